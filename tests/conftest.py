@@ -20,7 +20,7 @@ from tiny import make_busy_recipe, make_scene
 
 import polarguide
 from polarguide.capture import Scene
-from polarguide.options import SceneOptions, SessionOptions
+from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 

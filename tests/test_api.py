@@ -17,9 +17,9 @@ from camera_files import write_mosaics
 from safetensors.torch import load_file
 
 import polarguide
-from polarguide.evaluation.record import validate_metrics
-from polarguide.options import SceneOptions, SessionOptions
-from polarguide.progress import Advance
+from polarguide.core.options import SceneOptions, SessionOptions
+from polarguide.core.progress import Advance
+from polarguide.results.evaluation.record import validate_metrics
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, PLY
 from polarguide.shading.result import LAYERS
 from polarguide.training.trainer import StepReport, Trainer

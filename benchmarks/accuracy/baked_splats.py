@@ -14,9 +14,9 @@ from pathlib import Path
 import torch
 
 from polarguide.api import open_run
-from polarguide.color import srgb_encode
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.gaussians.ply import read_ply
+from polarguide.optics.color import srgb_encode
 from polarguide.raster import Splats
 from polarguide.runs.folder import PLY
 

@@ -18,9 +18,9 @@ from typing import Any
 import msgspec
 from scipy import stats
 
-from polarguide.errors import PolarguideError
-from polarguide.evaluation.table import METRICS, OBJECT_METRICS
+from polarguide.core.errors import PolarguideError
 from polarguide.experiments.record import read_results
+from polarguide.results.evaluation.table import METRICS, OBJECT_METRICS
 
 BY_KEY = {metric.key: metric for metric in METRICS}
 COLUMNS = {

@@ -31,7 +31,7 @@ def scene_mesh(path: Path) -> trimesh.Trimesh:
     about = dict(line.split(" ", 1) for line in lines if " " in line)
     turn = np.array(about.get("rotation_of_scene", "1 0 0 0 1 0 0 0 1").split(), np.float64).reshape(3, 3)
     back = np.eye(4)
-    # File = scale * rotation @ scene, see polarguide.export.placement.
+    # File = scale * rotation @ scene, see polarguide.results.export.placement.
     back[:3, :3] = turn.T / float(about.get("meters_per_unit_of_scene", "1"))
     return mesh.apply_transform(back)
 

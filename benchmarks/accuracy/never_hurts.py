@@ -27,9 +27,9 @@ from typing import Any
 
 import msgspec
 
-from polarguide.errors import PolarguideError
-from polarguide.evaluation.table import METRICS
+from polarguide.core.errors import PolarguideError
 from polarguide.experiments.record import read_results
+from polarguide.results.evaluation.table import METRICS
 
 PICTURE = {"psnr": 0.15, "psnr_foreground": 0.15}
 LAYERS = {"specular_psnr": 0.2, "diffuse_psnr": 0.2}

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.api import open_run
-from polarguide.evaluation.metrics import normal_angles_deg
+from polarguide.results.evaluation.metrics import normal_angles_deg
 
 NEAR = np.ones((5, 5), dtype=np.uint8)
 JUMP = 0.9  # cosine between neighbors

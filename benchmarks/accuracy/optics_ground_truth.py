@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera
-from polarguide.color import shown
+from polarguide.geometry.camera import Camera
+from polarguide.optics.color import shown
 
 THRESHOLD = 0.05
 WATER_INDEX = 1.33

@@ -23,7 +23,7 @@ from polarguide.capture.formats.pictures import decode_picture, linear_codes
 from polarguide.capture.layout import Layout, find_layout
 from polarguide.capture.sensor.pattern import sensor_pattern
 from polarguide.capture.view import ANGLES
-from polarguide.files import read_file
+from polarguide.core.files import read_file
 
 FULL = 4095
 

@@ -30,7 +30,7 @@ from torch import Tensor
 import polarguide as pg
 from polarguide.capture import Scene, View
 from polarguide.capture.exposures import analyzers
-from polarguide.evaluation.metrics import psnr
+from polarguide.results.evaluation.metrics import psnr
 from polarguide.runs.opened import OpenedRun
 from polarguide.training.photometric import behind_analyzer
 

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from polarguide.api import open_run
-from polarguide.export.placement import transforms
+from polarguide.results.export.placement import transforms
 from polarguide.visualization import figures
 
 FLAGS = (

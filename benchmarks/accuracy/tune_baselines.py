@@ -22,9 +22,9 @@ from typing import Any
 import torch
 
 import polarguide as pg
-from polarguide.evaluation.record import read_metrics
 from polarguide.recipes import recipe_named
 from polarguide.recipes.baselines import RESET
+from polarguide.results.evaluation.record import read_metrics
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.directional import DirectionalShading
 from polarguide.training.recipe import Recipe, Stage, Weights

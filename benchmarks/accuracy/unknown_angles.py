@@ -25,14 +25,14 @@ from typing import Any
 import numpy as np
 
 import polarguide
-from polarguide.angles.polarizers import Judgment
-from polarguide.angles.trainer import AngleTrainer
 from polarguide.capture import Scene
 from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.view import View
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.runs.defaults import resolve
+from polarguide.training.angles.polarizers import Judgment
+from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 

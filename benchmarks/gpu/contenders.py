@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene
-from polarguide.color import srgb_encode
 from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
+from polarguide.optics.color import srgb_encode
 from polarguide.raster import Backend, ScreenStatistic, Splats
 from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve

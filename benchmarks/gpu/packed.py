@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from polarguide.camera import Camera
 from polarguide.capture import Scene, View
+from polarguide.geometry.camera import Camera
 
 SUFFIX = ".scene.npz"
 

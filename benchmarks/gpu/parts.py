@@ -21,12 +21,12 @@ from packed import SUFFIX, enlarged, read_scene
 
 import polarguide
 from polarguide.capture import Scene
-from polarguide.evaluation.metrics import psnr
 from polarguide.gaussians.densify import DensityStatistics
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.raster import Backend, choose_backend
 from polarguide.raster.cuda import has_gsplat
 from polarguide.recipes import RECIPES
+from polarguide.results.evaluation.metrics import psnr
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
 from polarguide.shading.gbuffer import render

@@ -27,7 +27,7 @@ sys.path[:] = [path for path in sys.path if path]
 import numpy as np, torch
 from polarguide.capture import load_scene
 try:
-    from polarguide.system import keep_freed_memory
+    from polarguide.core.system import keep_freed_memory
 except ImportError:
     keep_freed_memory = lambda: None
 from polarguide.raster import choose_backend

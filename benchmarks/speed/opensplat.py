@@ -23,8 +23,8 @@ import torch
 
 from polarguide.capture import Scene, load_scene
 from polarguide.capture.write import write_png
-from polarguide.color import srgb_encode
-from polarguide.export.placement import write_colmap
+from polarguide.optics.color import srgb_encode
+from polarguide.results.export.placement import write_colmap
 
 MOST_STEPS = 98
 """Ours first looks at the density after 100 steps, OpenSplat after 500."""

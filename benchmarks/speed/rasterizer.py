@@ -20,7 +20,7 @@ import time
 import torch
 
 from polarguide import _native
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.raster import use_threads
 from polarguide.raster.cpu import native_rasterizer
 from polarguide.raster.interface import ScreenStatistic, Splats

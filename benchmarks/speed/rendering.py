@@ -21,10 +21,10 @@ import torch
 
 from polarguide import _native
 from polarguide.api import Run, open_run
-from polarguide.camera import Camera
+from polarguide.core.system import keep_freed_memory
+from polarguide.geometry.camera import Camera
 from polarguide.raster import use_threads
 from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.system import keep_freed_memory
 
 ROUNDS = 7
 

@@ -22,12 +22,12 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does,
 
 from polarguide import _native, open_run
 from polarguide.capture import load_scene
+from polarguide.core.system import keep_freed_memory
 from polarguide.gaussians.gaussians import Trained
 from polarguide.raster import choose_backend, use_threads
 from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CONFIGURATION, load_checkpoint
-from polarguide.system import keep_freed_memory
 from polarguide.training.feed import Feed
 from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer

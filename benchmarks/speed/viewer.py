@@ -21,9 +21,9 @@ import torch
 
 from polarguide.api import open_run
 from polarguide.gaussians.gaussians import Gaussians
-from polarguide.scene_frame import scene_frame
+from polarguide.geometry.scene_frame import scene_frame
+from polarguide.geometry.trajectory import orbit
 from polarguide.shading.result import LAYERS
-from polarguide.trajectory import orbit
 from polarguide.viewer import run_scenery
 from polarguide.viewer.cameras import letterbox
 from polarguide.viewer.scenery import Appearance, Painter

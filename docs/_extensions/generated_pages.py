@@ -81,29 +81,28 @@ def module_section(name: str, level: int) -> str:
 
 def api_pages(docs: Path) -> dict[str, str]:
     """Text of the pages below reference/api by name."""
-    pages, alone = {}, []
-    for room in rooms(docs):
+    pages = {}
+    for room in dict.fromkeys(room.partition(".")[0] for room in rooms(docs)):
         name = f"{PACKAGE}.{room}"
         if room in NOT_LIBRARY or not exists(name):
-            continue
-        if source_of(name).name != "__init__.py":
-            alone.append(name)
             continue
         first, *others = public_modules(name)
         parts = [module_section(first, 1), *(module_section(other, 2) for other in others)]
         pages[room] = "\n".join(parts)
-    ground = "\n".join(module_section(name, 2) for name in alone)
-    pages["ground-floor"] = f"# Ground floor\n\nModules that every room may use.\n\n{ground}"
-    order = ["ground-floor", *(room for room in rooms(docs) if room in pages)]
     lines = [
-        f"| [`{PACKAGE}.{room}`]({room}.md) | {escaped(summary(f'{PACKAGE}.{room}'))} |" for room in order[1:]
+        f"| [`{PACKAGE}.{room}`]({room}.md) | {escaped(summary(f'{PACKAGE}.{room}'))} |" for room in pages
     ]
-    index = ["# The library, room by room", "", "| room | what is in it |", "|---|---|"]
-    index += [
-        "| [ground floor](ground-floor.md) | Errors, cameras, vectors and other things that every room may use |"
+    contents = ["```{toctree}", ":hidden:", "", *pages, "```"]
+    index = [
+        "# The library, room by room",
+        "",
+        "| room | what is in it |",
+        "|---|---|",
+        *lines,
+        "",
+        *contents,
     ]
-    contents = ["```{toctree}", ":hidden:", "", *order, "```"]
-    pages["index"] = "\n".join([*index, *lines, "", *contents]) + "\n"
+    pages["index"] = "\n".join(index) + "\n"
     return pages
 
 

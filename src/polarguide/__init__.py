@@ -27,18 +27,18 @@ if TYPE_CHECKING:
     from polarguide.capture import Scene, load_scene
     from polarguide.capture.sensor.analyzer_file import read_analyzers
     from polarguide.capture.sensor.analyzers import AnalyzerCalibration
-    from polarguide.errors import PolarguideError, PolarguideWarning
+    from polarguide.core.errors import PolarguideError, PolarguideWarning
+    from polarguide.core.options import SceneOptions, SessionOptions
+    from polarguide.core.progress import Reporter
     from polarguide.experiments.compare import ablate, compare
     from polarguide.experiments.options import CompareOptions
     from polarguide.inspection.settings import InspectSettings
-    from polarguide.measurement.options import MeasureOptions, WatchOptions
-    from polarguide.measurement.watch import watch_folder
-    from polarguide.options import SceneOptions, SessionOptions
     from polarguide.preparation.settings import PrepareSettings
-    from polarguide.progress import Reporter
-    from polarguide.sensor_calibration.settings import CalibrateSettings
+    from polarguide.shots.calibration.settings import CalibrateSettings
     from polarguide.shots.exposures import find_shots
     from polarguide.shots.maps import ShotMaps
+    from polarguide.shots.measurement.options import MeasureOptions, WatchOptions
+    from polarguide.shots.measurement.watch import watch_folder
     from polarguide.shots.options import ShotOptions
     from polarguide.shots.read import SurfaceMaps, read_shot, surface_maps
     from polarguide.training.recipe import Recipe
@@ -63,16 +63,16 @@ _NAMES = {
     "capture": ("Scene", "load_scene"),
     "capture.sensor.analyzer_file": ("read_analyzers",),
     "capture.sensor.analyzers": ("AnalyzerCalibration",),
-    "errors": ("PolarguideError", "PolarguideWarning"),
+    "core.errors": ("PolarguideError", "PolarguideWarning"),
     "experiments.compare": ("ablate", "compare"),
     "experiments.options": ("CompareOptions",),
     "inspection.settings": ("InspectSettings",),
-    "measurement.options": ("MeasureOptions", "WatchOptions"),
-    "measurement.watch": ("watch_folder",),
-    "options": ("SceneOptions", "SessionOptions"),
+    "shots.measurement.options": ("MeasureOptions", "WatchOptions"),
+    "shots.measurement.watch": ("watch_folder",),
+    "core.options": ("SceneOptions", "SessionOptions"),
     "preparation.settings": ("PrepareSettings",),
-    "progress": ("Reporter",),
-    "sensor_calibration.settings": ("CalibrateSettings",),
+    "core.progress": ("Reporter",),
+    "shots.calibration.settings": ("CalibrateSettings",),
     "shots.exposures": ("find_shots",),
     "shots.maps": ("ShotMaps",),
     "shots.options": ("ShotOptions",),

@@ -12,7 +12,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 try:
     from polarguide.cli.app import run
-    from polarguide.system import interrupt, keep_freed_memory, stop_signals
+    from polarguide.core.system import interrupt, keep_freed_memory, stop_signals
 except KeyboardInterrupt:  # before there is anything to stop
     sys.exit(130)
 

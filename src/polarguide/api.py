@@ -14,27 +14,34 @@ from typing import Any
 from polarguide.capture import Scene
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.metadata import refractive_index_of
-from polarguide.errors import PolarguideError
-from polarguide.evaluation import evaluate
-from polarguide.evaluation.record import read_metrics
-from polarguide.export import formats
-from polarguide.files import read_file, require_folder
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import read_file, require_folder
+from polarguide.core.options import (
+    DeviceName,
+    PathLike,
+    SceneOptions,
+    SessionOptions,
+    VisitorOptions,
+    index_of,
+)
+from polarguide.core.progress import SILENT, Reporter
 from polarguide.inspection.inspect import Inspection, inspect_scene, inspection_folder
 from polarguide.inspection.record import write_inspection
 from polarguide.inspection.settings import InspectSettings
-from polarguide.measurement.line import measure_shots
-from polarguide.options import DeviceName, PathLike, SceneOptions, SessionOptions, VisitorOptions, index_of
 from polarguide.preparation.prepare import prepare_scene
-from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
-from polarguide.rendering import film, pictures, relight
-from polarguide.rendering import present as presenting
-from polarguide.rendering.pictures import select_views
-from polarguide.rendering.priors import write_priors
+from polarguide.results.evaluation import evaluate
+from polarguide.results.evaluation.record import read_metrics
+from polarguide.results.export import formats
+from polarguide.results.rendering import film, pictures, relight
+from polarguide.results.rendering import present as presenting
+from polarguide.results.rendering.pictures import select_views
+from polarguide.results.rendering.priors import write_priors
 from polarguide.runs import train as training
 from polarguide.runs.opened import OpenedRun, read_scene
-from polarguide.sensor_calibration.calibrate import calibrate_sensor
+from polarguide.shots.calibration.calibrate import calibrate_sensor
 from polarguide.shots.develop import require_four_pictures
+from polarguide.shots.measurement.line import measure_shots
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.write import FORMATS, WrittenShots, check_formats, write_shots, write_view_maps
 from polarguide.training.recipe import Recipe
@@ -148,7 +155,7 @@ def priors(
     Args:
         scene: a scene with poses, or its folder, which is read as ``reading`` says.
         out: folder to write.
-        run, views, threshold: as ``rendering.priors.write_priors`` takes them.
+        run, views, threshold: as ``results.rendering.priors.write_priors`` takes them.
         refractive_index: of the surfaces; None: as ``scene.json`` says, else 1.5.
         formats: of maps as ``shot_priors`` writes them, a folder for each view: png, exr, npy, page.
         shots: ``full_well``, ``read_noise`` and ``snr`` for the maps.

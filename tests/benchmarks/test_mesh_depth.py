@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from random_runs import ring
 
-from polarguide.export.mesh import write_mesh
-from polarguide.export.placement import Placement
-from polarguide.presentation import Presentation
-from polarguide.rendering.mesh import ColoredMesh, Surface
-from polarguide.scene_frame import scene_frame
+from polarguide.capture.presentation import Presentation
+from polarguide.geometry.scene_frame import scene_frame
+from polarguide.results.export.mesh import write_mesh
+from polarguide.results.export.placement import Placement
+from polarguide.results.rendering.mesh import ColoredMesh, Surface
 
 trimesh = pytest.importorskip("trimesh")
 sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks" / "accuracy"))

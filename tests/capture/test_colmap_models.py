@@ -14,13 +14,13 @@ import pytest
 import torch
 from tiny_capture import NAMES, TinyCapture, fails
 
-from polarguide.camera import Camera
 from polarguide.capture import load_scene, read_model
 from polarguide.capture.colmap import sfm
 from polarguide.capture.colmap.model import unseen_points
 from polarguide.capture.colmap.sfm import NotConnectedError, connected_views, log_false_alarms, reconstruct
-from polarguide.polarizer import ANGLES
-from polarguide.progress import SILENT
+from polarguide.core.progress import SILENT
+from polarguide.geometry.camera import Camera
+from polarguide.optics.polarizer import ANGLES
 
 
 def model_folder(capture: TinyCapture) -> Path:

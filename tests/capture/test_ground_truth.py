@@ -19,7 +19,7 @@ from polarguide.capture import load_scene
 from polarguide.capture.exposures import Exposure
 from polarguide.capture.ground_truth import Material
 from polarguide.capture.variants import SmallerViews, smaller
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 
 
 def test_arrays_become_float_tensors_and_unit_normals(capture: TinyCapture) -> None:

@@ -14,10 +14,10 @@ import torch
 from heard import Heard
 from tiny_capture import NAMES, TinyCapture
 
-from polarguide.camera import Camera, look_at
 from polarguide.capture import load_scene
 from polarguide.capture.split import TEST_EVERY, chosen_views, far_from_training, held_out_band
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.geometry.camera import Camera, look_at
 
 
 def test_intensities_are_those_that_were_written(capture: TinyCapture) -> None:

@@ -18,7 +18,7 @@ from polarguide.capture.formats.integrity import declared_size, find_damage
 from polarguide.capture.formats.pictures import decode_stored
 from polarguide.capture.ground_truth import objects_of
 from polarguide.capture.pose_files import read_pose_file
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 
 HUGE, SMALL = 30_000, (24, 20)
 

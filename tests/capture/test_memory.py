@@ -19,13 +19,13 @@ from polarguide.capture import load_scene, view_reader
 from polarguide.capture.formats.integrity import declared_size
 from polarguide.capture.formats.pictures import decode_stored, read_picture, stated_size
 from polarguide.capture.memory import KEPT, READ, SHARE
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.core.system import free_memory
 from polarguide.preparation.mosaic_source import WORKED
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import read_shot
-from polarguide.system import free_memory
 
 
 @pytest.fixture

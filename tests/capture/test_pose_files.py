@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from dataset_files import HEIGHT, INNER, WIDTH, idr_cameras, poses
 
-from polarguide.camera import Camera
 from polarguide.capture.colmap.files import colmap_camera
 from polarguide.capture.pose_files import read_pose_file
-from polarguide.errors import PolarguideError
-from polarguide.export.placement import write_transforms
+from polarguide.core.errors import PolarguideError
+from polarguide.geometry.camera import Camera
+from polarguide.results.export.placement import write_transforms
 
 VIEWS = ["a", "b", "c", "d"]
 LENS = {

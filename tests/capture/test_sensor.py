@@ -18,7 +18,7 @@ from polarguide.capture.sensor.pattern import (
     unusable_samples,
 )
 from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, packed_size, read_mosaic, unpack
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.preparation.mosaic_source import sample_blocks
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings

@@ -25,8 +25,8 @@ from polarguide.capture.filter.camera_raw import read_camera_raw
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration, read_taken, taken
 from polarguide.capture.filter.ring_scale import BAND, place, ring_scale
 from polarguide.capture.filter.shots import split_name
-from polarguide.errors import PolarguideError
-from polarguide.polarizer import malus
+from polarguide.core.errors import PolarguideError
+from polarguide.optics.polarizer import malus
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.synth.sensor import FilterShot, Sensor, behind_filter, exif_tags, filter_jpeg

@@ -16,7 +16,6 @@ import torch
 from tiny_capture import HEIGHT, WIDTH, ideal_intensities, write_tiny_capture
 from torch import Tensor
 
-from polarguide.camera import Camera, look_at
 from polarguide.capture import Scene, View, load_scene
 from polarguide.capture import box_filter as boxes
 from polarguide.capture.exposures import FOUR, PLAIN
@@ -29,8 +28,9 @@ from polarguide.capture.variants import (
     select_exposures,
 )
 from polarguide.capture.view import Loader
-from polarguide.errors import PolarguideError
-from polarguide.options import Exposures
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import Exposures
+from polarguide.geometry.camera import Camera, look_at
 from polarguide.training.priors import view_priors
 from polarguide.training.recipe import Priors
 from tests.helpers.tiny import make_scene

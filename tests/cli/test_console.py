@@ -14,9 +14,9 @@ from polarguide.cli import console
 from polarguide.cli.app import run
 from polarguide.cli.console import ConsoleReporter, JobReporter, Lines, bars, say, size_text, warnings_printed
 from polarguide.cli.evaluate import _errors, print_scores
-from polarguide.errors import PolarguideWarning
-from polarguide.evaluation.table import METRICS, OBJECT_METRICS
-from polarguide.text import printable
+from polarguide.core.errors import PolarguideWarning
+from polarguide.core.text import printable
+from polarguide.results.evaluation.table import METRICS, OBJECT_METRICS
 
 HOSTILE = "\x1b[2J\x1b]0;mine\x07\u202e"
 

@@ -20,13 +20,13 @@ from safetensors.torch import load_file, save_file
 from scipy.spatial import cKDTree
 
 import polarguide
-from polarguide import errors
 from polarguide.cli.app import run
-from polarguide.errors import install_package
-from polarguide.export import mesh
+from polarguide.core import errors
+from polarguide.core.errors import install_package
 from polarguide.gaussians.ply import read_ply
+from polarguide.geometry.trajectory import camera_record
+from polarguide.results.export import mesh
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
-from polarguide.trajectory import camera_record
 
 ONE = ("--threads", "1")
 

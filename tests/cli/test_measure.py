@@ -12,8 +12,8 @@ import pytest
 from camera_files import write_mosaics
 
 from polarguide.cli.app import run
-from polarguide.measurement.pictures import diverging
-from polarguide.polarizer import ANGLES
+from polarguide.optics.polarizer import ANGLES
+from polarguide.shots.measurement.pictures import diverging
 from tests.shots.test_read import write_four
 
 SENSOR = ("--sensor", "IMX250MZR", "--bits", "12", "--threads", "1")

@@ -17,8 +17,8 @@ from safetensors.torch import load_file
 
 import polarguide
 from polarguide.cli.app import run
-from polarguide.color import srgb_decode
-from polarguide.evaluation.record import validate_metrics
+from polarguide.optics.color import srgb_decode
+from polarguide.results.evaluation.record import validate_metrics
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, LOG, PLY
 from polarguide.training.trainer import StepReport, Trainer
 

@@ -14,11 +14,11 @@ import torch
 from plyfile import PlyData
 
 import polarguide
+from polarguide.capture.presentation import PRESENTATION_FILE, Crop, Presentation, read_presentation
 from polarguide.cli.app import run
 from polarguide.gaussians.ply import read_ply
-from polarguide.presentation import PRESENTATION_FILE, Crop, Presentation, read_presentation
-from polarguide.rendering import picking
-from polarguide.rendering.film import path_cameras
+from polarguide.results.rendering import picking
+from polarguide.results.rendering.film import path_cameras
 
 ONE = ("--threads", "1")
 
@@ -205,7 +205,7 @@ def test_the_mesh_says_its_units_and_whose_it_is(
     copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trimesh = pytest.importorskip("trimesh")
-    monkeypatch.setattr("polarguide.rendering.mesh.OPAQUE", 0.05)  # nothing is opaque yet
+    monkeypatch.setattr("polarguide.results.rendering.mesh.OPAQUE", 0.05)  # nothing is opaque yet
     trained = polarguide.open_run(copy, device="cpu")
     trained.export("mesh", tmp_path / "plain", resolution=24)
     present(copy, "--meters-per-unit", "0.5", "--author", "Zoë", "--license", "CC-BY-4.0", "--title", "Cup")

@@ -16,7 +16,7 @@ from made_sensor import made_sensor, write_codes, write_polarizer_shots
 
 from polarguide.capture.filter.ring_scale import ring_scale
 from polarguide.cli.app import run
-from polarguide.errors import install_extra
+from polarguide.core.errors import install_extra
 from polarguide.synth.schema import SceneSpec
 from polarguide.synth.settings import Variant, choose_variant
 

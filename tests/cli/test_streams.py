@@ -18,11 +18,11 @@ from safetensors.torch import load_file
 
 from polarguide.cli import app
 from polarguide.cli.app import run
+from polarguide.core.system import interrupt
 from polarguide.runs import families
 from polarguide.runs import forecast as forecasts
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
 from polarguide.runs.forecast import MemoryPlan
-from polarguide.system import interrupt
 
 PROGRAM = f"{sys.executable} -m polarguide"
 

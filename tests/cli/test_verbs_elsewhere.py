@@ -14,19 +14,19 @@ from other_device import BACKEND, OtherDevice
 
 from polarguide.api import Run, open_run
 from polarguide.capture import load_scene
+from polarguide.capture.presentation import Crop
 from polarguide.cli.app import run
 from polarguide.cli.compare import chosen_steps
 from polarguide.cli.render import render
-from polarguide.errors import PolarguideError
-from polarguide.evaluation.metrics import HAZE_DEPTH
-from polarguide.evaluation.perceptual import load_package
-from polarguide.evaluation.scores import ErrorsByObject, score_view
-from polarguide.evaluation.target import SceneFacts, ViewTarget
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import ComputeOptions
 from polarguide.experiments.record import read_results
+from polarguide.geometry.scene_frame import scene_frame
 from polarguide.inspection.short_run import short_run, surface_of
-from polarguide.options import ComputeOptions
-from polarguide.presentation import Crop
-from polarguide.scene_frame import scene_frame
+from polarguide.results.evaluation.metrics import HAZE_DEPTH
+from polarguide.results.evaluation.perceptual import load_package
+from polarguide.results.evaluation.scores import ErrorsByObject, score_view
+from polarguide.results.evaluation.target import SceneFacts, ViewTarget
 from polarguide.viewer import run_scenery
 from polarguide.viewer.scenery import Appearance, Painter
 

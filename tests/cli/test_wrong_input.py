@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from polarguide.errors import install_package
+from polarguide.core.errors import install_package
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import polarguide
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.experiments import bench as benches
 from polarguide.experiments.bench import run_bench
 from polarguide.experiments.compare import locked

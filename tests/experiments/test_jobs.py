@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
+from polarguide.core.options import ComputeOptions
+from polarguide.core.progress import Advance, Reporter
+from polarguide.core.system import interrupt
 from polarguide.experiments.jobs import Job, last_row, run_jobs
 from polarguide.experiments.worker import Scoring
-from polarguide.options import ComputeOptions
-from polarguide.progress import Advance, Reporter
-from polarguide.system import interrupt
 
 # Reads its task, writes down that it begins, does what the name of the device asks for, and writes down the end.
 PROGRAM = """

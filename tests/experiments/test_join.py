@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from comparison_records import results, run, unfinished
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.experiments.join import join_records, join_tables
 from polarguide.experiments.record import Record, read_results
 from polarguide.experiments.results import Results

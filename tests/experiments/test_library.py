@@ -9,7 +9,7 @@ import pytest
 from heard import Heard
 
 import polarguide
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, plan_runs, scene_entries
 from polarguide.experiments.record import read_results

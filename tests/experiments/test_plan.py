@@ -12,15 +12,15 @@ from typing import Any
 import pytest
 from heard import Heard
 
-from polarguide.errors import PolarguideError
-from polarguide.evaluation.evaluate import evaluate
-from polarguide.evaluation.sources import code_digest
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import SceneOptions
 from polarguide.experiments import plan as plans
 from polarguide.experiments.compare import ablated, collect, compare
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, run_key, scene_entries
-from polarguide.options import SceneOptions
 from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
+from polarguide.results.evaluation.evaluate import evaluate
+from polarguide.results.evaluation.sources import code_digest
 from polarguide.runs.opened import OpenedRun
 from polarguide.training.settings import TrainSettings
 

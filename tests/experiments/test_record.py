@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 from comparison_records import content, results, run
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.core.records import decode
 from polarguide.experiments.record import Record, read_results
 from polarguide.experiments.results import Results
 from polarguide.experiments.tables import scores_section
 from polarguide.experiments.writing import write_tables
-from polarguide.records import decode
 
 STORED = Path(__file__).parents[2] / "benchmarks" / "results"
 PART = {"material": None, "pixels": 3, "views": 1, "metrics": {}}

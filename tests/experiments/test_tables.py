@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 from comparison_records import part, results, run, unfinished
 
-from polarguide.evaluation.table import COLUMNS
 from polarguide.experiments.results import Cell, Results, cell_of
 from polarguide.experiments.tables import (
     Section,
@@ -22,6 +21,7 @@ from polarguide.experiments.tables import (
     sections,
 )
 from polarguide.experiments.writing import csv_text, latex_text, readable, write_tables
+from polarguide.results.evaluation.table import COLUMNS
 
 FREE, LOOSE = "r:unpolarized", "r:unpolarized-without-consistency"
 

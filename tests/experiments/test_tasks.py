@@ -14,7 +14,7 @@ import torch
 from heard import Heard
 
 from polarguide.capture import Scene
-from polarguide.evaluation.evaluate import evaluate
+from polarguide.core.options import ComputeOptions, SceneOptions
 from polarguide.experiments import compare as comparing
 from polarguide.experiments.compare import BESIDE_OTHERS, collect
 from polarguide.experiments.jobs import Job
@@ -30,8 +30,8 @@ from polarguide.experiments.plan import (
 from polarguide.experiments.record import PartScores
 from polarguide.experiments.worker import Scoring, Training
 from polarguide.experiments.writing import write_tables
-from polarguide.options import ComputeOptions, SceneOptions
 from polarguide.recipes import recipe_named
+from polarguide.results.evaluation.evaluate import evaluate
 from polarguide.runs.opened import OpenedRun
 from polarguide.training.settings import TrainSettings
 

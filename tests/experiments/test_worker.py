@@ -11,9 +11,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from polarguide.core.options import ComputeOptions, SceneOptions
+from polarguide.core.records import decode
 from polarguide.experiments.worker import COMMAND, Scoring, Training, encoded
-from polarguide.options import ComputeOptions, SceneOptions
-from polarguide.records import decode
 from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide.training.settings import TrainSettings
 

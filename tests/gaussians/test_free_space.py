@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from polarguide.camera import Camera
 from polarguide.gaussians.densify import free_space
+from polarguide.geometry.camera import Camera
 
 
 def camera(z: float) -> Camera:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
 
 COUNT = 9

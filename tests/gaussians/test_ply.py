@@ -7,9 +7,9 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.gaussians.ply import read_ply, refit_sh_to_display, write_ply
-from polarguide.vectors import spread_directions
+from polarguide.geometry.vectors import spread_directions
 
 COUNT = 7
 SHAPES = {

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from polarguide.inspection.capture import Capture, read_capture
-from polarguide.polarizer import ANGLES
+from polarguide.optics.polarizer import ANGLES
 
 
 def soft_intensities(seed: int, size: tuple[int, int] = (60, 80)) -> np.ndarray:

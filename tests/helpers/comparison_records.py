@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from polarguide.evaluation.table import COLUMNS
+from polarguide.core.records import decode
 from polarguide.experiments.record import FORMAT, Record
 from polarguide.experiments.results import Results
-from polarguide.records import decode
+from polarguide.results.evaluation.table import COLUMNS
 
 
 def run(scene: str, recipe: str, seed: int, **metrics: float | None) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from polarguide.camera import Camera, look_at, quaternion
+from polarguide.geometry.camera import Camera, look_at, quaternion
 from polarguide.synth.sensor import FilterShot, Sensor, behind_filter, filter_jpeg
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 110.0

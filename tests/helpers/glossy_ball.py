@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera
 from polarguide.capture import ColmapModel, checks
 from polarguide.capture.calibration import Calibration, oriented
+from polarguide.geometry.camera import Camera
 from polarguide.inspection.capture import InspectedView
 from polarguide.inspection.evidence import Surface
-from polarguide.polarizer import ANGLES
+from polarguide.optics.polarizer import ANGLES
 
 WIDTH, HEIGHT, INDEX = 72, 64, 1.5
 

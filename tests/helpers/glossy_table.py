@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera, look_at
 from polarguide.capture import Scene, View
 from polarguide.capture.exposures import Exposure
+from polarguide.geometry.camera import Camera, look_at
 
 WIDTH, HEIGHT, VIEWS, INDEX = 40, 30, 24, 1.5
 ELEVATION = math.radians(34.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-from polarguide.progress import Advance, Reporter
+from polarguide.core.progress import Advance, Reporter
 
 
 class Heard(Reporter):

@@ -10,9 +10,9 @@ import torch
 from random_runs import ring
 from torch import Tensor
 
-from polarguide.camera import Camera
 from polarguide.capture import GroundTruth, Scene, View
 from polarguide.capture.ground_truth import Material, SceneObject
+from polarguide.geometry.camera import Camera
 
 HEIGHT, WIDTH = 20, 26
 OBJECTS = (

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map
 
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.raster import Backend, Rasterized, ScreenStatistic, Splats
 from polarguide.raster.cpu import rasterize_cpu
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera, look_at
 from polarguide.gaussians.densify import DensityStatistics
 from polarguide.gaussians.gaussians import Gaussians
+from polarguide.geometry.camera import Camera, look_at
 from polarguide.recipes import RECIPES
 from polarguide.shading.model import ShadingModel
 from polarguide.training.state import Environment, TrainingState

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera
 from polarguide.gaussians.geometry import quaternions_to_rotations
+from polarguide.geometry.camera import Camera
 from polarguide.raster import Rasterize, ScreenStatistic, Splats, rasterize_reference
 from polarguide.raster.interface import MINIMUM_ALPHA
 

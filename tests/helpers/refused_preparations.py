@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from polarguide.capture import load_scene
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 

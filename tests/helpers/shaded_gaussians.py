@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 
 COUNT = 30
 

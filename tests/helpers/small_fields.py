@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from polarguide.neural.recipe import FieldShape, NeuralRecipe, Sampling
+from polarguide.fields.recipe import FieldShape, NeuralRecipe, Sampling
 from polarguide.recipes.gnerp import RECIPE_GNERP
 
 SMALL_SHAPE = FieldShape(resolutions=(8, 16), channels=2, width=16, background=(8,))

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera, look_at
 from polarguide.capture import GroundTruth, Scene, View
-from polarguide.color import srgb_decode
-from polarguide.neural.field import MARGIN
-from polarguide.polarizer import ANGLES
-from polarguide.vectors import unit
+from polarguide.fields.field import MARGIN
+from polarguide.geometry.camera import Camera, look_at
+from polarguide.geometry.vectors import unit
+from polarguide.optics.color import srgb_decode
+from polarguide.optics.polarizer import ANGLES
 
 DISTANCE = 4.0
 OFFSET = (0.3, -0.2, 0.25)

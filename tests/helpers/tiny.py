@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera, look_at
 from polarguide.capture import Scene, View
+from polarguide.geometry.camera import Camera, look_at
 from polarguide.raster import Splats, rasterize_reference
 from polarguide.recipes.ablations import release_rates
 from polarguide.recipes.baselines import SHADING_3DGS_DR

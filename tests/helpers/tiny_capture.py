@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from polarguide.capture import load_scene
-from polarguide.errors import PolarguideError
-from polarguide.polarizer import ANGLES
+from polarguide.core.errors import PolarguideError
+from polarguide.optics.polarizer import ANGLES
 
 HEIGHT, WIDTH = 10, 12
 NAMES = tuple(f"v{index:03d}" for index in range(9))

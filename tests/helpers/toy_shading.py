@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import unit
 from polarguide.recipes import RECIPES
 from polarguide.shading.model import (
     Channels,
@@ -21,7 +22,6 @@ from polarguide.shading.model import (
     mirrored,
 )
 from polarguide.training.recipe import Stage, Weights
-from polarguide.vectors import unit
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from random_runs import random_state, ring
 
-from polarguide.camera import Camera
 from polarguide.capture import View
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.scene_frame import SceneFrame, scene_frame
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.viewer import GaussianScenery
 from polarguide.viewer.cameras import Photograph
 

@@ -12,11 +12,11 @@ import pytest
 from captures import soft_intensities, write_scene
 
 from polarguide.capture.calibration import Calibration, oriented
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.inspection import corrections as fixing
 from polarguide.inspection.angles import ORDERS, PAIRINGS, AngleFindings, OrderPosterior
 from polarguide.inspection.capture import read_capture
-from polarguide.polarizer import ANGLES
+from polarguide.optics.polarizer import ANGLES
 
 
 def decided(

@@ -14,10 +14,10 @@ from made_sensor import made_sensor, true_calibration, write_codes
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.sensor.analyzer_file import write_analyzers
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.inspection.capture import read_capture
 from polarguide.inspection.corrections import analyzer_check, corrected
-from polarguide.polarizer import ANGLES, stokes_of_four
+from polarguide.optics.polarizer import ANGLES, stokes_of_four
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 

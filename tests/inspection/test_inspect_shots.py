@@ -10,12 +10,12 @@ import pytest
 from single_shots import single_shots
 
 import polarguide
-from polarguide.angles.polarizers import Judgment
 from polarguide.capture.exposures import Exposure
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.inspection.settings import InspectSettings
 from polarguide.inspection.shots import ShotFindings, shot_checks
 from polarguide.inspection.verdict import Check
+from polarguide.training.angles.polarizers import Judgment
 
 TURNS = (0.0, 45.0, 90.0, 135.0)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from polarguide import _native
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.metal import BLUR, MINIMUM_SHARE, where_metal
 from polarguide.shading.model import GBuffer

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from polarguide import _native
-from polarguide.color import srgb_decode, srgb_encode
+from polarguide.optics.color import srgb_decode, srgb_encode
 from polarguide.training.photometric import (
     photometric_loss,
     photometric_loss_explicit,

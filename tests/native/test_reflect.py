@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from polarguide import _native
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.shading.deferred import DeferredShading, reflect_reference
 from polarguide.shading.model import GBuffer, ShadingModel
 from polarguide.shading.native import reflect_native, world_rays_native

@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from polarguide import _native
-from polarguide.camera import Camera
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.gaussians.harmonics import SH_C0, evaluate_sh
+from polarguide.geometry.camera import Camera
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.interface import Splats
 from polarguide.shading.deferred import DeferredShading

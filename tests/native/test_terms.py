@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from polarguide import _native, optics
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult

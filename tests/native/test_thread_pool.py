@@ -13,7 +13,7 @@ WITHOUT_MEMORY = """
 import resource
 import torch
 from polarguide import _native
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.raster import Splats
 from polarguide.raster.cpu import rasterize_cpu
 

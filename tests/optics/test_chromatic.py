@@ -9,7 +9,7 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import load_scene
-from polarguide.vectors import dot
+from polarguide.geometry.vectors import dot
 
 SCENES = Path(__file__).resolve().parents[3] / "shared" / "scenes"
 F64 = torch.float64

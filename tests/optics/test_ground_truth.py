@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 
 SCENES = Path(__file__).resolve().parents[3] / "shared" / "scenes"
 

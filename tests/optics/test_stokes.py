@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from polarguide import optics
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 
 PI = math.pi
 degrees_of_polarization = st.floats(0.0, 1.0)

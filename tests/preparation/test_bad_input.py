@@ -16,8 +16,8 @@ from damage import EVERYWHERE, colmap_binary, duplicate, patched
 from dataset_files import write_gnerp, write_neisf, write_nersp, write_pandora, write_pisr
 from refused_preparations import refused as refused_preparation
 
-from polarguide import files
-from polarguide.polarizer import ANGLES
+from polarguide.core import files
+from polarguide.optics.polarizer import ANGLES
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 

@@ -32,8 +32,8 @@ from tiny_capture import write_picture
 from polarguide.capture import load_scene
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.formats.pictures import decode_mask
-from polarguide.errors import PolarguideError
-from polarguide.polarizer import ANGLES
+from polarguide.core.errors import PolarguideError
+from polarguide.optics.polarizer import ANGLES
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 

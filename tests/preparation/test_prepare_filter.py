@@ -16,7 +16,7 @@ from tiny_capture import encode_srgb, write_picture
 from polarguide.capture.filter.develop import Shift, estimate_shifts
 from polarguide.capture.filter.exif import apply_orientation, orientation
 from polarguide.capture.filter.shots import find_shots
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 

@@ -20,17 +20,17 @@ import pytest
 from camera_files import write_mosaics
 from refused_preparations import MOSAIC, NAMES, refused
 
-from polarguide import files
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.datasets.readers import DATASETS
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES
 from polarguide.capture.sensor.pattern import SENSORS
 from polarguide.capture.sensor.raw_file import PACKINGS
-from polarguide.errors import PolarguideError
+from polarguide.core import files
+from polarguide.core.errors import PolarguideError
+from polarguide.core.system import hold_folder
 from polarguide.preparation import folder as folder_module
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
-from polarguide.system import hold_folder
 
 
 def test_a_full_disk_and_going_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,8 +25,8 @@ from made_sensor import MadeSensor, made_sensor, true_calibration, write_codes
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.sensor.analyzer_file import write_analyzers
-from polarguide.errors import PolarguideError
-from polarguide.polarizer import stokes_of_four
+from polarguide.core.errors import PolarguideError
+from polarguide.optics.polarizer import stokes_of_four
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 

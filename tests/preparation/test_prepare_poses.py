@@ -35,10 +35,10 @@ from polarguide.capture.colmap.files import PosedCamera, write_cameras
 from polarguide.capture.colmap.sfm import tone_mapped
 from polarguide.capture.colmap.triangulate import sample_visual_hull
 from polarguide.capture.write import write_png
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.core.progress import SILENT
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.progress import SILENT
 
 MOSAIC = PrepareSettings(sensor="IMX250MYR", gains="none")
 FILTER = PrepareSettings(gains="none", align=False, transfer="linear")

@@ -16,10 +16,10 @@ from refused_preparations import FILTER, MOSAIC, refused
 
 from polarguide.capture import load_scene
 from polarguide.capture.calibration import Calibration, read_calibration
-from polarguide.errors import PolarguideError, PolarguideWarning
+from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.progress import Reporter
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.progress import Reporter
 
 RAW = replace(MOSAIC, packing="12p", width=64, height=48)
 

@@ -24,8 +24,8 @@ from tiny_capture import encode_srgb, write_picture
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.filter.exif import TURNS, apply_orientation
-from polarguide.errors import PolarguideError
-from polarguide.polarizer import malus
+from polarguide.core.errors import PolarguideError
+from polarguide.optics.polarizer import malus
 from polarguide.preparation import prepare as prepare_module
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings

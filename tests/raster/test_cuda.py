@@ -13,7 +13,7 @@ import torch
 from raster_scenes import differences, in_view, outcome, posed
 
 from polarguide import raster
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.raster import ScreenStatistic, Splats, choose_backend, cuda, rasterize_reference
 from polarguide.raster.cuda import load_gsplat, rasterize_cuda
 

@@ -9,7 +9,7 @@ import torch
 from raster_scenes import looking_ahead, posed
 from torch import Tensor
 
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.raster import ScreenStatistic, Splats, rasterize_reference
 
 

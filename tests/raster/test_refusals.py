@@ -9,7 +9,7 @@ import pytest
 import torch
 from raster_scenes import looking_ahead, repeated, round_gaussian
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.raster import Rasterize, ScreenStatistic, Splats, choose_backend, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 

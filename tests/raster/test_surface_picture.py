@@ -7,8 +7,8 @@ import torch
 from raster_scenes import in_view, looking_ahead, posed, round_gaussian
 
 from polarguide import _native
-from polarguide.camera import Camera
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.geometry.camera import Camera
 from polarguide.raster import Splats, rasterize_reference
 from polarguide.raster.cpu import native_rasterizer, rasterize_cpu
 from polarguide.raster.surface import SurfacePicture, surface_picture, surface_reference

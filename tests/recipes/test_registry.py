@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from plugins import install
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.recipes import ABLATIONS, RECIPES, ablations_of, recipe_named
 from polarguide.training.recipe import Recipe, Stage
 

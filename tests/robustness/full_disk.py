@@ -183,7 +183,7 @@ def _run(command: Command) -> int:
     app = importlib.import_module("polarguide.cli.app")
     try:
         called()
-    except importlib.import_module("polarguide.errors").PolarguideError as error:
+    except importlib.import_module("polarguide.core.errors").PolarguideError as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         return 2
     return int(app.run(arguments)) if arguments else 0

@@ -39,7 +39,7 @@ def warm_up(few_gaussians: bool = True) -> None:
     for verb in app.VERBS:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
             app.run([verb, "--help"])
-    importlib.import_module("polarguide.evaluation.sources").code_digest()
+    importlib.import_module("polarguide.results.evaluation.sources").code_digest()
     if few_gaussians:
         _shrink(importlib.import_module("polarguide.recipes.registry"))
     tasks = Path("/proc/self/task")

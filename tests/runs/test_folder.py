@@ -17,10 +17,10 @@ from safetensors.torch import save_file
 
 import polarguide
 from polarguide.capture import Scene
-from polarguide.errors import PolarguideError
-from polarguide.files import atomic
-from polarguide.neural.recipe import NeuralRecipe
-from polarguide.options import SceneOptions, SessionOptions
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import atomic
+from polarguide.core.options import SceneOptions, SessionOptions
+from polarguide.fields.recipe import NeuralRecipe
 from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import (

@@ -14,19 +14,19 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 import polarguide
-from polarguide.angles.polarizers import Polarizers
-from polarguide.camera import Camera
 from polarguide.capture import Scene, View, load_scene
 from polarguide.capture.exposures import FOUR, PLAIN, Exposure
 from polarguide.capture.variants import select_exposures
-from polarguide.errors import PolarguideError
-from polarguide.options import SceneOptions, SessionOptions
-from polarguide.progress import SILENT
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import SceneOptions, SessionOptions
+from polarguide.core.progress import SILENT
+from polarguide.geometry.camera import Camera
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.runs.health import HEALTH, Evidence, Health, Limits, Polarization, examine, warnings_of
 from polarguide.runs.model import GaussianModel
 from polarguide.shading.result import RenderResult
+from polarguide.training.angles.polarizers import Polarizers
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
 from tests.helpers.heard import Heard

@@ -15,8 +15,8 @@ import torch
 import polarguide
 from polarguide.capture import load_scene
 from polarguide.capture.split import chosen_views, far_from_training
-from polarguide.errors import PolarguideError
-from polarguide.options import SceneOptions
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import SceneOptions
 from polarguide.training.settings import TrainSettings
 
 READING = SceneOptions(downscale=4)

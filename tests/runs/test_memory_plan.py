@@ -13,10 +13,10 @@ from textured_ball import cameras
 from torch import Tensor
 
 from polarguide.capture import Scene
-from polarguide.errors import PolarguideError
-from polarguide.neural.recipe import NeuralRecipe
-from polarguide.neural.state import FieldState
-from polarguide.options import Exposures, SceneOptions, gibibytes
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import Exposures, SceneOptions, gibibytes
+from polarguide.fields.recipe import NeuralRecipe
+from polarguide.fields.state import FieldState
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.runs import forecast as forecasts

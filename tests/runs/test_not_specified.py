@@ -19,8 +19,8 @@ EXCEPT = {
     ("shading/model.py", "default of refractive_index"): "of a recipe; ``bind`` gives it the run's",
     ("cli/demo.py", "default of steps"): "the demo's own number",
     ("inspection/settings.py", "default of steps"): "of the short training that inspects",
-    ("neural/recipe.py", "default of steps"): "the recipe's own number, which ``resolve`` takes",
-    ("neural/recipe.py", "default of background"): "samples of a ray",
+    ("fields/recipe.py", "default of steps"): "the recipe's own number, which ``resolve`` takes",
+    ("fields/recipe.py", "default of background"): "samples of a ray",
     ("experiments/record.py", "refractive_index compared with 0"): "records of the first versions",
 }
 
@@ -86,7 +86,7 @@ def fallbacks(node: ast.AST) -> Iterator[str]:
             name in SETTINGS and number(value)
         ):
             yield f"default of {name}"
-        case ast.ImportFrom(module="polarguide.options" | "polarguide.training.settings", names=names):
+        case ast.ImportFrom(module="polarguide.core.options" | "polarguide.training.settings", names=names):
             yield from (f"{alias.name} taken" for alias in names if alias.name in CONSTANTS)
 
 

@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 import polarguide
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import SceneOptions
+from polarguide.core.progress import Reporter
+from polarguide.core.system import MemoryBound
 from polarguide.experiments.options import CompareOptions
-from polarguide.options import SceneOptions
-from polarguide.progress import Reporter
 from polarguide.recipes import recipe_named
 from polarguide.runs import train as training
 from polarguide.runs.folder import CONFIGURATION
 from polarguide.runs.train import TrainingStopped
-from polarguide.system import MemoryBound
 from polarguide.training.recipe import Schedule
 from polarguide.training.settings import TrainSettings
 

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from polarguide.camera import Camera
 from polarguide.gaussians.geometry import GRAZING, shortest_axis_normals
 from polarguide.gaussians.harmonics import SH_C0, sh_basis
+from polarguide.geometry.camera import Camera
 from polarguide.raster import Rasterize, ScreenStatistic, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.deferred import DeferredShading, local_light, reflect_reference

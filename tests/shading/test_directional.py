@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.cubemap import box_mips, mip_lookup
 from polarguide.shading.directional import CHANNELS, FEATURES, DirectionalShading, albedo_of

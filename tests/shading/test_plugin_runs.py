@@ -9,9 +9,9 @@ from plugins import install
 from toy_shading import TOY, SkyShading
 
 import polarguide
-from polarguide.errors import PolarguideError
-from polarguide.evaluation.sources import model_digest
+from polarguide.core.errors import PolarguideError
 from polarguide.experiments.compare import ablated
+from polarguide.results.evaluation.sources import model_digest
 from polarguide.shading.deferred import DeferredShading
 
 

@@ -13,25 +13,25 @@ import torch
 from plugins import install
 from torch import Tensor
 
-from polarguide.angles.trainer import AngleTrainer
 from polarguide.capture import Scene
-from polarguide.errors import PolarguideError
-from polarguide.evaluation.scores import score_view
-from polarguide.evaluation.target import ViewTarget
-from polarguide.export.mesh import surface_points
-from polarguide.export.share import BAKED, share_page
+from polarguide.capture.presentation import Crop
+from polarguide.core.errors import PolarguideError
 from polarguide.gaussians.ply import read_ply
-from polarguide.presentation import Crop
+from polarguide.geometry.scene_frame import scene_frame
 from polarguide.raster import choose_backend
 from polarguide.recipes import ablations_of, recipe_named
-from polarguide.rendering.relight import needs_radiance
+from polarguide.results.evaluation.scores import score_view
+from polarguide.results.evaluation.target import ViewTarget
+from polarguide.results.export.mesh import surface_points
+from polarguide.results.export.share import BAKED, share_page
+from polarguide.results.rendering.relight import needs_radiance
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.model import write_run_ply
-from polarguide.scene_frame import scene_frame
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.result import LAYERS, RenderResult
 from polarguide.training.actions import reset_opacity
+from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState

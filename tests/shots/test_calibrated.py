@@ -11,8 +11,8 @@ from heard import Heard
 from made_sensor import made_sensor, true_calibration, write_codes
 
 from polarguide.capture.sensor.analyzer_file import write_analyzers
-from polarguide.errors import PolarguideError
-from polarguide.measurement.line import measure_shots
+from polarguide.core.errors import PolarguideError
+from polarguide.shots.measurement.line import measure_shots
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import read_shot
 from polarguide.shots.write import write_shots

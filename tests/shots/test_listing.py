@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polarguide.errors import PolarguideError
-from polarguide.polarizer import ANGLES
+from polarguide.core.errors import PolarguideError
+from polarguide.optics.polarizer import ANGLES
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import read_shot

@@ -11,7 +11,7 @@ import pytest
 
 import polarguide
 from polarguide.capture.calibration import Calibration
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import read_shot

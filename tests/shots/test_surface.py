@@ -11,14 +11,14 @@ import torch
 
 import polarguide
 from polarguide import optics
-from polarguide.errors import PolarguideError
-from polarguide.rendering.priors import _guide
+from polarguide.core.errors import PolarguideError
+from polarguide.geometry.vectors import unit
+from polarguide.results.rendering.priors import _guide
 from polarguide.shots.develop import Developed
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.maps import NoiseModel, ShotMaps
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import TOWARD, camera_of, maps_of, parse_intrinsics, read_shot, surface_maps
-from polarguide.vectors import unit
 
 VIEW = "v000"
 

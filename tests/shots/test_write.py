@@ -17,8 +17,8 @@ import torch
 import polarguide
 from polarguide import optics
 from polarguide.capture.exposures import FOUR
-from polarguide.errors import PolarguideError
-from polarguide.options import SceneOptions
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import SceneOptions
 from polarguide.shots.exposures import find_shots
 from polarguide.shots.maps import Reason, ShotMaps
 from polarguide.shots.options import ShotOptions

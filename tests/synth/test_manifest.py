@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.synth.folder import MANIFEST, folder_state, verify_scene
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.synth.build import _user_mesh
 
 HEAD = "ply\nformat binary_little_endian 1.0\nelement vertex {}\n" + "".join(

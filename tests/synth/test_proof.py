@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera, look_at
+from polarguide.geometry.camera import Camera, look_at
+from polarguide.geometry.vectors import unit_array as unit
 from polarguide.synth.build import BuiltScene, build_scene
 from polarguide.synth.film import LobeRadiance, render_lobes
 from polarguide.synth.ground_truth import ground_truth_maps
 from polarguide.synth.schema import parse_scene
 from polarguide.synth.settings import Variant
 from polarguide.synth.transport import PathLimits
-from polarguide.vectors import unit_array as unit
 
 INDEX = 1.5
 BALL = {

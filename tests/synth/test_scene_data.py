@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.synth.build import area_light_dict
 from polarguide.synth.colmap import place_cameras
 from polarguide.synth.mesh import Mesh, write_ply

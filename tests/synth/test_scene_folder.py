@@ -22,8 +22,8 @@ from tiny_capture import write_picture
 from polarguide import optics
 from polarguide.capture import load_scene
 from polarguide.capture.colmap.model import read_model
-from polarguide.errors import PolarguideError
-from polarguide.progress import Reporter
+from polarguide.core.errors import PolarguideError
+from polarguide.core.progress import Reporter
 from polarguide.synth import render as runner
 from polarguide.synth.folder import MANIFEST, photograph, scene_digest, verify_scene
 from polarguide.synth.render import Sweep, sweep_scenes, synthesize

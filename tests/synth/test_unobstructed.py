@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull, Delaunay
 
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.synth.build import _mesh
 from polarguide.synth.colmap import place_cameras
 from polarguide.synth.settings import PRESETS, find_scene

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from polarguide.capture import Scene
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.raster import Backend, choose_backend, rasterize_reference
 from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve

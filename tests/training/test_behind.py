@@ -7,7 +7,7 @@ import torch
 from raster_scenes import difference
 from torch import Tensor
 
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.raster import rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.interface import Rasterize

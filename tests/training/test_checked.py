@@ -15,8 +15,8 @@ from torch import Tensor
 
 import polarguide
 from polarguide.capture import Scene
-from polarguide.errors import PolarguideError
-from polarguide.options import SceneOptions, SessionOptions
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.recipes import RECIPES, recipe_named
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint

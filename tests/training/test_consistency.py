@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.shading.result import RenderResult
 from polarguide.training.losses import consistency_loss, depth_normals
 

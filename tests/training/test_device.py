@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from polarguide.camera import Camera
 from polarguide.capture import Scene
+from polarguide.geometry.camera import Camera
 from polarguide.raster import Backend, Rasterized, ScreenStatistic, Splats
 from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve

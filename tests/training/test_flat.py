@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera, look_at
 from polarguide.capture import View
 from polarguide.capture.view import FULL_CODE
-from polarguide.polarizer import ANGLES
+from polarguide.geometry.camera import Camera, look_at
+from polarguide.geometry.vectors import dot, unit
+from polarguide.optics.polarizer import ANGLES
 from polarguide.training.flat import FlatRules, flat_surface, flat_surfaces
 from polarguide.training.priors import view_priors
 from polarguide.training.recipe import Priors
-from polarguide.vectors import dot, unit
 
 WIDTH, HEIGHT, INDEX = 80, 60, 1.5
 UP = torch.tensor([0.0, 0.0, 1.0])

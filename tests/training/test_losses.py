@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from polarguide import optics
-from polarguide.camera import Camera
-from polarguide.color import srgb_encode
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.geometry.camera import Camera
+from polarguide.optics.color import srgb_encode
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.result import RenderResult
 from polarguide.training.losses import (

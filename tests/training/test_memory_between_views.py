@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from polarguide.capture import View
+from polarguide.core.system import MemoryBound
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.system import MemoryBound
 from polarguide.training import flat
 from polarguide.training.actions import outward_directions
 from polarguide.training.metals.evidence import evidence

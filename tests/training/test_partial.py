@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from polarguide import optics
-from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.capture.exposures import FOUR, PLAIN, Exposure
+from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.result import RenderResult

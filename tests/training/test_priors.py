@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 
 from polarguide import optics
 from polarguide.capture import GroundTruth, View, load_scene
-from polarguide.color import srgb_decode, srgb_encode
+from polarguide.optics.color import srgb_decode, srgb_encode
 from polarguide.training.losses import azimuth_loss
 from polarguide.training.priors import ViewPriors, debiased_dolp, guide_normals, view_priors
 from polarguide.training.recipe import Priors

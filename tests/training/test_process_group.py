@@ -13,9 +13,9 @@ import pytest
 from safetensors.torch import load_file
 
 import polarguide
-from polarguide.options import SceneOptions, SessionOptions
+from polarguide.core.options import SceneOptions, SessionOptions
+from polarguide.core.system import process_is_alive
 from polarguide.runs.folder import CHECKPOINT
-from polarguide.system import process_is_alive
 
 pytestmark = [
     pytest.mark.slow,

@@ -14,9 +14,9 @@ import torch
 
 import polarguide
 from polarguide.capture import load_scene
-from polarguide.errors import PolarguideError
-from polarguide.options import SceneOptions
-from polarguide.progress import Reporter
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import SceneOptions
+from polarguide.core.progress import Reporter
 from polarguide.raster import choose_backend
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.recipes import RECIPES

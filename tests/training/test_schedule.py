@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
 from polarguide.training.recipe import Recipe, Repeat, Rounds, Schedule, Stage
 

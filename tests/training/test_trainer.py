@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve

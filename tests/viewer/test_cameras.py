@@ -9,8 +9,8 @@ import pytest
 import torch
 from random_runs import ring
 
-from polarguide.camera import quaternion
-from polarguide.trajectory import read_path
+from polarguide.geometry.camera import quaternion
+from polarguide.geometry.trajectory import read_path
 from polarguide.viewer.cameras import FRAMES_PER_SECOND, Keyframes, free_camera, letterbox, window_fov
 
 CAMERA = next(iter(ring().values()))

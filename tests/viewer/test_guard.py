@@ -19,7 +19,7 @@ from viewer_scenes import photographs, shown
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.viewer import Viewer, guard
 from polarguide.viewer.guard import Gate
 from polarguide.viewer.messages import LARGEST, Refused, checked, choice, flag, number, pair

@@ -14,7 +14,7 @@ import torch
 from fake_browser import FakeClient
 from viewer_scenes import frame_of_scene, photographs, shown
 
-from polarguide.presentation import (
+from polarguide.capture.presentation import (
     PRESENTATION_FILE,
     Crop,
     Presentation,
@@ -22,7 +22,7 @@ from polarguide.presentation import (
     read_presentation,
     write_presentation,
 )
-from polarguide.rendering.picking import gains_of, gray_world, surface_at
+from polarguide.results.rendering.picking import gains_of, gray_world, surface_at
 from polarguide.shading.result import LAYERS
 from polarguide.viewer.cameras import letterbox
 from polarguide.viewer.messages import Refused, checked

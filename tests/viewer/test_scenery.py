@@ -13,11 +13,11 @@ from small_fields import small
 from textured_ball import textured_ball
 from viewer_scenes import frame_of_scene, photograph, shown
 
-from polarguide.neural.trainer import FieldTrainer
-from polarguide.presentation import Crop
+from polarguide.capture.presentation import Crop
+from polarguide.fields.trainer import FieldTrainer
+from polarguide.geometry.scene_frame import scene_frame
 from polarguide.runs.defaults import resolve
 from polarguide.runs.train import train
-from polarguide.scene_frame import scene_frame
 from polarguide.shading.result import LAYERS
 from polarguide.training.settings import TrainSettings
 from polarguide.viewer.cameras import letterbox

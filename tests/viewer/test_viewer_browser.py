@@ -19,8 +19,8 @@ from browsers import PATIENCE, REBOUND, chromium
 from random_runs import ring
 from viewer_scenes import photograph, shown
 
-from polarguide.presentation import Presentation
-from polarguide.rendering.picking import gains_of, surface_at
+from polarguide.capture.presentation import Presentation
+from polarguide.results.rendering.picking import gains_of, surface_at
 from polarguide.viewer import Viewer
 from polarguide.visualization import figures
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from polarguide.camera import Camera
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.geometry.camera import Camera
 from polarguide.visualization import figures
 from polarguide.visualization.figures import contact_sheet
 from polarguide.visualization.layers import clipping_exposure

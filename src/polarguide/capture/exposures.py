@@ -15,13 +15,13 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture.calibration import Calibration
-from polarguide.errors import PolarguideError
-from polarguide.files import read_file
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import read_file
+from polarguide.core.records import shortened
+from polarguide.core.spreadsheet import csv_lines
+from polarguide.core.text import number_or_nan
 from polarguide.optics import Mount
-from polarguide.polarizer import ANGLES
-from polarguide.records import shortened
-from polarguide.spreadsheet import csv_lines
-from polarguide.text import number_or_nan
+from polarguide.optics.polarizer import ANGLES
 
 Angle = float | Literal["unknown", "none"]
 """Degrees counter-clockwise from the picture's horizontal, modulo 180; or a word."""

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from polarguide.capture import box_filter as boxes
 from polarguide.capture.formats.arrays import BROKEN, unpacked
-from polarguide.errors import PolarguideError
-from polarguide.records import decode
+from polarguide.core.errors import PolarguideError
+from polarguide.core.records import decode
 
 ROUGH = 0.15
 """GGX roughness above which a surface is called rough: its lobe is wider than some nine degrees to each side."""

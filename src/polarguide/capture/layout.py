@@ -12,8 +12,8 @@ from pathlib import Path
 from polarguide.capture.exposures import FOUR, TABLE, Exposure, Line, read_table
 from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.view import ANGLES, listed, unknown_view
-from polarguide.errors import PolarguideError
-from polarguide.files import require_folder
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import require_folder
 
 _PICTURE_STEM = re.compile(r"(?P<view>.+)_(?P<angle>000|045|090|135)")
 _ANGLE_FOLDER = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>\d{1,3})(?:deg)?", re.IGNORECASE)

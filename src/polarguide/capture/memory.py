@@ -8,8 +8,8 @@ from pathlib import Path
 
 from polarguide.capture.formats.pictures import stated_size
 from polarguide.capture.layout import Layout
-from polarguide.errors import PolarguideError
-from polarguide.system import free_memory
+from polarguide.core.errors import PolarguideError
+from polarguide.core.system import free_memory
 
 GIBIBYTE = 1 << 30
 SHARE = 0.8

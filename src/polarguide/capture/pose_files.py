@@ -14,10 +14,10 @@ from msgspec import Meta
 from polarguide.capture.colmap.files import PosedCamera
 from polarguide.capture.datasets.dataset import checked_pose, pinhole_camera, read_projections
 from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
-from polarguide.errors import PolarguideError
-from polarguide.files import read_file
-from polarguide.records import read_record
-from polarguide.text import number_or_nan
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import read_file
+from polarguide.core.records import read_record
+from polarguide.core.text import number_or_nan
 
 SUFFIXES = (".json", ".xml", ".npz")
 _SQUARE = ((3, 4), (4, 4))

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from polarguide.camera import Camera
 from polarguide.capture import checks
 from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unseen_points, unused_poses
 from polarguide.capture.exposures import FOUR
@@ -25,9 +24,10 @@ from polarguide.capture.metadata import held_out, indices_of, mount_of, refracti
 from polarguide.capture.split import chosen_views, far_from_training, held_out_band
 from polarguide.capture.view import Scene, listed
 from polarguide.capture.view_reader import Files, ViewData, ViewFiles, check_materials, read_view
-from polarguide.errors import PolarguideError
-from polarguide.options import Split, check_choice
-from polarguide.progress import SILENT, Reporter
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import Split, check_choice
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.geometry.camera import Camera
 
 _THREADS = 4
 

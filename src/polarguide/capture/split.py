@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.camera import Camera
-from polarguide.options import Split
+from polarguide.core.options import Split
+from polarguide.geometry.camera import Camera
 
 TEST_EVERY = 8
 """One view in so many is held out."""

@@ -15,13 +15,13 @@ from scipy.ndimage import label
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import seen_at
 from polarguide.capture.box_filter import agreed, every, maximum, mean_codes
 from polarguide.capture.exposures import FOUR, PLAIN, Exposure
 from polarguide.capture.view import FULL_CODE, Latest, Loader, Scene, View
-from polarguide.errors import PolarguideError
-from polarguide.options import EXPOSURES, Exposures, check_choice
-from polarguide.polarizer import ANGLES
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import EXPOSURES, Exposures, check_choice
+from polarguide.geometry.camera import seen_at
+from polarguide.optics.polarizer import ANGLES
 
 BLACK = 0.005
 """Linear S0/2 up to which a pixel is black: a little over one step of 8 bits, which is what noise and rounding leave of

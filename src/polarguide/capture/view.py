@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera
 from polarguide.capture.exposures import (
     FOUR,
     Exposure,
@@ -22,9 +21,10 @@ from polarguide.capture.exposures import (
     radiance_places,
 )
 from polarguide.capture.ground_truth import GroundTruth, SceneObject
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
-from polarguide.polarizer import ANGLES as ANGLES
+from polarguide.optics.polarizer import ANGLES as ANGLES
 
 T = TypeVar("T")
 

@@ -15,7 +15,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polarguide.camera import Camera
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import checks
 from polarguide.capture.exposures import Exposure
@@ -31,10 +30,11 @@ from polarguide.capture.formats.pictures import (
 from polarguide.capture.ground_truth import GroundTruth, read_ground_truth
 from polarguide.capture.layout import Layout
 from polarguide.capture.view import Latest, Loader, View
-from polarguide.errors import PolarguideError
-from polarguide.files import LARGEST_FILE, read_file
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import LARGEST_FILE, read_file
+from polarguide.core.records import LARGEST_RECORD
+from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
-from polarguide.records import LARGEST_RECORD
 
 
 class Files:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.exposures import Angle, angle_labels
 from polarguide.capture.view import ANGLES, FULL_CODE
-from polarguide.files import make_folder, write_whole
+from polarguide.core.files import make_folder, write_whole
 
 # Of PNG: the second is better for few values, as those of JPEGs that nothing resampled. libpng's own choice for each
 # row makes files no smaller, as low bits that hold nothing mislead its estimate, and slower to read.

@@ -18,9 +18,9 @@ import tyro
 
 from polarguide import __version__
 from polarguide.cli.console import print_error, warnings_printed
-from polarguide.errors import PolarguideError
-from polarguide.options import gibibytes
-from polarguide.system import check_variables, interrupts
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import gibibytes
+from polarguide.core.system import check_variables, interrupts
 
 VERBS = {
     "demo": "demo",

@@ -10,8 +10,8 @@ from typing import Annotated
 import tyro
 
 from polarguide.cli.console import ConsoleReporter, say, use_threads
-from polarguide.options import ThreadOptions
-from polarguide.sensor_calibration.settings import CalibrateSettings
+from polarguide.core.options import ThreadOptions
+from polarguide.shots.calibration.settings import CalibrateSettings
 
 
 def calibrate(
@@ -32,7 +32,7 @@ def calibrate(
         out: File to write, ending in .safetensors; a picture (PNG) of the same name goes beside it.
     """
     use_threads(compute.threads)
-    calibration = importlib.import_module("polarguide.sensor_calibration.calibrate")
+    calibration = importlib.import_module("polarguide.shots.calibration.calibrate")
     done = calibration.calibrate_sensor(shots, out, settings, ConsoleReporter())
     say(f"calibration: {done.path}   picture: {done.picture}")
     option = f"--sensor {settings.sensor} --calibration {shlex.quote(str(done.path))}"

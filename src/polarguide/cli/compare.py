@@ -10,7 +10,7 @@ import tyro
 
 import polarguide
 from polarguide.cli.console import JobReporter, say, use_threads
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.experiments.options import CompareOptions
 from polarguide.training.settings import Background, Materials, TrainSettings
 

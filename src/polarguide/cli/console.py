@@ -18,11 +18,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Column
 
 import polarguide
-from polarguide.errors import PolarguideWarning
-from polarguide.options import ComputeOptions, ThreadOptions
-from polarguide.progress import Advance, Reporter
-from polarguide.system import process_rank
-from polarguide.text import printable
+from polarguide.core.errors import PolarguideWarning
+from polarguide.core.options import ComputeOptions, ThreadOptions
+from polarguide.core.progress import Advance, Reporter
+from polarguide.core.system import process_rank
+from polarguide.core.text import printable
 
 # Of several processes of one training, the first alone talks.
 console = Console(highlight=False, soft_wrap=True, quiet=process_rank() > 0)
@@ -115,7 +115,7 @@ class Lines:
         self._line = ""
 
     def __call__(self, done: int, *, total: int | None = None, note: str = "") -> None:
-        """See ``progress.Advance``."""
+        """See ``core.progress.Advance``."""
         now = self._clock()
         self._total = total or self._total
         if not self._seen or now - self._seen[-1][0] >= 1:

@@ -10,7 +10,7 @@ from polarguide.cli.console import say
 from polarguide.cli.evaluate import evaluate
 from polarguide.cli.render import render
 from polarguide.cli.train import train
-from polarguide.options import ComputeOptions, SessionOptions, ThreadOptions
+from polarguide.core.options import ComputeOptions, SessionOptions, ThreadOptions
 from polarguide.training.settings import TrainSettings
 
 STEPS = 2000

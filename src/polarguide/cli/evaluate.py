@@ -9,8 +9,8 @@ from rich.table import Table
 from rich.text import Text
 
 from polarguide.cli.console import RunFolder, console, opened, say, warn
-from polarguide.options import ComputeOptions
-from polarguide.text import printable
+from polarguide.core.options import ComputeOptions
+from polarguide.core.text import printable
 
 _MOST_OBJECTS = 100
 """Lines of the table: a terminal takes minutes to lay out the most that a scene may have."""
@@ -40,14 +40,14 @@ def evaluate(
         warn(warning)
     say(f"polarization: {trained.polarization}")
     say("health: not recorded, the training was not checked" if found is None else found.summary)
-    sheet = importlib.import_module("polarguide.evaluation.error_sheet").ERRORS_FILE
+    sheet = importlib.import_module("polarguide.results.evaluation.error_sheet").ERRORS_FILE
     say(f"metrics: {run / 'metrics.json'}")
     say(f"where the errors are: {run / sheet}")
 
 
 def print_scores(record: dict[str, Any], title: str) -> None:
     """Print a run's record as tables: its metrics, and its errors by object and material."""
-    metrics = importlib.import_module("polarguide.evaluation.table")
+    metrics = importlib.import_module("polarguide.results.evaluation.table")
     table = Table(title=Text(printable(title)))
     table.add_column("metric")
     table.add_column("value", justify="right")

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Literal
 
 from polarguide.cli.console import RunFolder, opened, say, size_text
-from polarguide.errors import require_package
-from polarguide.options import EXPORT_PACKAGES, ExportFormat, ThreadOptions
+from polarguide.core.errors import require_package
+from polarguide.core.options import EXPORT_PACKAGES, ExportFormat, ThreadOptions
 
 
 def export(

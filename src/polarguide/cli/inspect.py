@@ -9,9 +9,9 @@ from typing import Annotated, Any
 import tyro
 
 from polarguide.cli.console import ConsoleReporter, console, say, use_threads
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import ComputeOptions
 from polarguide.inspection.settings import InspectSettings
-from polarguide.options import ComputeOptions
 
 COLORS = {"ok": "green", "warning": "yellow", "wrong": "bold red", "n/a": "dim", "not verified": "magenta"}
 

@@ -11,12 +11,12 @@ from typing import Annotated, Any
 import tyro
 
 from polarguide.cli.console import ConsoleReporter, console, print_error, say, use_threads
-from polarguide.errors import PolarguideError
-from polarguide.measurement.options import MeasureOptions, WatchOptions
-from polarguide.options import ThreadOptions
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import ThreadOptions
+from polarguide.core.system import StopSignals
 from polarguide.preparation.settings import CalibrationOptions
+from polarguide.shots.measurement.options import MeasureOptions, WatchOptions
 from polarguide.shots.options import ShotOptions
-from polarguide.system import StopSignals
 
 
 def measure(
@@ -59,10 +59,10 @@ def measure(
     reading = replace(reading, calibration=angles.read(), analyzers=angles.analyzers())
     heard = partial(_print_entry, every=watching.watch is not None)
     if watching.watch is None:
-        line = importlib.import_module("polarguide.measurement.line")
+        line = importlib.import_module("polarguide.shots.measurement.line")
         outcome = line.measure_shots(paths, out, options, reading, heard=heard, reporter=ConsoleReporter())
     else:
-        watch = importlib.import_module("polarguide.measurement.watch")
+        watch = importlib.import_module("polarguide.shots.measurement.watch")
         with StopSignals() as should_stop:
             outcome = watch.watch_folder(
                 watching.watch, out, options, reading, watching,

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from polarguide.cli.console import ConsoleReporter, say, use_threads
-from polarguide.options import ThreadOptions
+from polarguide.core.options import ThreadOptions
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 
 

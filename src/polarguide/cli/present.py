@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from polarguide.cli.console import ConsoleReporter, say, use_threads
-from polarguide.options import ComputeOptions
+from polarguide.core.options import ComputeOptions
 
 
 def present(
@@ -50,7 +50,7 @@ def present(
         provenance: Where, when and with what it was captured, or its number in an inventory.
     """
     use_threads(compute.threads)
-    presenting = importlib.import_module("polarguide.rendering.present")
+    presenting = importlib.import_module("polarguide.results.rendering.present")
     shown = presenting.present(
         folder,
         white_balance=white_balance or None,

@@ -11,10 +11,10 @@ import tyro
 
 import polarguide
 from polarguide.cli.console import ConsoleReporter, say, use_threads
-from polarguide.errors import PolarguideError
-from polarguide.options import SceneOptions, ThreadOptions
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import SceneOptions, ThreadOptions
+from polarguide.core.records import option_name
 from polarguide.preparation.settings import CalibrationOptions
-from polarguide.records import option_name
 from polarguide.shots.options import ShotOptions
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from polarguide.cli.console import RunFolder, opened, say
-from polarguide.errors import PolarguideError, require_package
-from polarguide.options import ComputeOptions, PictureFormat, check_finite
+from polarguide.core.errors import PolarguideError, require_package
+from polarguide.core.options import ComputeOptions, PictureFormat, check_finite
 
 FRAMES = 120
 

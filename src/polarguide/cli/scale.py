@@ -6,9 +6,9 @@ from pathlib import Path
 
 from polarguide.capture.filter.ring_scale import ring_scale
 from polarguide.cli.console import console
-from polarguide.errors import PolarguideError
-from polarguide.files import make_folder, read_file, write_whole
-from polarguide.options import check_finite
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import make_folder, read_file, write_whole
+from polarguide.core.options import check_finite
 
 
 def scale(*, diameter: float, out: Path = Path("filter-scale.svg")) -> None:

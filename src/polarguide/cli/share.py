@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from polarguide.cli.console import RunFolder, opened, say, size_text
-from polarguide.options import ThreadOptions
+from polarguide.core.options import ThreadOptions
 
 
 def share(

@@ -10,8 +10,8 @@ from typing import Annotated
 import tyro
 
 from polarguide.cli.console import ConsoleReporter, console, say, use_threads
-from polarguide.errors import PolarguideError
-from polarguide.options import ThreadOptions
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import ThreadOptions
 from polarguide.synth.settings import LONG_SECONDS, Overrides, SynthSettings, find_scene, rough_time
 
 

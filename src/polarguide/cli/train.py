@@ -9,8 +9,8 @@ import tyro
 
 import polarguide
 from polarguide.cli.console import ConsoleReporter, say
-from polarguide.options import SceneOptions, SessionOptions
-from polarguide.system import StopSignals
+from polarguide.core.options import SceneOptions, SessionOptions
+from polarguide.core.system import StopSignals
 from polarguide.training.settings import TrainSettings
 
 

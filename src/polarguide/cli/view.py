@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from polarguide.cli.console import RunFolder, opened
-from polarguide.errors import PolarguideError, require_package
-from polarguide.options import LOOPBACK, ComputeOptions, VisitorOptions
+from polarguide.core.errors import PolarguideError, require_package
+from polarguide.core.options import LOOPBACK, ComputeOptions, VisitorOptions
 
 
 def view(

@@ -7,16 +7,16 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from polarguide.capture.layout import refuse_scene
-from polarguide.errors import PolarguideError
-from polarguide.evaluation.mesh import missing_package
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import make_folder
+from polarguide.core.options import PathLike
+from polarguide.core.progress import SILENT, Reporter
 from polarguide.experiments.compare import compare, locked
 from polarguide.experiments.options import BENCH, Bench, BenchOptions
 from polarguide.experiments.results import Results
-from polarguide.files import make_folder
-from polarguide.options import PathLike
-from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
+from polarguide.results.evaluation.mesh import missing_package
 from polarguide.synth.folder import State, folder_state, scene_digest, scene_request, verify_scene
 from polarguide.synth.render import Plan, expected_time, synthesize
 from polarguide.synth.schema import SceneSpec

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.evaluation.table import COLUMNS, Metric
 from polarguide.experiments.results import Results
+from polarguide.results.evaluation.table import COLUMNS, Metric
 from polarguide.runs.folder import RunLog
 from polarguide.visualization.pages import BASE, templates
 

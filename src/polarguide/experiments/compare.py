@@ -13,9 +13,12 @@ from typing import Any
 from polarguide import __version__
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.variants import count_of
-from polarguide.errors import PolarguideError
-from polarguide.evaluation.sources import code_digest, commit
-from polarguide.evaluation.table import COLUMNS, PART_METRICS
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import check_out, make_folder, require_inside, write_text
+from polarguide.core.options import MOST, ComputeOptions, PathLike, check_choice, check_count
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.records import decode
+from polarguide.core.system import only_writer
 from polarguide.experiments.charts import exposure_svg, read_study, study_svg
 from polarguide.experiments.jobs import STDERR, Job, run_jobs
 from polarguide.experiments.options import MOST_SEEDS, CompareOptions
@@ -25,14 +28,11 @@ from polarguide.experiments.report import write_report
 from polarguide.experiments.results import Results
 from polarguide.experiments.worker import Scoring, Task, Training
 from polarguide.experiments.writing import write_tables
-from polarguide.files import check_out, make_folder, require_inside, write_text
-from polarguide.options import MOST, ComputeOptions, PathLike, check_choice, check_count
-from polarguide.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.recipes.registry import ABLATIONS, ablations_of
-from polarguide.records import decode
-from polarguide.system import only_writer
+from polarguide.results.evaluation.sources import code_digest, commit
+from polarguide.results.evaluation.table import COLUMNS, PART_METRICS
 from polarguide.training.recipe import Method
 from polarguide.training.settings import TrainSettings
 

@@ -15,9 +15,9 @@ from typing import Annotated
 
 import msgspec
 
+from polarguide.core.files import make_folder
+from polarguide.core.progress import Advance, Reporter
 from polarguide.experiments.worker import COMMAND, Task, Training, encoded
-from polarguide.files import make_folder
-from polarguide.progress import Advance, Reporter
 from polarguide.runs.folder import LOG
 
 POLL_SECONDS = 0.1

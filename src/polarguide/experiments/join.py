@@ -9,7 +9,10 @@ from pathlib import Path
 import msgspec
 
 from polarguide.capture.layout import refuse_scene
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import make_folder, write_text
+from polarguide.core.options import PathLike, check_choice
+from polarguide.core.records import shortened
 from polarguide.experiments.record import (
     FORMAT,
     Provenance,
@@ -22,9 +25,6 @@ from polarguide.experiments.record import (
 from polarguide.experiments.report import REPORT, report_html
 from polarguide.experiments.results import Results
 from polarguide.experiments.writing import write_tables
-from polarguide.files import make_folder, write_text
-from polarguide.options import PathLike, check_choice
-from polarguide.records import shortened
 
 RECORD = "results.json"
 _REMEDY = "Join records of one commit, with the same recipes and settings."

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from polarguide.errors import PolarguideError
-from polarguide.options import (
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import (
     EXPOSURES,
     MOST_THREADS,
     DeviceName,

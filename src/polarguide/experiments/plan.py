@@ -17,14 +17,14 @@ from typing import Any, Literal
 from polarguide import __version__
 from polarguide.capture import View
 from polarguide.capture.variants import black_pixels, mask_background
-from polarguide.errors import PolarguideError
-from polarguide.evaluation.record import read_metrics
-from polarguide.evaluation.sources import code_digest, model_digest
-from polarguide.evaluation.target import SceneFacts
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import Exposures, SceneOptions, index_of
+from polarguide.core.progress import SILENT, Reporter
 from polarguide.experiments.options import CompareOptions
-from polarguide.options import Exposures, SceneOptions, index_of
-from polarguide.progress import SILENT, Reporter
 from polarguide.recipes.registry import ablations_of
+from polarguide.results.evaluation.record import read_metrics
+from polarguide.results.evaluation.sources import code_digest, model_digest
+from polarguide.results.evaluation.target import SceneFacts
 from polarguide.runs.defaults import compared_steps
 from polarguide.runs.families import family_of
 from polarguide.runs.folder import CONFIGURATION, RunConfiguration, trained_steps

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
-from polarguide.errors import PolarguideError
-from polarguide.records import read_record, shortened
+from polarguide.core.errors import PolarguideError
+from polarguide.core.records import read_record, shortened
 
 FORMAT = "polarguide-results-2"
 FORMER = "polarguide-results-1"

@@ -12,14 +12,14 @@ from msgspec import UNSET
 
 from polarguide.capture import Scene, View
 from polarguide.capture.ground_truth import METAL_CLASSES
-from polarguide.evaluation.metrics import normal_angles_deg
-from polarguide.evaluation.table import COLUMNS
+from polarguide.core.files import write_text
+from polarguide.core.progress import Reporter
 from polarguide.experiments.charts import DASHES, Curve, curves_svg, read_curve
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry
 from polarguide.experiments.results import Results
 from polarguide.experiments.tables import formatted, sections, seed_counts
-from polarguide.files import write_text
-from polarguide.progress import Reporter
+from polarguide.results.evaluation.metrics import normal_angles_deg
+from polarguide.results.evaluation.table import COLUMNS
 from polarguide.runs.health import Health
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.visualization import figures

@@ -12,9 +12,9 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from polarguide.evaluation.table import COLUMNS, PART_METRICS, Metric
 from polarguide.experiments.record import PartScores, Record
 from polarguide.experiments.statistics import differences, known, metric_of_runs, values_of
+from polarguide.results.evaluation.table import COLUMNS, PART_METRICS, Metric
 
 COMPARED = tuple(column for column in COLUMNS if column.better is not None and not column.timed)
 """The metrics of which differences are taken: those that have a better side and do not depend on the machine."""

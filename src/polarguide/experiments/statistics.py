@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from polarguide.evaluation.table import Metric
 from polarguide.experiments.record import Record, RunRecord
+from polarguide.results.evaluation.table import Metric
 
 Numbers = NDArray[np.float64]
 Values = dict[str, Numbers]

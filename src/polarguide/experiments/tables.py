@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec import UNSET
 
-from polarguide.evaluation.table import COLUMNS, MESH_LABEL, PART_METRICS, Metric
 from polarguide.experiments.record import RunRecord
 from polarguide.experiments.results import Cell, Results, Row
 from polarguide.experiments.statistics import (
@@ -25,6 +24,7 @@ from polarguide.experiments.statistics import (
     seed_means,
     values_of,
 )
+from polarguide.results.evaluation.table import COLUMNS, MESH_LABEL, PART_METRICS, Metric
 
 NOT_APPLICABLE = "n/a"
 MEAN_TITLE = "mean over scenes"

@@ -9,14 +9,14 @@ from typing import Any
 
 import msgspec
 
-from polarguide.errors import PolarguideError
-from polarguide.evaluation.evaluate import evaluate
-from polarguide.options import ComputeOptions, SceneOptions, SessionOptions
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import ComputeOptions, SceneOptions, SessionOptions
+from polarguide.core.records import decode, to_json
+from polarguide.core.system import StopSignals, keep_freed_memory
 from polarguide.raster import use_threads
-from polarguide.records import decode, to_json
+from polarguide.results.evaluation.evaluate import evaluate
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import train
-from polarguide.system import StopSignals, keep_freed_memory
 from polarguide.training.settings import TrainSettings
 
 PACKAGE = Path(__file__).parents[1]

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pandas as pd
 
+from polarguide.core.files import write_text
+from polarguide.core.spreadsheet import plain
+from polarguide.core.text import printable
 from polarguide.experiments.results import Results
 from polarguide.experiments.tables import MINUS, Section, sections
-from polarguide.files import write_text
-from polarguide.spreadsheet import plain
-from polarguide.text import printable
 from polarguide.visualization.pages import templates
 
 _LATEX = {

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import quaternions_to_rotations
+from polarguide.geometry.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 
 # What every recipe trains, with the shape of one Gaussian's values. A shading model adds parameters of its own.
 CORE_SHAPES = {

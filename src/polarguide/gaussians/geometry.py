@@ -10,8 +10,8 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import normalize
 
 from polarguide import _native
-from polarguide.native import fits
-from polarguide.vectors import dot, unit
+from polarguide.core.native import fits
+from polarguide.geometry.vectors import dot, unit
 
 # Cosine of the angle to the camera under which the outward side decides, not the camera.
 GRAZING = 0.35

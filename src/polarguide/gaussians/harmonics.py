@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from polarguide import _native
-from polarguide.native import fits
+from polarguide.core.native import fits
 
 SH_C0 = 0.28209479177387814
 """The basis function of degree 0."""

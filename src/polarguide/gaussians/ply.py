@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 from torch import Tensor
 
-from polarguide.errors import PolarguideError
-from polarguide.files import atomic
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import atomic
 from polarguide.gaussians.harmonics import sh_basis
-from polarguide.vectors import spread_directions
+from polarguide.geometry.vectors import spread_directions
 
 REST_COUNT = 15
 DIRECTIONS = 64

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera
 from polarguide.capture import checks
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import ColmapModel, read_model
@@ -24,9 +23,10 @@ from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.metadata import applied_calibration, indices_of, refractive_index_of
 from polarguide.capture.reader import StoredViews, check_transfer, read_views
 from polarguide.capture.view import FULL_CODE
-from polarguide.files import read_file
-from polarguide.progress import SILENT, Reporter
-from polarguide.records import LARGEST_RECORD
+from polarguide.core.files import read_file
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.records import LARGEST_RECORD
+from polarguide.geometry.camera import Camera
 
 LONGEST = 640
 """Pixels of the longer side that pictures are averaged down to (by whole factors)."""

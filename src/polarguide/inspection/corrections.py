@@ -20,19 +20,19 @@ from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented
 from polarguide.capture.colmap.files import MODELS
 from polarguide.capture.colmap.poses import Geometry, undistortion
 from polarguide.capture.layout import describe_contents
+from polarguide.capture.presentation import PRESENTATION_FILE
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
 from polarguide.capture.write import intensity_codes, write_view
-from polarguide.errors import PolarguideError
-from polarguide.files import read_file, write_whole, writing
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import read_file, write_whole, writing
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.records import decode, read_record, shortened, to_json
 from polarguide.inspection.angles import AngleFindings, swaps
 from polarguide.inspection.capture import Capture, InspectedView
 from polarguide.inspection.verdict import Check
-from polarguide.presentation import PRESENTATION_FILE
-from polarguide.progress import SILENT, Reporter
-from polarguide.records import decode, read_record, shortened, to_json
 
 COPIED = ("sparse", "masks", "invalid", "gt", "split.json", PRESENTATION_FILE)
 """Files and folders that are copied unchanged."""

@@ -17,11 +17,11 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
 from polarguide import optics
-from polarguide.camera import Camera
 from polarguide.capture.colmap.model import ColmapModel
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
 from polarguide.inspection.angles import DEGREES, PAIRINGS, SENSES, Evidence, spatial_cells, sum_by_cluster
 from polarguide.inspection.capture import InspectedView
-from polarguide.vectors import dot, unit
 
 NORMALS = "normals of a short training"
 SAMPLES = 400

@@ -9,8 +9,11 @@ from pathlib import Path
 
 from polarguide.capture import Scene, load_scene
 from polarguide.capture.layout import refuse_scene
-from polarguide.errors import PolarguideError
-from polarguide.files import check_out, require_inside
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import check_out, require_inside
+from polarguide.core.options import index_of
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.records import check_options
 from polarguide.inspection.angles import (
     AngleFindings,
     Evidence,
@@ -34,10 +37,7 @@ from polarguide.inspection.settings import InspectSettings
 from polarguide.inspection.short_run import LONGEST, short_run, surface_of
 from polarguide.inspection.shots import ShotFindings, find_shots, pictures_check, shot_checks
 from polarguide.inspection.verdict import Check, Verdict, worst
-from polarguide.options import index_of
-from polarguide.progress import SILENT, Reporter
 from polarguide.raster import Backend
-from polarguide.records import check_options
 
 SURE = 0.98
 """Probability from which on ``auto`` is content with the points."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from polarguide.core.progress import SILENT, Reporter
 from polarguide.inspection.angles import AngleFindings
 from polarguide.inspection.capture import ViewMeasurements
 from polarguide.inspection.inspect import Inspection
 from polarguide.inspection.layers import LAYERS, SHOT_LAYERS, layer_uris
 from polarguide.inspection.shots import ShotFindings
-from polarguide.progress import SILENT, Reporter
 from polarguide.visualization import figures
 from polarguide.visualization.pages import page
 

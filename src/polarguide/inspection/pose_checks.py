@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from polarguide.camera import Camera
 from polarguide.capture.view import listed
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.scene_frame import scene_frame
+from polarguide.geometry.vectors import unit_array
 from polarguide.inspection.capture import Capture, InspectedView
 from polarguide.inspection.verdict import Check, Verdict
-from polarguide.scene_frame import scene_frame
-from polarguide.vectors import unit_array
 
 NEIGHBORS = 4
 FEATURES = 3000

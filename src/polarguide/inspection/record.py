@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from polarguide import __version__
-from polarguide.files import make_folder, write_text, write_whole
+from polarguide.core.files import make_folder, write_text, write_whole
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.records import to_json
 from polarguide.inspection.inspect import Inspection
 from polarguide.inspection.page_html import FILE as PAGE
 from polarguide.inspection.page_html import inspection_html
 from polarguide.inspection.verdict import plain
-from polarguide.progress import SILENT, Reporter
-from polarguide.records import to_json
 
 SCHEMA = 2
 """Raised whenever a key changes its meaning or goes away; new keys do not raise it."""

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from polarguide.options import Transfer
+from polarguide.core.options import Transfer
 
 Normals = Literal["auto", "points", "train"]
 

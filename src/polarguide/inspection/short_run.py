@@ -15,24 +15,24 @@ from typing import Any
 import torch
 
 from polarguide import __version__
-from polarguide.angles.trainer import AngleTrainer
 from polarguide.capture import Scene, View
 from polarguide.capture.exposures import FOUR
-from polarguide.errors import PolarguideError
-from polarguide.files import write_text
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import write_text
+from polarguide.core.records import read_record
+from polarguide.geometry.vectors import dot, unit
 from polarguide.inspection.evidence import Surface
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
-from polarguide.records import read_record
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
 from polarguide.shading.gbuffer import RenderRequest, render
+from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.losses import depth_normals
 from polarguide.training.priors import guide_normals
 from polarguide.training.recipe import Priors, Recipe
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide.vectors import dot, unit
 
 RECIPE = "3dgs-dr:consistent"
 LONGEST = 160

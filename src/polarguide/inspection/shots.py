@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from polarguide.angles.polarizers import REMEDY, Judgment, Polarizers
 from polarguide.capture import Scene
 from polarguide.capture.exposures import Exposure
 from polarguide.capture.view import View, listed
@@ -23,6 +22,7 @@ from polarguide.inspection.short_run import short_run
 from polarguide.inspection.verdict import Check, Verdict
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
+from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers
 from polarguide.training.recipe import Recipe
 from polarguide.training.trainer import StepReport
 

@@ -34,6 +34,7 @@ from polarguide.optics.normals import (
     physical_candidates,
     polarization_mask,
 )
+from polarguide.optics.polarizer import ANGLES
 from polarguide.optics.separation import (
     Separation,
     exact_separation,
@@ -56,7 +57,6 @@ from polarguide.optics.stokes import (
     polarization_uncertainty,
     stokes,
 )
-from polarguide.polarizer import ANGLES
 
 __all__ = [
     "ANGLES",

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from polarguide.vectors import dot
+from polarguide.geometry.vectors import dot
 
 
 def safe_sqrt(x: Tensor) -> Tensor:

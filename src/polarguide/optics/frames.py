@@ -11,8 +11,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from polarguide.geometry.vectors import dot
 from polarguide.optics._numerics import for_arrays, safe_atan2
-from polarguide.vectors import dot
 
 
 @for_arrays

@@ -24,6 +24,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from polarguide.geometry.vectors import dot
 from polarguide.optics._numerics import (
     check_leading,
     check_refractive_index,
@@ -36,7 +37,6 @@ from polarguide.optics._numerics import (
 from polarguide.optics.frames import normal_from_angles
 from polarguide.optics.fresnel import diffuse_dolp_limit, diffuse_zenith, specular_zeniths
 from polarguide.optics.stokes import aolp, dolp, luminance
-from polarguide.vectors import dot
 
 
 class Candidates(NamedTuple):

@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from polarguide.camera import Camera
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.exposures import TABLE, angle_text
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, linear_codes, read_picture
 from polarguide.capture.view import FULL_CODE, listed
 from polarguide.capture.write import picture_names
-from polarguide.files import write_whole
+from polarguide.core.files import write_whole
+from polarguide.core.progress import Reporter
+from polarguide.geometry.camera import Camera
 from polarguide.preparation.folder import SceneFolder
-from polarguide.progress import Reporter
 
 Array = NDArray[np.floating[Any]]
 FEWEST = 20

@@ -47,10 +47,10 @@ from polarguide.capture.formats.pictures import stated_size
 from polarguide.capture.memory import require_memory_of_each
 from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.write import EXACT, Rounding
-from polarguide.errors import PolarguideError, PolarguideWarning
+from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.progress import Advance
 from polarguide.preparation.settings import PrepareSettings, white_gains
 from polarguide.preparation.source import DevelopedView, Source
-from polarguide.progress import Advance
 
 _JUDGED_VIEWS = 8
 # Bytes for each pixel of a shot: as stored and stacked, linear, aligned or turned, written.

@@ -33,13 +33,13 @@ from polarguide.capture.write import (
     write_png,
     write_view,
 )
-from polarguide.errors import PolarguideError
-from polarguide.files import check_out, holds_files, make_folder, read_file, require_inside, write_whole
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import check_out, holds_files, make_folder, read_file, require_inside, write_whole
+from polarguide.core.progress import Reporter
+from polarguide.core.records import decode, read_record, shortened, to_json
+from polarguide.core.system import hold_folder
 from polarguide.preparation.settings import PrepareSettings, known_intrinsics
 from polarguide.preparation.source import Source
-from polarguide.progress import Reporter
-from polarguide.records import decode, read_record, shortened, to_json
-from polarguide.system import hold_folder
 
 JOURNAL = "prepare.json"
 SCENE = "scene.json"

@@ -33,10 +33,10 @@ from polarguide.capture.sensor.pattern import (
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.write import EXACT, Rounding, rounding_of
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.core.progress import Advance
 from polarguide.preparation.settings import PrepareSettings, white_gains
 from polarguide.preparation.source import DevelopedView, Source
-from polarguide.progress import Advance
 
 SMALLEST = 16
 """Pixels of the shorter side of a mosaic."""

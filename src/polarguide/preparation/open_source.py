@@ -17,8 +17,8 @@ from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import read_pose_file
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
-from polarguide.errors import PolarguideError
-from polarguide.files import require_folder
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import require_folder
 from polarguide.preparation.filter_source import FilterSource, SinglesSource
 from polarguide.preparation.mosaic_source import MosaicSource
 from polarguide.preparation.settings import PrepareSettings, check_format

@@ -20,15 +20,15 @@ from polarguide.capture.colmap.poses import Geometry, Poses
 from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError
 from polarguide.capture.filter.exif import TURNS
 from polarguide.capture.view import ANGLES, listed
-from polarguide.errors import PolarguideError
-from polarguide.files import make_folder, writing
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import make_folder, writing
+from polarguide.core.progress import Reporter
+from polarguide.core.records import option_name
 from polarguide.preparation.exposure_table import write_exposure_table
 from polarguide.preparation.folder import PARTIAL, PHOTOGRAPHS, SCENE, SFM, SceneFolder, Workshop
 from polarguide.preparation.open_source import known_poses, open_source, origin_of_poses, poses_beside
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Source
-from polarguide.progress import Reporter
-from polarguide.records import option_name
 
 MOSTLY = 0.5
 """Share of saturated pixels from which on a view is warned of."""

@@ -15,10 +15,10 @@ from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, Sense, checked, read_calibration
 from polarguide.capture.sensor.analyzer_file import is_analyzer_file
-from polarguide.errors import PolarguideError
-from polarguide.polarizer import ANGLES
-from polarguide.records import check_options, option_name
-from polarguide.text import decimal
+from polarguide.core.errors import PolarguideError
+from polarguide.core.records import check_options, option_name
+from polarguide.core.text import decimal
+from polarguide.optics.polarizer import ANGLES
 
 Dataset = Literal["pandora", "pisr", "nersp", "neisf", "gnerp", "phygap"]
 ORIGINS = ("auto", "dataset", "sfm", "none")

@@ -19,10 +19,10 @@ from polarguide.capture.exposures import Angle
 from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, read_picture
 from polarguide.capture.memory import require_memory_of_each
 from polarguide.capture.view import listed
-from polarguide.errors import PolarguideError
-from polarguide.polarizer import ANGLES, four_intensities
+from polarguide.core.errors import PolarguideError
+from polarguide.core.progress import Advance
+from polarguide.optics.polarizer import ANGLES, four_intensities
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.progress import Advance
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 
 from polarguide import _native
-from polarguide.errors import PolarguideError
-from polarguide.options import DeviceName
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import DeviceName
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.cuda import has_gsplat, load_gsplat, rasterize_cuda
 from polarguide.raster.interface import Rasterize, Rasterized, ScreenStatistic, Splats

@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from polarguide import _native
-from polarguide.camera import Camera
-from polarguide.native import applied
+from polarguide.core.native import applied
+from polarguide.geometry.camera import Camera
 from polarguide.raster.interface import (
     NEAR_PLANE,
     Rasterized,

@@ -25,8 +25,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from polarguide.camera import Camera
-from polarguide.errors import PolarguideError, install_extra
+from polarguide.core.errors import PolarguideError, install_extra
+from polarguide.geometry.camera import Camera
 from polarguide.raster.interface import BLUR, NEAR_PLANE, Rasterized, ScreenStatistic, Splats, check_shapes
 
 TILE = 16

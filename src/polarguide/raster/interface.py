@@ -16,8 +16,8 @@ from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
-from polarguide.camera import Camera
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.geometry.camera import Camera
 
 NEAR_PLANE = 0.01
 BLUR = 0.1

@@ -8,8 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera
 from polarguide.gaussians.geometry import quaternions_to_rotations
+from polarguide.geometry.camera import Camera
 from polarguide.raster.interface import (
     BLUR,
     JACOBIAN_MARGIN,

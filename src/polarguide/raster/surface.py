@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from polarguide._native import MAX_CHANNELS
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.raster.cpu import finite, native_rasterizer
 from polarguide.raster.interface import Rasterize, Splats
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from polarguide.neural.recipe import FieldRates, FieldShape, NeuralRecipe, Sampling
+from polarguide.fields.recipe import FieldRates, FieldShape, NeuralRecipe, Sampling
 
 RECIPE_GNERP = NeuralRecipe(
     name="gnerp",

@@ -10,7 +10,7 @@ from __future__ import annotations
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.recipes.ablations import (
     ABLATIONS_3DGS,
     ABLATIONS_3DGS_DR,

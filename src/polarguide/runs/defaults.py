@@ -8,9 +8,9 @@ from typing import Any
 
 from polarguide.capture import Scene
 from polarguide.capture.variants import has_black_background
-from polarguide.errors import PolarguideError
-from polarguide.neural.recipe import NeuralRecipe
-from polarguide.options import index_of
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import index_of
+from polarguide.fields.recipe import NeuralRecipe
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import STEPS, Background, ResolvedSettings, TrainSettings
 

@@ -9,25 +9,25 @@ from typing import Any, Protocol
 
 import torch
 
-from polarguide.angles.polarizers import REMEDY, Judgment, Polarizers, predicts_filters
-from polarguide.angles.trainer import AngleTrainer
 from polarguide.capture import Scene
 from polarguide.capture.exposures import TABLE, Exposure, table_text
 from polarguide.capture.layout import find_layout
 from polarguide.capture.view import listed
-from polarguide.errors import PolarguideError
-from polarguide.files import write_text
-from polarguide.neural.model import FieldModel
-from polarguide.neural.recipe import NeuralRecipe
-from polarguide.neural.trainer import FieldTrainer
-from polarguide.progress import Reporter
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import write_text
+from polarguide.core.progress import Reporter
+from polarguide.core.system import MemoryBound
+from polarguide.fields.model import FieldModel
+from polarguide.fields.recipe import NeuralRecipe
+from polarguide.fields.trainer import FieldTrainer
 from polarguide.raster import Backend
 from polarguide.runs.folder import CHECKPOINT, PLY, AnyState
 from polarguide.runs.forecast import Forecast, MemoryPlan, forecast, plan_field_memory, plan_memory
 from polarguide.runs.health import Evidence, Polarization
 from polarguide.runs.model import GaussianModel, Model, write_run_ply
 from polarguide.shading.model import ShadingModel
-from polarguide.system import MemoryBound
+from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers, predicts_filters
+from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.distributed import Ranks
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings, StepReport

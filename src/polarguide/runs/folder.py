@@ -26,12 +26,12 @@ from torch import Tensor
 
 from polarguide import __version__
 from polarguide.capture import Scene
-from polarguide.errors import PolarguideError
-from polarguide.files import atomic, in_utf8, make_folder, read_file, require_file, write_text, writing
-from polarguide.neural.recipe import NeuralRecipe
-from polarguide.neural.state import FieldState
-from polarguide.options import Transfer
-from polarguide.records import LARGEST_RECORD, decode
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import atomic, in_utf8, make_folder, read_file, require_file, write_text, writing
+from polarguide.core.options import Transfer
+from polarguide.core.records import LARGEST_RECORD, decode
+from polarguide.fields.recipe import NeuralRecipe
+from polarguide.fields.state import FieldState
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings

@@ -11,14 +11,20 @@ from pathlib import Path
 
 import torch
 
-from polarguide.angles.polarizers import Polarizers, search_steps
 from polarguide.capture import Scene
 from polarguide.capture.layout import find_layout, select_views
 from polarguide.capture.memory import GIBIBYTE, KEPT, MASKS, READ, SHARE, stated_pixels
-from polarguide.errors import PolarguideError
-from polarguide.neural.recipe import NeuralRecipe
+from polarguide.core.errors import PolarguideError
+from polarguide.core.system import (
+    MEBIBYTE,
+    free_memory,
+    machine_busy_seconds,
+    peak_memory_mib,
+    resident_memory,
+)
+from polarguide.fields.recipe import NeuralRecipe
 from polarguide.raster import Backend
-from polarguide.system import MEBIBYTE, free_memory, machine_busy_seconds, peak_memory_mib, resident_memory
+from polarguide.training.angles.polarizers import Polarizers, search_steps
 from polarguide.training.feed import coarse_steps
 from polarguide.training.recipe import Recipe, Schedule
 from polarguide.training.settings import ResolvedSettings

@@ -20,17 +20,17 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from polarguide.angles.polarizers import Judgment
 from polarguide.capture import View
 from polarguide.capture.exposures import analyzers
 from polarguide.capture.variants import black_pixels
 from polarguide.capture.view import listed
-from polarguide.color import srgb_encode
-from polarguide.files import write_text
+from polarguide.core.files import write_text
+from polarguide.core.progress import Reporter
+from polarguide.core.records import read_record
 from polarguide.gaussians.densify import Densification, free_space
-from polarguide.progress import Reporter
-from polarguide.records import read_record
+from polarguide.optics.color import srgb_encode
 from polarguide.runs.model import Model
+from polarguide.training.angles.polarizers import Judgment
 from polarguide.training.photometric import behind_analyzer
 
 Word = Literal["measured", "fitted", "none"]

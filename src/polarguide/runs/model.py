@@ -12,10 +12,10 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera
-from polarguide.color import srgb_encode
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import refit_sh_to_display, write_ply
+from polarguide.geometry.camera import Camera
+from polarguide.optics.color import srgb_encode
 from polarguide.raster import Backend
 from polarguide.raster.surface import alpha_in_front
 from polarguide.shading.gbuffer import RenderRequest, render, splats
@@ -25,7 +25,7 @@ from polarguide.training.state import TrainingState
 
 
 class Model(Protocol):
-    """What every kind of model does: see ``GaussianModel`` and ``neural.model.FieldModel``."""
+    """What every kind of model does: see ``GaussianModel`` and ``fields.model.FieldModel``."""
 
     @property
     def shading(self) -> ShadingModel:

@@ -11,21 +11,21 @@ from typing import TypeVar
 
 from torch import Tensor
 
-from polarguide.camera import Camera
 from polarguide.capture import Scene, load_scene, read_model
 from polarguide.capture.layout import find_layout
+from polarguide.capture.presentation import Presentation, read_presentation
 from polarguide.capture.variants import mask_background, select_exposures
-from polarguide.errors import PolarguideError, PolarguideWarning
-from polarguide.options import DeviceName, PathLike, SceneOptions, check_choice
-from polarguide.presentation import Presentation, read_presentation
-from polarguide.progress import SILENT, Reporter
+from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.options import DeviceName, PathLike, SceneOptions, check_choice
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.scene_frame import SceneFrame, scene_frame
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.runs.families import family_of
 from polarguide.runs.folder import RunConfiguration, load_checkpoint
 from polarguide.runs.health import Health
 from polarguide.runs.model import GaussianModel, Model
-from polarguide.scene_frame import SceneFrame, scene_frame
 from polarguide.shading.result import LAYERS, RenderResult
 from polarguide.training.recipe import Method
 

@@ -17,10 +17,11 @@ import torch
 from polarguide.capture import Scene
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.variants import mask_background, select_exposures
-from polarguide.errors import PolarguideError, PolarguideWarning
-from polarguide.files import check_out, make_folder
-from polarguide.options import PathLike, SceneOptions, SessionOptions
-from polarguide.progress import SILENT, Advance, Reporter
+from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.files import check_out, make_folder
+from polarguide.core.options import PathLike, SceneOptions, SessionOptions
+from polarguide.core.progress import SILENT, Advance, Reporter
+from polarguide.core.system import MemoryBound, return_freed_memory
 from polarguide.raster import Backend, use_threads
 from polarguide.recipes import recipe_named
 from polarguide.runs.defaults import most_gaussians, resolve
@@ -37,7 +38,6 @@ from polarguide.runs.folder import (
 from polarguide.runs.forecast import MemoryPlan, Stopwatch, pixels_of
 from polarguide.runs.health import examine
 from polarguide.runs.opened import OpenedRun, read_scene
-from polarguide.system import MemoryBound, return_freed_memory
 from polarguide.training.distributed import Ranks, backend_of, process_group
 from polarguide.training.losses import refuse_diverged
 from polarguide.training.recipe import Method

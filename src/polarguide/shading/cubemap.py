@@ -32,7 +32,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from polarguide import _native
-from polarguide.native import fits
+from polarguide.core.native import fits
 
 # Per face: axis and sign of the major component, of s and of t.
 _FACES = (

@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera
+from polarguide.core.native import fits
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import mirrored_directions
 from polarguide.gaussians.harmonics import evaluate_sh
-from polarguide.native import fits
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
 from polarguide.optics import reflectances_from_cosine
 from polarguide.shading.cubemap import cubemap_lookup, mip_lookup
 from polarguide.shading.metal import (
@@ -54,7 +55,6 @@ from polarguide.shading.model import (
 )
 from polarguide.shading.native import MetalArguments, reflect_native, world_rays_native
 from polarguide.shading.result import LAYERS, DetachedLayers, MetalPixels
-from polarguide.vectors import dot, unit
 
 Blend = Literal["lerp", "fresnel"]
 RESET_STRENGTH = 1e-3

@@ -26,8 +26,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import relu
 
-from polarguide.camera import Camera
 from polarguide.gaussians.harmonics import SH_C0
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import unit
 from polarguide.shading.cubemap import box_mips, mip_lookup
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,
@@ -42,7 +43,6 @@ from polarguide.shading.model import (
     harmonic_colors,
     mirrored,
 )
-from polarguide.vectors import unit
 
 CHANNELS, FEATURES = 16, 4
 INPUTS = CHANNELS * (1 + FEATURES)

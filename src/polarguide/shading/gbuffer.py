@@ -16,9 +16,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from polarguide import _native
-from polarguide.camera import Camera
+from polarguide.core.native import applied, fits
 from polarguide.gaussians.geometry import GRAZING, shortest_axis_normals
-from polarguide.native import applied, fits
+from polarguide.geometry.camera import Camera
 from polarguide.raster.interface import Rasterize, ScreenStatistic, Splats
 from polarguide.raster.surface import surface_picture
 from polarguide.shading.model import PLAIN, GBuffer, Light, Parameters, ShadingModel

@@ -25,14 +25,14 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.harmonics import sh_basis
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, spread_directions, unit
 from polarguide.optics.fresnel import LARGEST_REFLECTANCE
 from polarguide.shading.cubemap import box_mips, cubemap_lookup, mip_lookup
 from polarguide.shading.result import Layout, MetalPixels
-from polarguide.vectors import dot, spread_directions, unit
 
 # Of which a metal's reflectance is trained between these.
 LEAST = 0.2

@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.harmonics import evaluate_sh
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot
 from polarguide.shading.metal import metal_stokes
 from polarguide.shading.result import DetachedLayers, Layout, MetalPixels, RenderResult
-from polarguide.vectors import dot
 
 # Brightest light of an environment with the exponential scale: e^5, about 150 times display white.
 MAXIMUM_LOG_LIGHT = 5.0
@@ -122,7 +122,7 @@ class PageShading:
 
     Attributes:
         kind: the page's shaders are compiled with its name, in capitals, defined.
-        values: per Gaussian, by the names of ``export.records.SLOTS``, [N, ...].
+        values: per Gaussian, by the names of ``results.export.share.SLOTS``, [N, ...].
         light: cubemaps [6, R, R, C], the finest first.
         network: matrices [rows, columns] in the order in which the shaders read them.
         constants: further entries of the page's scene, plain JSON values.

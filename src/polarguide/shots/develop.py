@@ -29,8 +29,8 @@ from polarguide.capture.sensor.demosaic import demosaic
 from polarguide.capture.sensor.pattern import SENSOR_SIZE, SIDE, estimate_levels, tiled, unusable_samples
 from polarguide.capture.view import ANGLES, FULL_CODE, View
 from polarguide.capture.view_reader import read_view
-from polarguide.errors import PolarguideError
-from polarguide.files import require_file
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import require_file
 from polarguide.preparation.mosaic_source import MosaicFiles, block_intensities, sample_blocks
 from polarguide.shots.exposures import ExposureSet
 from polarguide.shots.maps import Map, NoiseModel, estimated_noise, given_noise, interpolation_factors

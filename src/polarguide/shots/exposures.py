@@ -19,7 +19,7 @@ from polarguide.capture.layout import (
 )
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.shots.options import Kind, ShotOptions
 
 _EXPECTED = "raw mosaics with --sensor, or shots with angles in their names"

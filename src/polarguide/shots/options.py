@@ -10,9 +10,9 @@ import tyro
 from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, checked
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.core.records import check_options, option_name
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.records import check_options, option_name
 
 Kind = Literal["mosaic", "filter", "scene"]
 """What a shot is made of: one file, one an angle, or a view of a scene."""

@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera
 from polarguide.capture.colmap.model import fit_camera, read_model
 from polarguide.capture.view import View
-from polarguide.errors import PolarguideError
-from polarguide.options import check_finite, index_of
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import check_finite, index_of
+from polarguide.core.text import decimal
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
 from polarguide.shots.develop import Developed, develop, develop_view
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.maps import Map, Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
-from polarguide.text import decimal
-from polarguide.vectors import dot, unit
 
 UNREADABLE = (PolarguideError, OSError, MemoryError)
 """What one bad file may raise; others come after it."""

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.view import View
-from polarguide.errors import PolarguideError, optional_import
-from polarguide.files import atomic, in_utf8, make_folder, require_inside, write_text, write_whole
-from polarguide.progress import SILENT, Reporter
-from polarguide.records import to_json
+from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.files import atomic, in_utf8, make_folder, require_inside, write_text, write_whole
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.records import to_json
 from polarguide.shots.develop import check_files
 from polarguide.shots.exposures import (
     ExposureSet,

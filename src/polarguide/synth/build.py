@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from polarguide.errors import PolarguideError
-from polarguide.files import make_folder, write_whole
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import make_folder, write_whole
 from polarguide.synth.mesh import Array, Mesh, rotation, write_ply
 from polarguide.synth.schema import (
     REMEDY,

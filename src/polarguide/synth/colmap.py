@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.camera import Camera, look_at, quaternion
-from polarguide.files import make_folder, write_text
+from polarguide.core.files import make_folder, write_text
+from polarguide.geometry.camera import Camera, look_at, quaternion
 from polarguide.synth.build import BuiltScene
 from polarguide.synth.ground_truth import intersect
 from polarguide.synth.mesh import Array

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.synth.settings import dr, mi
 from polarguide.synth.transport import (
     PathLimits,

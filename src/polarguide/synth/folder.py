@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from polarguide import __version__
 from polarguide.capture.write import picture_name
-from polarguide.color import srgb_encode_array
-from polarguide.errors import PolarguideError
-from polarguide.files import holds_files, make_folder, read_file, write_whole
-from polarguide.polarizer import ANGLES, malus
-from polarguide.records import read_record, shortened
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import holds_files, make_folder, read_file, write_whole
+from polarguide.core.records import read_record, shortened
+from polarguide.optics.color import srgb_encode_array
+from polarguide.optics.polarizer import ANGLES, malus
 from polarguide.synth.mesh import Array
 from polarguide.synth.schema import SceneSpec, with_current_keys
 from polarguide.synth.settings import SynthSettings, Variant

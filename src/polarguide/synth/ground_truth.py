@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from polarguide import optics
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.synth.build import BuiltScene
 from polarguide.synth.folder import write_file
 from polarguide.synth.mesh import Array

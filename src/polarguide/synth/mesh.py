@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.files import write_whole
-from polarguide.vectors import unit_array
-from polarguide.vectors import unit_array as unit
+from polarguide.core.files import write_whole
+from polarguide.geometry.vectors import unit_array
+from polarguide.geometry.vectors import unit_array as unit
 
 Array = NDArray[np.float64]
 

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from polarguide.camera import Camera
 from polarguide.capture.write import write_png, write_view
-from polarguide.errors import PolarguideError
-from polarguide.progress import Reporter
+from polarguide.core.errors import PolarguideError
+from polarguide.core.progress import Reporter
+from polarguide.geometry.camera import Camera
 from polarguide.synth import folder
 from polarguide.synth.build import BuiltScene, build_scene
 from polarguide.synth.colmap import (

@@ -16,8 +16,8 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from polarguide.errors import PolarguideError
-from polarguide.records import decode, read_record
+from polarguide.core.errors import PolarguideError
+from polarguide.core.records import decode, read_record
 
 REMEDY = "docs/reference/scene-files.md describes the fields."
 LARGEST = 1e6

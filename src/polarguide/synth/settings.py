@@ -13,8 +13,8 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from polarguide.errors import PolarguideError, optional_import
-from polarguide.records import check_options
+from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.records import check_options
 from polarguide.synth.schema import SceneSpec, parse_scene, read_scene_file
 
 Color = Literal["rgb", "spectral"]

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from polarguide.geometry.vectors import unit_array as unit
 from polarguide.synth.mesh import Array, Mesh, grid_faces, joined, smooth_normals, solid
 from polarguide.synth.schema import make
 from polarguide.synth.textures import fractal_noise
-from polarguide.vectors import unit_array as unit
 
 
 def sphere(radius: float = 1.0, detail: int = 96) -> Mesh:

@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.color import srgb_decode_array
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.geometry.vectors import unit_array as unit
+from polarguide.optics.color import srgb_decode_array
 from polarguide.synth.mesh import Array
 from polarguide.synth.schema import make
-from polarguide.vectors import unit_array as unit
 
 
 def fractal_noise(points: Array, seed: int, octaves: int = 4) -> Array:

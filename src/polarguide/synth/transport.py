@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.synth.settings import dr, mi
 
 

@@ -8,19 +8,19 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera, seen_at
 from polarguide.capture import Scene, View
+from polarguide.core.system import MemoryBound
 from polarguide.gaussians.densify import densify, free_space
 from polarguide.gaussians.initialize import scene_extent
+from polarguide.geometry.camera import Camera, seen_at
+from polarguide.geometry.vectors import unit
 from polarguide.raster import Backend, Rasterize
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.model import Parameters, ShadingModel
-from polarguide.system import MemoryBound
 from polarguide.training.distributed import Ranks
 from polarguide.training.recipe import Propagation, Recipe
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import TrainingState, seeded
-from polarguide.vectors import unit
 
 
 def _logit(value: float) -> float:

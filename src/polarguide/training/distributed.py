@@ -22,11 +22,11 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from polarguide.errors import PolarguideError
-from polarguide.options import DeviceName
-from polarguide.progress import SILENT, Reporter
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import DeviceName
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.system import process_count, process_is_alive
 from polarguide.raster import Backend, choose_backend
-from polarguide.system import process_count, process_is_alive
 
 if dist.is_available():
     # Its functions have the default group for a default value. Imported once there is a group, as torch's optimizers

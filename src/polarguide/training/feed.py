@@ -10,10 +10,10 @@ from torch import Tensor
 
 from polarguide.capture import View
 from polarguide.capture.variants import SmallerViews, empty_pixels
-from polarguide.color import srgb_encode
+from polarguide.core.system import UNBOUNDED, MemoryBound
+from polarguide.optics.color import srgb_encode
 from polarguide.raster import Backend
 from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.flat import Flat, flat_surfaces
 from polarguide.training.losses import Weights
 from polarguide.training.metals.observations import index_picture, metalness_share

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import View
+from polarguide.geometry.vectors import dot, unit
 from polarguide.training.rules import FlatRules
-from polarguide.vectors import dot, unit
 
 
 @dataclass(frozen=True, eq=False)

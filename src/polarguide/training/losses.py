@@ -16,9 +16,10 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
 from polarguide import _native
-from polarguide.camera import Camera
-from polarguide.errors import PolarguideError
-from polarguide.native import fits
+from polarguide.core.errors import PolarguideError
+from polarguide.core.native import fits
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
 from polarguide.training.native_terms import (
@@ -31,7 +32,6 @@ from polarguide.training.native_terms import (
 )
 from polarguide.training.photometric import partial_terms, photometric_loss, photometric_terms
 from polarguide.training.targets import Step, ViewPriors
-from polarguide.vectors import dot, unit
 
 
 def term(*priors: str, rendered: tuple[str, ...] = (), optional: bool = False, default: float = 0.0) -> float:

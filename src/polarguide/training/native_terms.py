@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from polarguide import _native
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.shading.result import RenderResult
 
 S1_AND_S2 = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

@@ -20,8 +20,8 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import conv2d
 
 from polarguide import _native
-from polarguide.color import srgb_encode
-from polarguide.native import fits
+from polarguide.core.native import fits
+from polarguide.optics.color import srgb_encode
 from polarguide.training.targets import Step
 
 _WINDOW = 11

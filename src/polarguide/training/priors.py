@@ -15,11 +15,11 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.capture import View
 from polarguide.capture.exposures import FOUR
-from polarguide.color import srgb_encode
+from polarguide.geometry.vectors import dot, unit
+from polarguide.optics.color import srgb_encode
 from polarguide.training.flat import Flat
 from polarguide.training.recipe import Candidates, Priors
 from polarguide.training.targets import ViewPriors, stokes_weight, surface_weight
-from polarguide.vectors import dot, unit
 
 
 class Unguided(NamedTuple):

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 from polarguide.gaussians.densify import Densification
 from polarguide.gaussians.gaussians import CORE_SHAPES, ORIENTED_SHAPES
 from polarguide.gaussians.initialize import Initialization

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from polarguide.errors import PolarguideError
-from polarguide.options import EXPOSURES, Exposures, check_choice, check_count
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import EXPOSURES, Exposures, check_choice, check_count
 
 MOST_VIEWS, MOST_SEEDS = 4096, 2**63 - 1
 STEPS = 5000

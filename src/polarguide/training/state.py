@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene
-from polarguide.color import srgb_decode
 from polarguide.gaussians.densify import DensityStatistics
 from polarguide.gaussians.gaussians import ORIENTED_SHAPES, Gaussians, Trained
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.initialize import far_away, initial_parameters
+from polarguide.optics.color import srgb_decode
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import ResolvedSettings
 

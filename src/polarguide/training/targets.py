@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.camera import Camera
 from polarguide.capture import View
 from polarguide.capture.exposures import analyzers, radiance_places
-from polarguide.color import srgb_encode
+from polarguide.geometry.camera import Camera
+from polarguide.optics.color import srgb_encode
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
 

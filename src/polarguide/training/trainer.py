@@ -15,12 +15,12 @@ from torch import Tensor
 
 from polarguide.capture import Scene, View
 from polarguide.capture.exposures import Exposure
+from polarguide.core.system import UNBOUNDED, MemoryBound
 from polarguide.gaussians.initialize import orbit
 from polarguide.raster import Backend, ScreenStatistic
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN
 from polarguide.shading.result import COLOR_CHANNELS, RenderResult
-from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.actions import DensityControl, outward_directions, propagate_normals, reset_opacity
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.feed import Feed

@@ -21,7 +21,7 @@ from typing import IO, NamedTuple
 import torch
 from torch import Tensor
 
-from polarguide.camera import Camera
+from polarguide.geometry.camera import Camera
 from polarguide.training.losses import Weights
 from polarguide.training.recipe import Priors
 from polarguide.training.targets import ViewPriors

@@ -1,6 +1,6 @@
 """A local web viewer for trained runs and for trainings in progress."""
 
-from polarguide.options import LOOPBACK
+from polarguide.core.options import LOOPBACK
 from polarguide.viewer.cameras import photographs
 from polarguide.viewer.scenery import GaussianScenery, run_scenery, training_scenery
 from polarguide.viewer.server import Viewer, viewing_address

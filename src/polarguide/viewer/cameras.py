@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from polarguide.camera import Camera, quaternion
 from polarguide.capture import Scene, View
-from polarguide.presentation import Crop
-from polarguide.scene_frame import SceneFrame
-from polarguide.trajectory import camera_record, interpolated
+from polarguide.capture.presentation import Crop
+from polarguide.geometry.camera import Camera, quaternion
+from polarguide.geometry.scene_frame import SceneFrame
+from polarguide.geometry.trajectory import camera_record, interpolated
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
 

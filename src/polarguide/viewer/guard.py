@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 from urllib.parse import urlsplit
 
-from polarguide.errors import PolarguideError, install_package, optional_import
+from polarguide.core.errors import PolarguideError, install_package, optional_import
 from polarguide.viewer.messages import LARGEST, Refused
 
 WEB = ("http", "https")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from polarguide.presentation import Crop, Presentation, Vector
+from polarguide.capture.presentation import Crop, Presentation, Vector
 from polarguide.shading.result import LAYERS
 from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
 from polarguide.viewer.presenting import PresentingControls

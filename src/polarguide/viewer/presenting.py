@@ -11,9 +11,9 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from polarguide.errors import PolarguideError
-from polarguide.presentation import Presentation, Vector, shown_length
-from polarguide.rendering.picking import SurfacePoint, gains_of
+from polarguide.capture.presentation import Presentation, Vector, shown_length
+from polarguide.core.errors import PolarguideError
+from polarguide.results.rendering.picking import SurfacePoint, gains_of
 from polarguide.viewer.messages import Accepts, choice, number, push
 
 AS_PHOTOGRAPHED, GRAY_WORLD, PICKED = WHITES = ("as photographed", "gray world", "picked")

@@ -9,24 +9,24 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from polarguide.angles.trainer import AngleTrainer
-from polarguide.camera import Camera
 from polarguide.capture import View
+from polarguide.capture.presentation import Crop, Presentation, Vector, balanced
+from polarguide.fields.model import FieldModel
+from polarguide.fields.trainer import FieldTrainer
 from polarguide.gaussians.gaussians import Gaussians
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.scene_frame import SceneFrame
 from polarguide.inspection.layers import AOLP_FULL_DOLP, DOLP_HIGH
-from polarguide.neural.model import FieldModel
-from polarguide.neural.trainer import FieldTrainer
 from polarguide.optics import aolp, dolp, luminance
-from polarguide.presentation import Crop, Presentation, Vector, balanced
 from polarguide.raster.interface import Rasterize
-from polarguide.rendering.picking import SurfacePoint, surface_at
-from polarguide.rendering.relight import RELIT_RESOLUTION, turned_cubemap
+from polarguide.results.rendering.picking import SurfacePoint, surface_at
+from polarguide.results.rendering.relight import RELIT_RESOLUTION, turned_cubemap
 from polarguide.runs.families import AnyTrainer
 from polarguide.runs.opened import OpenedRun
-from polarguide.scene_frame import SceneFrame
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
 from polarguide.shading.result import RenderResult
+from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.viewer.cameras import letterbox
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture

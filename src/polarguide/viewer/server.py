@@ -18,21 +18,21 @@ from typing import Any
 import msgspec
 
 from polarguide.capture import Scene
-from polarguide.errors import PolarguideError, optional_import
-from polarguide.options import LOOPBACK, VisitorOptions
-from polarguide.presentation import (
+from polarguide.capture.presentation import (
     PRESENTATION_FILE,
     Presentation,
     Vector,
     read_presentation,
     write_presentation,
 )
-from polarguide.progress import SILENT, Reporter
-from polarguide.rendering.picking import gray_world
+from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.options import LOOPBACK, VisitorOptions
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.geometry.scene_frame import scene_frame
+from polarguide.results.rendering.picking import gray_world
 from polarguide.runs.families import AnyTrainer
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import Ends, Look
-from polarguide.scene_frame import scene_frame
 from polarguide.shading.model import ShadingModel
 from polarguide.viewer.cameras import Photograph, photographs
 from polarguide.viewer.guard import Gate, guarded

@@ -10,10 +10,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from polarguide.camera import Camera
-from polarguide.presentation import PRESENTATION_FILE, Presentation, Vector
-from polarguide.records import to_json
-from polarguide.scene_frame import SceneFrame
+from polarguide.capture.presentation import PRESENTATION_FILE, Presentation, Vector
+from polarguide.core.records import to_json
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.scene_frame import SceneFrame
 from polarguide.viewer.cameras import (
     FRAMES_PER_SECOND,
     Frusta,

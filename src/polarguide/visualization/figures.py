@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polarguide.camera import Camera
-from polarguide.color import shown
-from polarguide.files import write_whole
+from polarguide.core.files import write_whole
+from polarguide.geometry.camera import Camera
+from polarguide.optics.color import shown
 
 Picture = NDArray[np.uint8]
 """uint8 RGB [H, W, 3]."""

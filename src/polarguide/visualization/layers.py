@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from polarguide.camera import Camera
 from polarguide.capture import View
-from polarguide.presentation import balanced
+from polarguide.capture.presentation import balanced
+from polarguide.geometry.camera import Camera
 from polarguide.shading.result import RenderResult
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture

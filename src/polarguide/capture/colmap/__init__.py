@@ -3,7 +3,7 @@
 import contextlib
 import importlib
 
-from polarguide.system import sigterm_kept
+from polarguide.core.system import sigterm_kept
 
 # pycolmap prints a stack trace at SIGTERM, where a process should just end.
 with contextlib.suppress(ImportError), sigterm_kept():

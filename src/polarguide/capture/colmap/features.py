@@ -16,9 +16,9 @@ import pycolmap
 
 from polarguide.capture.colmap.files import PosedCamera, colmap_camera
 from polarguide.capture.write import write_png
-from polarguide.errors import PolarguideError
-from polarguide.files import make_folder, writing
-from polarguide.progress import Reporter
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import make_folder, writing
+from polarguide.core.progress import Reporter
 
 _POLL_SECONDS = 0.5
 # COLMAP logs every picture and pair; what fails comes as an exception.

@@ -13,9 +13,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polarguide.camera import quaternion
-from polarguide.errors import PolarguideError
-from polarguide.files import read_file
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import read_file
+from polarguide.geometry.camera import quaternion
 
 MODELS = {
     "SIMPLE_PINHOLE": (0, 3), "PINHOLE": (1, 4), "SIMPLE_RADIAL": (2, 4), "RADIAL": (3, 5), "OPENCV": (4, 8),

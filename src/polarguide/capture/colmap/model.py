@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from polarguide.camera import FARTHEST, LENS, Camera, can_be_lens
 from polarguide.capture.colmap.files import check_model_files
 from polarguide.capture.view import listed
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.geometry.camera import FARTHEST, LENS, Camera, can_be_lens
 
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 # Perspective models that are a plain pinhole when all of their distortion parameters are zero.

@@ -15,7 +15,6 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polarguide.camera import FARTHEST, LENS
 from polarguide.capture.colmap.files import PosedCamera, write_cameras
 from polarguide.capture.colmap.model import (
     MODEL_FILES,
@@ -27,7 +26,8 @@ from polarguide.capture.colmap.model import (
 )
 from polarguide.capture.filter.develop import remapped_mask
 from polarguide.capture.view import listed
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
+from polarguide.geometry.camera import FARTHEST, LENS
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from polarguide.capture.colmap.features import match_features, pipeline_options, run_step
 from polarguide.capture.colmap.files import PosedCamera
-from polarguide.color import srgb_encode_array
-from polarguide.errors import PolarguideError
-from polarguide.files import make_folder
-from polarguide.progress import Reporter
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import make_folder
+from polarguide.core.progress import Reporter
+from polarguide.optics.color import srgb_encode_array
 
 SAMPLE = 7
 """Matches that determine an epipolar geometry."""

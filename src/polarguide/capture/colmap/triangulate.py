@@ -17,10 +17,10 @@ from polarguide.capture.colmap.features import match_features, pipeline_options,
 from polarguide.capture.colmap.files import PosedCamera, colmap_camera, write_cameras
 from polarguide.capture.colmap.model import load_model
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_picture
-from polarguide.errors import PolarguideError
-from polarguide.files import make_folder, write_whole, writing
-from polarguide.progress import Reporter
-from polarguide.records import read_record
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import make_folder, write_whole, writing
+from polarguide.core.progress import Reporter
+from polarguide.core.records import read_record
 
 _ROUNDS = 4
 _BATCH = 100_000

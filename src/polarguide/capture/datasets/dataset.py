@@ -19,7 +19,7 @@ from polarguide.capture.formats.arrays import finite_numbers, read_arrays, read_
 from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, decode_stored, read_picture
 from polarguide.capture.layout import index_files
 from polarguide.capture.view import listed
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 
 StokesImage = tuple[NDArray[np.float32], NDArray[np.bool_]]
 """Stokes vectors of a view [3, H, W, 3] in the dataset's own sense of angles; pixels at full scale in its pictures."""

@@ -48,7 +48,7 @@ from polarguide.capture.formats.pictures import (
 )
 from polarguide.capture.layout import index_files
 from polarguide.capture.view import FULL_CODE
-from polarguide.records import read_record
+from polarguide.core.records import read_record
 
 _PANDORA_PARTS = ("s0", "s0p1", "s0p2")
 _PANDORA_STEM = re.compile(r"(?P<view>\d{1,6})_(?P<part>s0|s0p1|s0p2)")

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from polarguide.capture.formats.arrays import array_kind
 from polarguide.capture.formats.integrity import LARGEST_PIXELS
-from polarguide.errors import PolarguideError, optional_import
-from polarguide.files import read_file
+from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.files import read_file
 
 CAMERA_RAW = (".dng", ".nef", ".nrw", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 """Suffixes that are read as camera raw."""

@@ -15,7 +15,7 @@ from polarguide.capture.filter.shots import Shots
 from polarguide.capture.formats.pictures import linear_codes
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.write import Rounding, rounding_of
-from polarguide.color import srgb_decode_array
+from polarguide.optics.color import srgb_decode_array
 
 SMALLEST = 0.2
 """Shifts below this many pixels are not corrected: resampling would blur more, and polarization causes errors of the

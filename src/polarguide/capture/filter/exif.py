@@ -18,8 +18,8 @@ from polarguide.capture.calibration import Calibration
 from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.formats.integrity import ORIENTATION, TIFF, jpeg_segments, png_chunks
 from polarguide.capture.formats.pictures import read_picture
-from polarguide.errors import optional_import
-from polarguide.files import read_file
+from polarguide.core.errors import optional_import
+from polarguide.core.files import read_file
 
 _MIRRORED = (2, 4, 5, 7)
 _QUARTER = (5, 6, 7, 8)

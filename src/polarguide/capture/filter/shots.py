@@ -20,7 +20,7 @@ from polarguide.capture.memory import require_memory_of_each
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.view_reader import require_alike
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 
 SHOT_SUFFIXES = (*SUFFIXES, *CAMERA_RAW)
 Candidates = dict[str, dict[int, list[Path]]]

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.formats.integrity import LARGEST_PIXELS, damaged
-from polarguide.errors import PolarguideError, optional_import
-from polarguide.files import in_utf8, read_file
+from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.files import in_utf8, read_file
 
 _LARGEST_HEADER = 1 << 16
 BROKEN = (

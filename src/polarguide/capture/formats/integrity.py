@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 # Within JPEG scan data, 0xFF followed by 0 is a stuffed byte and by 0xD0-0xD7 a restart; all else ends it.

@@ -26,9 +26,9 @@ from polarguide.capture.formats.integrity import (
     without_orientation,
 )
 from polarguide.capture.view import FULL_CODE
-from polarguide.color import srgb_decode_array
-from polarguide.errors import PolarguideError
-from polarguide.files import LARGEST_FILE, read_file
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import LARGEST_FILE, read_file
+from polarguide.optics.color import srgb_decode_array
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 TRANSFERS = ("linear", "srgb")

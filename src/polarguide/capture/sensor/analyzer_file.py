@@ -21,9 +21,9 @@ from polarguide.capture.sensor.analyzers import (
     grid_shape,
 )
 from polarguide.capture.sensor.pattern import SENSORS
-from polarguide.errors import PolarguideError
-from polarguide.files import in_utf8, require_file, write_whole
-from polarguide.records import decode
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import in_utf8, require_file, write_whole
+from polarguide.core.records import decode
 
 FORMAT, VERSION = "polarguide-analyzers", 1
 SUFFIX = ".safetensors"

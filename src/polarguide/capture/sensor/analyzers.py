@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.sensor.pattern import Pattern, sensor_pattern
-from polarguide.errors import PolarguideError
-from polarguide.polarizer import ANGLES
+from polarguide.core.errors import PolarguideError
+from polarguide.optics.polarizer import ANGLES
 
 Array = NDArray[np.float32]
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.errors import PolarguideError
+from polarguide.core.errors import PolarguideError
 
 _CELL = np.array([[90, 45], [135, 0]])
 _BAYER = np.array([[0, 1], [1, 2]])  # R G / G B, one entry a polarizer cell

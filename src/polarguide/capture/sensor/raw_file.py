@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from polarguide.capture.formats.arrays import array_kind, read_array
 from polarguide.capture.formats.pictures import decode_stored, read_picture
-from polarguide.errors import PolarguideError
-from polarguide.files import read_file
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import read_file
 
 PACKINGS = {"10p": (5, 4, 10), "12p": (3, 2, 12), "12packed": (3, 2, 12)}
 """Bytes of a group, pixels of a group, bits of a pixel."""

@@ -27,14 +27,14 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import View
+from polarguide.core.system import UNBOUNDED, MemoryBound
 from polarguide.gaussians.geometry import shortest_axis_normals
+from polarguide.geometry.vectors import dot
 from polarguide.raster import Rasterize
 from polarguide.shading.metal import FIRST_REFLECTANCE
 from polarguide.shading.model import Parameters
-from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.metals.observations import Seen, evenly, said_by, seen_by, seen_of
 from polarguide.training.rules import MetalRules
-from polarguide.vectors import dot
 
 
 def _relative(seen: Seen, dark: float) -> tuple[Tensor, Tensor]:

@@ -13,16 +13,16 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide._native import MAX_CHANNELS
-from polarguide.camera import Camera
 from polarguide.capture import View
+from polarguide.core.system import UNBOUNDED, MemoryBound
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.metal import any_nonzero
 from polarguide.shading.model import Parameters
-from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.priors import guide_normals
 from polarguide.training.rules import MetalRules
-from polarguide.vectors import dot
 
 
 class Seen(NamedTuple):

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from polarguide.capture import Scene, View
 from polarguide.capture.view import listed
+from polarguide.core.system import UNBOUNDED, MemoryBound
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.initialize import far_away
 from polarguide.raster import Backend, Rasterize
 from polarguide.shading.gbuffer import render
 from polarguide.shading.model import Light, ShadingModel
-from polarguide.system import UNBOUNDED, MemoryBound
 from polarguide.training.distributed import Ranks
 from polarguide.training.metals.evidence import Evidence, evidence
 from polarguide.training.metals.observations import contradicted, evenly

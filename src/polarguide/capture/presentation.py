@@ -1,0 +1,212 @@
+"""How a capture is presented: white, up, scale and crop box, and whom it is owed to.
+
+``presentation.json`` beside a scene or a run holds it. Whatever shows or exports a run uses it; pictures, training and
+scores never do. A run's own file goes before that of its scene, field by field.
+
+The names are those of USD (``metersPerUnit``, ``upAxis``) and of what glTF files say of their asset.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import torch
+from msgspec import Meta
+from torch import Tensor
+
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import write_whole
+from polarguide.core.records import read_record, to_json
+from polarguide.geometry.scene_frame import SceneFrame
+
+PRESENTATION_FILE = "presentation.json"
+REMEDY = "Correct it with polarguide present, or remove the file."
+CREDITS = ("title", "author", "license", "provenance")
+LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
+"""Meters of each unit of length that is understood."""
+LEAST_METERS, MOST_METERS = 1e-9, 1e9
+"""A nanometer, and eighty Earths: single precision of files that are exported ends beyond."""
+WIDEST_CROP = 100.0
+
+Vector = tuple[float, float, float]
+Gain = Annotated[float, Meta(ge=0.02, le=50)]
+Text = Annotated[str, Meta(max_length=1000)]
+
+
+class Crop(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A box about the point that the cameras look at, along their common right, up and back.
+
+    Attributes:
+        low, high: corners in shares of the cameras' distance from that point; low is less than high.
+        up: [3] what was up when it was made, in the scene's axes; None: as the cameras say. The box keeps its place
+            when another axis is chosen.
+    """
+
+    low: Vector
+    high: Vector
+    up: Vector | None = None
+
+    def __post_init__(self) -> None:
+        for low, high in zip(self.low, self.high, strict=True):
+            if not -WIDEST_CROP <= low < high <= WIDEST_CROP:
+                raise PolarguideError(
+                    "crop",
+                    expected=f"a low side less than the high one, both within {WIDEST_CROP:g} distances",
+                    found=f"{low:g} to {high:g}",
+                    remedy=REMEDY,
+                )
+        _check_direction("crop.up", self.up)
+
+    def _frame(self, around: SceneFrame) -> SceneFrame:
+        return around if self.up is None else _upright(around, self.up)
+
+    def corners(self, around: SceneFrame) -> Tensor:
+        """Its eight corners in the world, [8, 3] float64, the last axis fastest, from the cameras' own frame."""
+        frame = self._frame(around)
+        sides = torch.tensor([self.low, self.high], dtype=torch.float64)
+        local = torch.cartesian_prod(*sides.T) * frame.distance
+        return frame.center + local @ frame.panorama_axes().T
+
+    def inside(self, means: Tensor, around: SceneFrame) -> Tensor:
+        """Which means [N, 3] lie in it, [N] bool; ``around`` is the cameras' own frame."""
+        frame = self._frame(around)
+        axes, center = (t.to(means) for t in (frame.panorama_axes(), frame.center))
+        local = (means - center) @ axes / frame.distance
+        low, high = (
+            torch.tensor(side, dtype=local.dtype, device=local.device) for side in (self.low, self.high)
+        )
+        return ((local >= low) & (local <= high)).all(dim=1)
+
+
+class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """What ``presentation.json`` holds; each field may be missing.
+
+    Attributes:
+        white_balance: factors on linear R, G and B for display, 0.02 to 50; the data stay as they are.
+        up_axis: [3] direction in the scene's axes, of any length; without it, up is as the cameras say.
+        meters_per_unit: how long one unit of the scene is.
+        crop: what is shown and exported of the scene.
+        title: what is shown. author: whom the capture is owed to. license: a name, such as CC-BY-4.0.
+        provenance: where, when and with what it was captured, or a number of an inventory.
+    """
+
+    white_balance: tuple[Gain, Gain, Gain] | None = None
+    up_axis: Vector | None = None
+    meters_per_unit: Annotated[float, Meta(ge=LEAST_METERS, le=MOST_METERS)] | None = None
+    crop: Crop | None = None
+    title: Text = ""
+    author: Text = ""
+    license: Text = ""
+    provenance: Text = ""
+
+    def __post_init__(self) -> None:
+        _check_direction("up_axis", self.up_axis)
+        for name in CREDITS:
+            text = getattr(self, name)
+            if not text.isprintable():
+                raise PolarguideError(
+                    name, expected="one line of text", found=repr(text)[:100], remedy=REMEDY
+                )
+
+    @property
+    def credit(self) -> str:
+        """Author and license in one line; empty where there are none."""
+        return ", ".join(text for text in (self.author, self.license) if text)
+
+    @property
+    def gains(self) -> Tensor | None:
+        """The white balance as a tensor [3] float32, or None."""
+        return None if self.white_balance is None else torch.tensor(self.white_balance)
+
+    def over(self, other: Presentation) -> Presentation:
+        """This, with another's fields where this one has none."""
+        return Presentation(**{**_given(other), **_given(self)})
+
+    def upright(self, around: SceneFrame) -> SceneFrame:
+        """A frame of cameras with the up axis that was chosen, if one was."""
+        return around if self.up_axis is None else _upright(around, self.up_axis)
+
+    def to_record(self) -> dict[str, Any]:
+        """As the file holds it, without what is missing."""
+        found: dict[str, Any] = msgspec.to_builtins(self)
+        return found
+
+
+def _given(presentation: Presentation) -> Mapping[str, Any]:
+    fields = {name: getattr(presentation, name) for name in presentation.__struct_fields__}
+    return {name: value for name, value in fields.items() if value not in (None, "")}
+
+
+def _upright(around: SceneFrame, up: Vector) -> SceneFrame:
+    axis = torch.tensor(up, dtype=torch.float64)
+    return replace(around, up=axis / axis.norm())
+
+
+def _check_direction(name: str, vector: Vector | None) -> None:
+    if vector is not None and not (all(map(math.isfinite, vector)) and 1e-9 < math.hypot(*vector) < 1e9):
+        raise PolarguideError(
+            name, expected="a direction, three numbers not all 0", found=str(list(vector)), remedy=REMEDY
+        )
+
+
+def read_presentation(folder: Path) -> Presentation:
+    """What a scene's or a run's folder says; nothing where it has no such file.
+
+    Raises:
+        PolarguideError: the file is not such a record.
+    """
+    path = folder / PRESENTATION_FILE
+    return read_record(path, Presentation, remedy=REMEDY) if os.path.lexists(path) else Presentation()
+
+
+def write_presentation(folder: Path, presentation: Presentation) -> Path:
+    """Write the file of a scene or a run as a whole.
+
+    Raises:
+        PolarguideError: it cannot be written.
+    """
+    path = folder / PRESENTATION_FILE
+    write_whole(path, to_json(presentation.to_record()))
+    return path
+
+
+def parse_length(text: str, where: str = "distance") -> float:
+    """Meters of a length such as ``85mm``, ``8.5 cm``, ``0.085``; ``where`` is for messages.
+
+    Raises:
+        PolarguideError: the text is not a length.
+    """
+    match = re.fullmatch(r"\s*((?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*([a-z]*)\s*", text)
+    unit = LENGTHS.get((match[2] or "m") if match else "")
+    meters = float(match[1]) * unit if match and unit else math.nan
+    if not 0 < meters <= MOST_METERS:
+        raise PolarguideError(
+            where,
+            expected=f"a length above 0 such as 85mm (units: {', '.join(LENGTHS)}; m without one)",
+            found=repr(text),
+            remedy="Correct the length.",
+        )
+    return meters
+
+
+def shown_length(units: float, meters_per_unit: float | None) -> str:
+    """A length of the scene in words: ``85.0 mm``, or ``0.532 units`` without a scale."""
+    if meters_per_unit is None:
+        return f"{units:.4g} units"
+    meters = units * meters_per_unit
+    for unit in ("km", "m", "cm", "mm"):
+        if meters >= LENGTHS[unit]:
+            return f"{meters / LENGTHS[unit]:.4g} {unit}"
+    return f"{meters / 1e-3:.3g} mm"
+
+
+def balanced(radiance: Tensor, gains: Tensor | None) -> Tensor:
+    """Linear radiance [..., 3] as it is shown: times the gains [3] of a white balance, if there is one."""
+    return radiance if gains is None else radiance * gains.to(radiance)

@@ -1,0 +1,157 @@
+"""The one exception that means: the user's input or environment is at fault, and what to do about it."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import os
+import re
+import shlex
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
+
+
+class PolarguideError(Exception):
+    """A mistake in what was given to the program.
+
+    The message names the file or field, what was expected, what was found, and what to do. The command line
+    prints it as one line without a traceback.
+
+    Args:
+        where: the file, folder, flag or field.
+        expected: what should have been there.
+        found: what was there.
+        remedy: what to do about it.
+    """
+
+    def __init__(self, where: object, *, expected: str, found: str, remedy: str) -> None:
+        super().__init__(f"{where}: expected {expected}, found {found}. {remedy}")
+        self.where = str(where)
+        self.is_path = isinstance(where, os.PathLike)  # one may be called like an option
+        self.expected = expected
+        self.found = found
+        self.remedy = remedy
+
+
+class PolarguideWarning(UserWarning):
+    """Something that the user should know before relying on a result."""
+
+
+DISTRIBUTIONS = {"skimage": "scikit-image", "websockets": "viser"}
+"""What to install for a module of another name: viser works with some versions of websockets only, and brings one."""
+_NAME = re.compile(r"[A-Za-z0-9._-]+")
+_EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
+
+
+def install_extra(extra: str) -> str:
+    """The command that adds an extra to this installation.
+
+    Where there is no source folder, as after the installation of a wheel, the packages of the extra are named.
+    """
+    source = _source_folder()
+    packages = [text for text, of in _requirements() if of == extra]
+    if source is None and packages:
+        return _pip(*packages)
+    return _pip(f"{'.' if source in (None, Path.cwd()) else source}[{extra}]")
+
+
+def install_package(module: str) -> str:
+    """The command that adds the package of a module, in a version that polarguide works with."""
+    module = module.partition(".")[0]
+    package = _plain(DISTRIBUTIONS.get(module, module))
+    known = (
+        text for text, _ in _requirements() if (name := _NAME.match(text)) and _plain(name[0]) == package
+    )
+    return _pip(next(known, package))
+
+
+def _plain(name: str) -> str:
+    """The name of a distribution as indexes compare it."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def _pip(*packages: str) -> str:
+    """A command line of the pip that installs where this program runs: not always the one on the shell's path."""
+    found = shutil.which("pip")
+    ours = found is not None and Path(found).parent == Path(sys.executable).parent
+    return shlex.join([*(["pip"] if ours else [sys.executable, "-m", "pip"]), "install", *packages])
+
+
+def _source_folder() -> Path | None:
+    """The folder of sources that this copy runs or was installed from (PEP 610); None where there is no such folder."""
+    metadata = importlib.import_module("importlib.metadata")
+    here = Path(__file__).resolve().parents[3]
+    if _holds_project(here):
+        return here
+    try:
+        record = metadata.distribution("polarguide").read_text("direct_url.json")
+        url = json.loads(record or "{}").get("url", "")
+    except (metadata.PackageNotFoundError, ValueError):
+        return None
+    folder = Path(url2pathname(urlsplit(url).path))
+    return folder if url.startswith("file:") and _holds_project(folder) else None
+
+
+def _holds_project(folder: Path) -> bool:
+    """Whether a folder is polarguide's own checkout or source archive."""
+    return (folder / "src" / "polarguide").is_dir() and (folder / "pyproject.toml").is_file()
+
+
+def _requirements() -> list[tuple[str, str]]:
+    """What the installed metadata requires: (such as ``viser==1.1.*``, the extra or empty); [] without metadata."""
+    metadata = importlib.import_module("importlib.metadata")
+    try:
+        lines = metadata.requires("polarguide") or []
+    except metadata.PackageNotFoundError:
+        return []
+    found = []
+    for line in lines:
+        text, _, condition = line.partition(";")
+        extra = _EXTRA.search(condition)
+        found.append((text.strip(), extra[1] if extra else ""))
+    return found
+
+
+def require_package(module: str, what: str) -> None:
+    """Check that a package is there, without loading it: before work begins, not after.
+
+    Raises:
+        PolarguideError: it is not installed.
+    """
+    try:
+        there = importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):  # a package whose own metadata is broken
+        there = False
+    if not there:
+        raise _missing(module, what)
+
+
+def optional_import(module: str, what: str, *, extra: str = "") -> Any:
+    """Import a library that most verbs do without: then it costs them no time, and may be missing.
+
+    Args:
+        module: its name. what: what it is needed for, as the message says. extra: the extra of polarguide that
+            brings it; empty: it comes with polarguide.
+
+    Raises:
+        PolarguideError: it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise _missing(module, what, extra) from None
+
+
+def _missing(module: str, what: str, extra: str = "") -> PolarguideError:
+    command = install_extra(extra) if extra else install_package(module)
+    return PolarguideError(
+        what,
+        expected=f"the Python package {module.partition('.')[0]}",
+        found="that it is not installed",
+        remedy=f"Install it with {command} and repeat the command.",
+    )

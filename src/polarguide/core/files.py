@@ -1,0 +1,266 @@
+"""Reading and writing files: what is read is either the old file or the whole new one; failures are explained."""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import os
+import re
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from polarguide.core.errors import PolarguideError
+from polarguide.core.system import process_is_alive
+
+LARGEST_FILE = 1 << 31
+_MASK = os.umask(0)  # what rights new files do not get; it can only be asked for by setting it
+os.umask(_MASK)
+
+
+@contextlib.contextmanager
+def atomic(path: Path) -> Iterator[Path]:
+    """Write to a temporary file that takes the place of ``path`` only when it is complete and on disk.
+
+    What processes that were killed have left of the same file is removed.
+
+    Yields:
+        The temporary file's path, in the same folder.
+
+    Raises:
+        PolarguideError: it cannot be written, for example because the disk is full.
+    """
+    temporary = _temporary(path)
+    with writing(path):
+        try:
+            yield temporary
+            with open(temporary, "rb") as file:
+                os.fsync(file.fileno())
+            os.chmod(temporary, 0o666 & ~_MASK)  # some libraries write for the owner alone
+            os.replace(temporary, path)
+            _sync_folder(path.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def temporary_folder(path: Path) -> Iterator[Path]:
+    """A folder beside ``path`` for work on it, which is removed afterwards, and at the next call after a kill.
+
+    Raises:
+        PolarguideError: it cannot be written, for example because the disk is full.
+    """
+    temporary = _temporary(path)
+    with writing(path):
+        try:
+            temporary.mkdir(parents=True)
+            yield temporary
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Write into a temporary folder whose files then take their places in ``path``, each as a whole.
+
+    Yields:
+        The temporary folder, beside ``path``, which is made.
+
+    Raises:
+        PolarguideError: it cannot be written, for example because the disk is full.
+    """
+    make_folder(path)
+    with temporary_folder(path) as temporary:
+        yield temporary
+        for made in sorted(temporary.iterdir()):
+            with open(made, "rb") as file:
+                os.fsync(file.fileno())
+        for made in sorted(temporary.iterdir()):
+            os.replace(made, path / made.name)
+        _sync_folder(path)
+
+
+def _temporary(path: Path) -> Path:
+    """The temporary name of a file or folder in this process; removes those of processes that are no more.
+
+    What has this process's own number is of an earlier one, or a link that somebody put there to be written through.
+    """
+    with contextlib.suppress(OSError):
+        for old in path.parent.glob(f".{glob.escape(path.name)}.*.tmp*"):
+            process = old.name.removeprefix(f".{path.name}.").partition(".")[0]
+            ours = process.isascii() and process.isdigit()
+            if ours and (int(process) == os.getpid() or not process_is_alive(int(process))):
+                with contextlib.suppress(OSError):
+                    shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
+
+
+@contextlib.contextmanager
+def in_utf8(path: Path) -> Iterator[Path]:
+    """A name in UTF-8 by which to read or write a file whose own is other bytes: some libraries take no others."""
+    try:
+        os.fspath(path).encode()
+    except UnicodeEncodeError:
+        with tempfile.TemporaryDirectory() as folder:
+            link = Path(folder) / "file"
+            link.symlink_to(path.absolute())
+            yield link
+    else:
+        yield path
+
+
+def holds_files(folder: Path) -> bool:
+    """Whether there is anything in a folder but what a process that was killed left half-written."""
+    return any(re.fullmatch(r"\..+\.\d+\.tmp", path.name) is None for path in folder.iterdir())
+
+
+def write_whole(path: Path, data: bytes) -> int:
+    """Write a file completely or not at all; returns its size.
+
+    Raises:
+        PolarguideError: it cannot be written.
+    """
+    with atomic(path) as temporary:
+        temporary.write_bytes(data)
+    return len(data)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in UTF-8, completely or not at all; halves of characters in it become escapes.
+
+    Raises:
+        PolarguideError: it cannot be written.
+    """
+    write_whole(path, text.encode("utf-8", "backslashreplace"))
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder and those above it, unless it exists.
+
+    Raises:
+        PolarguideError: it cannot be created.
+    """
+    with writing(path):
+        path.mkdir(parents=True, exist_ok=True)
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn an OSError of what writes ``path`` into a message that says how to go on.
+
+    Raises:
+        PolarguideError: there was one.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise PolarguideError(
+            path,
+            expected="to write this file",
+            found=_reason(error),
+            remedy="Make room or give rights, and repeat the command: it goes on where it stopped.",
+        ) from error
+
+
+def _reason(error: OSError) -> str:
+    """What happened, in words; of a copied folder, what happened to its first file."""
+    if isinstance(error, shutil.Error) and isinstance(error.args[0], list):
+        return str(error.args[0][0][-1])
+    return error.strerror or str(error)
+
+
+def require_folder(path: Path, *, expected: str, remedy: str) -> None:
+    """Check that a folder exists.
+
+    Raises:
+        PolarguideError: there is a file of this name, or nothing.
+    """
+    if not path.is_dir():
+        found = "a file" if path.exists() else "nothing"
+        raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
+
+
+def require_file(path: Path, *, expected: str, remedy: str) -> None:
+    """Check that something is an ordinary file: reading a pipe or a device may never end.
+
+    Raises:
+        PolarguideError: it is something else, or there is nothing.
+    """
+    if path.is_file():
+        return
+    found = "a folder" if path.is_dir() else "a pipe or device" if path.exists() else "nothing"
+    raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
+
+
+def check_out(path: Path) -> None:
+    """Check that a folder can be written to where there may be none yet.
+
+    Raises:
+        PolarguideError: there is a file of this name, or a link to nowhere; or no file can have this name.
+    """
+    if "\0" in os.fspath(path):
+        raise PolarguideError(
+            repr(os.fspath(path)),
+            expected="a folder to write",
+            found="a null byte",
+            remedy="Give another --out.",
+        )
+    if os.path.lexists(path):
+        require_folder(path, expected="a folder to write", remedy="Give another --out.")
+
+
+def require_inside(folder: Path, *paths: Path) -> None:
+    """Refuse places that links lead out of a folder: somebody else may have made what it holds.
+
+    Args:
+        folder: what is written into; it may be a link itself. paths: places in it, which need not exist.
+
+    Raises:
+        PolarguideError: one lies elsewhere.
+    """
+    whole = Path(os.path.realpath(folder))
+    for path in paths:
+        real = Path(os.path.realpath(path))
+        if not real.is_relative_to(whole):
+            raise PolarguideError(
+                path,
+                expected=f"a place in {folder}",
+                found=f"a link to {real}",
+                remedy="Remove the link, or name the other place with --out; nothing was written there.",
+            )
+
+
+def read_file(
+    path: Path, *, largest: int = LARGEST_FILE, remedy: str = "Check that the file exists and may be read."
+) -> bytes:
+    """The bytes of a file of up to ``largest``, 2 GiB; ``remedy`` is for messages.
+
+    Raises:
+        PolarguideError: the file cannot be read, or is larger.
+    """
+    try:
+        about = path.stat()
+        if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):  # reading may never end
+            raise OSError("a pipe or device")
+        if about.st_size > largest:
+            raise OSError(f"one of {about.st_size} bytes, more than {largest >> 20} MiB")
+        return path.read_bytes()
+    except OSError as error:
+        raise PolarguideError(
+            path,
+            expected="a readable file",
+            found=error.strerror or str(error),
+            remedy=remedy,
+        ) from error
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename in a folder durable, on systems that can."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

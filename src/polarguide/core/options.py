@@ -1,0 +1,181 @@
+"""What commands ask for: how a scene is read, what to compute on. Nothing here imports torch.
+
+The command line reads names, types, defaults and texts from these classes.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from polarguide.core.errors import PolarguideError
+
+DeviceName = Literal["auto", "cpu", "cuda"]
+Transfer = Literal["linear", "srgb"]
+Split = Literal["directions", "every-8th"]
+Exposures = Literal["captured", "four", "three", "two", "one", "unknown", "mixed", "sparse", "none"]
+EXPOSURES: tuple[Exposures, ...] = get_args(Exposures)
+ExportFormat = Literal["ply", "spz", "sog", "mesh", "points", "environment", "cameras"]
+PictureFormat = Literal["png", "exr", "npy"]
+EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
+    "spz": ("gaussforge",),
+    "mesh": ("skimage", "trimesh"),
+    "environment": ("OpenEXR",),
+}
+"""The packages that formats need: looked for before a run is loaded."""
+PathLike = str | os.PathLike[str]
+INDEX = 1.5
+"""Refractive index of glass, plastic and glaze, for scenes that name none."""
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+
+MOST = 10**9
+"""The largest count that any option takes."""
+MOST_THREADS = 1024
+LEAST_MEMORY = 2**-10
+"""In GiB. Nothing fits into less; what is needed, the pictures say."""
+
+
+def check_count(name: str, value: int, minimum: int = 1, most: int = MOST) -> None:
+    """Check an option's value.
+
+    Raises:
+        PolarguideError: it is less than ``minimum`` or more than ``most``.
+    """
+    if not minimum <= value <= most:
+        expected, change = (f"up to {most}", "smaller") if value > most else (f"{minimum} or more", "larger")
+        raise PolarguideError(name, expected=expected, found=str(value), remedy=f"Give a {change} number.")
+
+
+def check_finite(name: str, value: float, least: float = -math.inf, most: float = math.inf) -> None:
+    """Check an option's value.
+
+    Raises:
+        PolarguideError: it is not a finite number from ``least`` to ``most``.
+    """
+    if not (math.isfinite(value) and least <= value <= most):
+        whole = math.isinf(least) and math.isinf(most)
+        expected = "a finite number" if whole else f"{least:g} to {most:g}"
+        raise PolarguideError(name, expected=expected, found=str(value), remedy="Correct the number.")
+
+
+def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
+    """Check an option's value.
+
+    Raises:
+        PolarguideError: it is not one of the choices.
+    """
+    known = list(choices)
+    if value not in known:
+        expected = "one of " + ", ".join(known)
+        raise PolarguideError(name, expected=expected, found=value, remedy="Correct the name.")
+
+
+_UNITS = {"k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
+_BINARY = {"k": 1 << 10, "m": 1 << 20, "g": 1 << 30, "t": 1 << 40}
+_SIZE = re.compile(r"(?P<count>\d+(\.\d*)?|\.\d+) ?(?P<unit>[kmgt])(?P<binary>i?)b?", re.IGNORECASE)
+
+
+def gibibytes(text: str) -> float | None:
+    """A size such as 4GB, 600MB or 3.5GiB in GiB; None for other texts, and for a number without a unit."""
+    found = _SIZE.fullmatch(text.strip())
+    if found is None:
+        return None
+    units = _BINARY if found["binary"] else _UNITS
+    return float(found["count"]) * units[found["unit"].lower()] / _BINARY["g"]
+
+
+def index_of(asked: float | None, scene: float | None = None) -> float:
+    """The refractive index that was asked for, else that of ``scene.json``, else ``INDEX``."""
+    return next((index for index in (asked, scene) if index is not None), INDEX)
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """How a scene folder is read.
+
+    Attributes:
+        downscale: Average the pictures over boxes of this many pixels first.
+        transfer: How the files encode radiance. Polarization needs linear; srgb undoes the display curve of JPEGs.
+        memory: The most memory to take, such as 4GB (a number alone is GiB): of training, all that the process takes;
+            elsewhere what the pictures take, as their headers state. Without it, 80 % of what is free.
+        split: Which views are held out to be scored on where the scene has no split.json, one in eight: directions
+            spreads them among the others, every-8th counts through the names.
+    """
+
+    downscale: int = 1
+    transfer: Transfer = "linear"
+    memory: float | None = None
+    split: Split = "directions"
+
+    def __post_init__(self) -> None:
+        check_count("downscale", self.downscale)
+        if self.memory is not None:
+            check_finite("memory", self.memory, LEAST_MEMORY, 1e6)
+
+
+@dataclass(frozen=True)
+class ThreadOptions:
+    """How much of the machine to use.
+
+    Attributes:
+        threads: Threads to use; 0 takes all cores.
+    """
+
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        check_count("threads", self.threads, 0, MOST_THREADS)
+
+
+@dataclass(frozen=True)
+class ComputeOptions(ThreadOptions):
+    """What to compute on.
+
+    Attributes:
+        device: What to compute on; auto takes the GPU where there is one and gsplat is installed.
+    """
+
+    device: DeviceName = "auto"
+
+
+@dataclass(frozen=True)
+class VisitorOptions:
+    """Which web pages may talk to the viewer, besides those that it sends itself to an address of its machine.
+
+    Attributes:
+        allow_host: Names, such as a tunnel's, by which the viewer may be asked for, besides addresses and localhost.
+        allow_origin: Names of sites, such as a proxy, whose pages may talk to the viewer.
+    """
+
+    allow_host: tuple[str, ...] = ()
+    allow_origin: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class SessionOptions(VisitorOptions, ComputeOptions):
+    """What a training's result does not depend on.
+
+    Attributes:
+        checkpoint_every: Steps between two checkpoints: a kill loses at most as many.
+        keep_optimizer: Keep the optimizer's state in the last checkpoint, which then is four times as large. Rendering,
+            scores and exports do without; only code of yours that trains on from it would want it.
+        viewer: Look on in a browser while it trains (afterwards: polarguide view).
+        viewer_host: Address to listen at. Others can reach it only if you give one of theirs (0.0.0.0: anyone's).
+        viewer_port: To listen at; the next free one is taken if it is in use.
+    """
+
+    checkpoint_every: int = 500
+    keep_optimizer: bool = False
+    viewer: bool = False
+    viewer_host: str = LOOPBACK[0]
+    viewer_port: int = 8080
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_count("checkpoint_every", self.checkpoint_every)
+        check_finite("viewer_port", self.viewer_port, 1, 65535)

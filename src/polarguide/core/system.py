@@ -1,0 +1,372 @@
+"""Signals, memory and processes, what only some operating systems offer, and variables that would end a process."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import importlib
+import math
+import os
+import re
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Any, TypeVar
+
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import MOST_THREADS
+
+MEBIBYTE = 1 << 20
+LAST_WORDS_SECONDS = 5.0
+MOST_PROCESSES = 65536
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
+NEARLY, GROWTH, SETTLED = 0.9, 1.05, 3
+"""Of a limit, from which on freed memory is given back; of the most that steps then hold, until it is again; and how
+many steps tell the most, some of which take more than others.
+"""
+PARTLY = 0.5
+"""Of a limit, from which on ``MemoryBound.clear`` gives freed memory back."""
+
+Item = TypeVar("Item")
+
+
+def _posix(module: str) -> Any | None:
+    """A module of the standard library that POSIX systems alone have."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        return None
+
+
+def stop_signals() -> list[int]:
+    """SIGTERM; and SIGHUP, of a terminal that goes away, unless it is ignored (nohup) or there is none."""
+    found = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    return [
+        number for number in found if signal.getsignal(number) != signal.SIG_IGN or number == signal.SIGTERM
+    ]
+
+
+_interrupts: list[int] = []
+
+
+def interrupt(number: int, frame: FrameType | None) -> None:
+    """A handler of signals that raises KeyboardInterrupt, as Python's own does, and takes note of it.
+
+    Packages lose it: what they import while it comes looks broken, and says nothing of the reason.
+    """
+    _interrupts.append(number)
+    signal.default_int_handler(number, frame)
+
+
+def interrupts() -> int:
+    """How many signals ``interrupt`` has taken in this process."""
+    return len(_interrupts)
+
+
+class StopSignals:
+    """A context in which Ctrl-C, SIGTERM and SIGHUP ask work to stop; the object is a training's ``should_stop``.
+
+    Before it is called for the first time, and at a second Ctrl-C, they interrupt at once.
+    """
+
+    def __init__(self) -> None:
+        self._asked = self._works = False
+
+    def __enter__(self) -> StopSignals:
+        self._old = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, *stop_signals())}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._old.items():
+            signal.signal(number, handler)
+
+    def __call__(self) -> bool:
+        self._works = True
+        return self._asked
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        if self._works:
+            if self._asked and number == signal.SIGINT:
+                interrupt(number, frame)
+            self._asked = True
+        elif number == signal.SIGTERM and process_count() > 1:
+            # torchrun ends the others when one process is lost: first one of them has to say what happened.
+            timer = threading.Timer(LAST_WORDS_SECONDS, os._exit, (128 + number,))
+            timer.daemon = True
+            timer.start()
+        else:
+            interrupt(number, frame)
+
+
+@contextlib.contextmanager
+def sigterm_kept() -> Iterator[None]:
+    """Keep the handler of SIGTERM, which some libraries replace as they are loaded."""
+    handler = signal.getsignal(signal.SIGTERM)
+    yield
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
+
+
+@contextlib.contextmanager
+def exclusive_lock(path: Path) -> Iterator[None]:
+    """Hold a lock on a file. Child processes inherit it, and keep it if this process is killed.
+
+    Raises:
+        BlockingIOError: another process holds it.
+        OSError: it cannot be opened, or is a link: what that leads to is not ours to open.
+    """
+    fcntl = _posix("fcntl")
+    handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+    with open(handle, "w") as file:
+        if fcntl is not None:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.set_inheritable(file.fileno(), True)
+        yield
+
+
+def hold_folder(folder: Path) -> Callable[[], None]:
+    """Lock a folder itself, without a file in it; returns what lets it go. Does nothing where folders have no locks.
+
+    Raises:
+        BlockingIOError: another process holds it.
+    """
+    fcntl = _posix("fcntl")
+    if fcntl is None:
+        return lambda: None
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise
+    except OSError:  # a disk of the network without locks
+        pass
+    return lambda: os.close(handle)
+
+
+@contextlib.contextmanager
+def only_writer(lock: Path, *, expected: str, found: str) -> Iterator[None]:
+    """Hold the lock of a folder.
+
+    Raises:
+        PolarguideError: another process holds it; ``expected`` and ``found`` say so.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(exclusive_lock(lock))
+        except BlockingIOError:
+            raise PolarguideError(
+                lock.parent, expected=expected, found=found, remedy="Wait for it, or give another --out."
+            ) from None
+        yield
+
+
+def peak_memory_mib() -> float | None:
+    """The most memory in MiB that this process has held at a time, or None where the system does not tell."""
+    resource = _posix("resource")
+    if resource is None:
+        return None
+    peak = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    return peak / MEBIBYTE if os.uname().sysname == "Darwin" else peak / 1024
+
+
+def resident_memory() -> int | None:
+    """Bytes of memory that this process holds now, or the most that it has held; None: the system does not tell."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    peak = peak_memory_mib()
+    return None if peak is None else int(peak * MEBIBYTE)
+
+
+def return_freed_memory() -> None:
+    """Give what has been freed back to the system, where the allocator is glibc's."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+class MemoryBound:
+    """Gives freed memory back to the system where this process comes to hold nearly as much as it may, or half of it
+    before other work.
+
+    An allocator that keeps what is freed (``keep_freed_memory``) holds ever more where sizes change, as with each
+    growth of the Gaussians: pieces of former sizes lie free between those in use.
+
+    Args:
+        limit: bytes that the process may hold; without one, nothing is done.
+    """
+
+    def __init__(self, limit: float = math.inf) -> None:
+        self._limit, self._least = limit, NEARLY * limit
+        self._bound, self._most, self._waits = self._least, 0.0, 0
+
+    def keep(self) -> None:
+        """Call once per step, when allocations of successive steps have similar sizes."""
+        held = resident_memory()
+        if held is None:
+            return
+        if self._waits:  # steps take what they need again: under the most of it there is nothing to return
+            self._most, self._waits = max(self._most, held), self._waits - 1
+            self._bound = min(max(self._least, GROWTH * self._most), self._limit)
+        elif held > self._bound:
+            return_freed_memory()
+            self._most, self._waits = 0.0, SETTLED
+
+    def clear(self) -> None:
+        """Call between two operations whose allocations have different sizes, such as a view's targets and a step."""
+        held = resident_memory()
+        if held is not None and held > PARTLY * self._limit:
+            return_freed_memory()
+
+    def between(self, items: Iterable[Item]) -> Iterator[Item]:
+        """The items, with ``clear`` called before each and after the last.
+
+        What is kept of one would otherwise lie between gaps that the work on those before it has left.
+        """
+        iterator = iter(items)
+        while True:
+            self.clear()
+            try:
+                item = next(iterator)
+            except StopIteration:
+                return
+            yield item
+
+
+UNBOUNDED = MemoryBound()
+
+
+def keep_freed_memory() -> None:
+    """Tell the allocator, for the rest of this process, to keep what is freed; only glibc's can.
+
+    Each step of a training frees and asks for the same hundred megabytes, which glibc would hand to the system and
+    fetch again, page by page, cleared. A process that is ours alone calls this, never a module as it is imported.
+    """
+    try:
+        libc = ctypes.CDLL(None)
+        libc.gnu_get_libc_version  # noqa: B018, elsewhere the numbers below may mean something else
+    except (AttributeError, OSError, TypeError):
+        return
+    libc.mallopt(M_TRIM_THRESHOLD, -1)  # never
+    if not libc.mallopt(M_MMAP_THRESHOLD, 1 << 30):
+        libc.mallopt(M_MMAP_THRESHOLD, 1 << 25)  # the most that older versions take
+
+
+def free_memory(group: Path = Path("/sys/fs/cgroup")) -> int | None:
+    """Bytes of memory that this process may still take, as the system and its control group say; None: they do not.
+
+    What a control group holds of files goes when memory is asked for, and counts as free.
+    """
+    found = []
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        found += [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+    with contextlib.suppress(OSError, ValueError):
+        free = int((group / "memory.max").read_text()) - int((group / "memory.current").read_text())
+        held = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        found.append(free + int(held.get("inactive_file", 0)) + int(held.get("active_file", 0)))
+    return max(0, min(found)) if found else None
+
+
+def machine_busy_seconds() -> float | None:
+    """Processor seconds that the whole machine has been busy, or None where the system does not tell."""
+    try:
+        fields = [int(x) for x in Path("/proc/stat").read_text().partition("\n")[0].split()[1:]]
+    except (OSError, ValueError):
+        return None
+    user, nice, system, _, _, irq, softirq, *rest = fields
+    steal = rest[0] if rest else 0
+    return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
+
+
+def process_is_alive(pid: int) -> bool:
+    """Whether a process runs; a zombie, which has ended and waits to be asked about, does not."""
+    if os.name != "posix":  # there, signal 0 would end it
+        return True
+    try:
+        os.kill(pid, 0)
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (ProcessLookupError, OverflowError):  # the latter of a number that no process has
+        return False
+    except (OSError, IndexError):  # not ours to signal, or a system without /proc
+        return True
+    return state not in "ZX"
+
+
+def process_rank() -> int:
+    """The number of this process among those that torchrun started; 0 without it, or for no number."""
+    text = os.environ.get("RANK", "")
+    return int(text) if _is_count(text) else 0
+
+
+def process_count() -> int:
+    """How many processes torchrun started for this training; 1 without it.
+
+    Raises:
+        PolarguideError: the variables that torchrun sets hold something else.
+    """
+    counts = {name: os.environ.get(name, default) for name, default in (("WORLD_SIZE", "1"), ("RANK", "0"))}
+    for name, text in counts.items():
+        if not _is_count(text):
+            raise _no_rank(name, f"a whole number up to {MOST_PROCESSES}", repr(text))
+    world, rank = (int(text) for text in counts.values())
+    if not rank < max(1, world) <= MOST_PROCESSES:
+        raise _no_rank(
+            "RANK", f"one of up to {MOST_PROCESSES} processes, counted from 0", f"{rank} of {world}"
+        )
+    if world > 1:
+        _require_meeting_place()
+    return max(1, world)
+
+
+def _require_meeting_place() -> None:
+    """Check what several processes need to find each other.
+
+    Raises:
+        PolarguideError: the variables that torchrun sets hold something else.
+    """
+    local, host, port = (os.environ.get(name, "") for name in ("LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT"))
+    if not _is_count(local):
+        raise _no_rank("LOCAL_RANK", "the number of this process on its machine", repr(local))
+    if not host:
+        raise _no_rank("MASTER_ADDR", "the machine of the first process", "none")
+    if not (_is_count(port) and 0 < int(port) < 65536):
+        raise _no_rank("MASTER_PORT", "a port from 1 to 65535", repr(port))
+
+
+def _is_count(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) < 10
+
+
+def _no_rank(name: str, expected: str, found: str) -> PolarguideError:
+    remedy = "Unset WORLD_SIZE and RANK, or start the training with torchrun."
+    return PolarguideError(name, expected=expected, found=found[:100], remedy=remedy)
+
+
+_SIZE = re.compile(r"[0-9]{1,18}(KB|Kb|kb|MB|Mb|mb)?")
+_SIZES = re.compile(r"OPENCV_(IO_MAX_IMAGE_[A-Z]+|IMGCODECS_[A-Z]+_MAX_FILE_SIZE)")
+"""Read by OpenCV as it is loaded, which ends the process where one is not a size."""
+
+
+def check_variables() -> None:
+    """Validate variables that OpenCV and the kernels read when they are loaded: a wrong value would end the process.
+
+    Raises:
+        PolarguideError: the kernels would start more threads than any machine has, or OpenCV would end the process.
+    """
+    threads = os.environ.get("POLARGUIDE_THREADS", "").strip()
+    if threads.isdecimal() and len(threads) < 1000 and int(threads) > MOST_THREADS:
+        raise _wrong("POLARGUIDE_THREADS", f"a number up to {MOST_THREADS}", threads)
+    for name, text in os.environ.items():
+        if _SIZES.fullmatch(name) and not _SIZE.fullmatch(text):
+            raise _wrong(name, "a whole number", text)
+
+
+def _wrong(name: str, expected: str, found: str) -> PolarguideError:
+    return PolarguideError(
+        f"the variable {name}",
+        expected=expected,
+        found=repr(found[:100]),
+        remedy=f"Correct it, or unset {name}.",
+    )

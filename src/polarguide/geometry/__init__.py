@@ -1,0 +1,1 @@
+"""Cameras, vectors and frames."""

@@ -1,0 +1,183 @@
+"""A pinhole camera with a pose: the one camera type of the project.
+
+OpenCV axes (x right, y down, z forward), world-to-camera pose ``x_cam = R x_world + t``, and the center of the
+top-left pixel at (0.5, 0.5), as in COLMAP.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from polarguide.geometry.vectors import unit, unit_array
+
+FARTHEST = 1e9
+"""The largest coordinate and focal length; single precision tells nothing apart beyond."""
+FARTHEST_CENTER = 1e4
+"""Of the principal point from the picture's corner, in sides of the picture, which may be a crop of a larger one."""
+SHORTEST_FOCAL = 1e-4
+"""In sides of the picture."""
+MOST_STRETCH = 100.0
+"""Of one focal length over the other; anamorphic lenses have 2."""
+LENS = (
+    f"positive focal lengths, at most {MOST_STRETCH:g} times one another, and a principal point, at most "
+    f"{FARTHEST_CENTER:g} sides of the picture away"
+)
+
+
+def can_be_lens(size: ArrayLike, focal: ArrayLike, center: ArrayLike) -> bool:
+    """Whether a lens can have these numbers in pixels, also in single precision; false for NaN."""
+    side = max(float(np.max(size)), 1.0)  # pictures without pixels are refused elsewhere
+    lengths, places = np.asarray(focal, np.float64), np.abs(np.asarray(center, np.float64))
+    sound = (lengths <= FARTHEST).all() and (places <= min(FARTHEST, FARTHEST_CENTER * side)).all()
+    alike = lengths.max() <= MOST_STRETCH * lengths.min()
+    return bool(sound and alike and (lengths >= SHORTEST_FOCAL * side).all())
+
+
+@lru_cache(maxsize=4)
+def _pixel_rays(
+    size: tuple[int, int],
+    focal: tuple[float, float],
+    center: tuple[float, float],
+    dtype: torch.dtype,
+    device: torch.device,
+) -> Tensor:
+    """Rays of an internal calibration, which views share and every rendering asks for."""
+    x, y = (
+        (torch.arange(n, dtype=dtype, device=device) + 0.5 - c) / f
+        for n, f, c in zip(size, focal, center, strict=True)
+    )
+    grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+    return unit(torch.stack((grid_x, grid_y, torch.ones_like(grid_x)), dim=-1))
+
+
+class Pose(NamedTuple):
+    """A pose on one device, in one dtype.
+
+    Attributes:
+        rotation: world-to-camera, [3, 3]. translation: world-to-camera, [3]. center: of the camera in the world, [3].
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    center: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera.
+
+    Attributes:
+        width, height: picture size in pixels.
+        fx, fy, cx, cy: focal lengths and principal point in pixels.
+        rotation: world-to-camera rotation, [3, 3] float64 on the CPU.
+        translation: world-to-camera translation, [3] float64 on the CPU.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    rotation: Tensor
+    translation: Tensor
+
+    @property
+    def center(self) -> Tensor:
+        """Camera center in the world, [3] float64."""
+        return -self.rotation.T @ self.translation
+
+    @property
+    def intrinsics(self) -> Tensor:
+        """Focal lengths and principal point as a matrix, [3, 3] float64."""
+        matrix = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
+        return torch.tensor(matrix, dtype=torch.float64)
+
+    @property
+    def world_to_camera(self) -> Tensor:
+        """The pose as a matrix, [4, 4] float64."""
+        matrix = torch.eye(4, dtype=torch.float64)
+        matrix[:3, :3], matrix[:3, 3] = self.rotation, self.translation
+        return matrix
+
+    def pose(self, dtype: torch.dtype, device: torch.device) -> Pose:
+        """The pose on a device, not to be written to. It is kept, so that a second rendering copies nothing there."""
+        poses: dict[tuple[torch.dtype, torch.device], Pose] = self.__dict__.setdefault("_poses", {})
+        key = (dtype, device)
+        if key not in poses:
+            poses[key] = Pose(*(t.to(device, dtype) for t in (self.rotation, self.translation, self.center)))
+        return poses[key]
+
+    def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+        """Unit rays through the pixel centers in camera axes, [height, width, 3]; not to be written to."""
+        size, focal, center = (self.width, self.height), (self.fx, self.fy), (self.cx, self.cy)
+        return _pixel_rays(size, focal, center, dtype, torch.device(device))
+
+    def world_rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+        """Unit rays through the pixel centers in world axes, [height, width, 3]."""
+        return self.rays(dtype=dtype, device=device) @ self.pose(dtype, torch.device(device)).rotation
+
+    def to_world(self, vectors: Tensor) -> Tensor:
+        """Turn direction vectors [..., 3] from camera axes into world axes."""
+        return vectors @ self.pose(vectors.dtype, vectors.device).rotation
+
+    def to_camera(self, vectors: Tensor) -> Tensor:
+        """Turn direction vectors [..., 3] from world axes into camera axes."""
+        return vectors @ self.pose(vectors.dtype, vectors.device).rotation.T
+
+    def scaled(self, factor: float, width: int, height: int) -> Camera:
+        """The camera of the same view with ``factor`` times as many pixels each way, in a picture of this size."""
+        inner = {name: factor * getattr(self, name) for name in ("fx", "fy", "cx", "cy")}
+        return replace(self, width=width, height=height, **inner)
+
+    def downscaled(self, factor: int) -> Camera:
+        """The camera of the same view averaged over ``factor`` x ``factor`` pixel boxes (remainders are cut)."""
+        inner = {name: getattr(self, name) / factor for name in ("fx", "fy", "cx", "cy")}
+        return replace(self, width=self.width // factor, height=self.height // factor, **inner)
+
+
+def seen_at(offsets: Tensor, camera: Camera) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
+    """Where a camera sees points: the nearest pixel (row, column), the depth, and whether it lies in the picture.
+
+    Args:
+        offsets: [N, 3] from the camera's center to the points, world axes.
+        camera: the view.
+    """
+    x, y, z = camera.to_camera(offsets).unbind(-1)
+    safe = z.clamp(min=1e-6)
+    column = (camera.fx * x / safe + camera.cx).floor().clamp(-1, camera.width).long()
+    row = (camera.fy * y / safe + camera.cy).floor().clamp(-1, camera.height).long()
+    inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return (row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)), z, inside
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> tuple[Tensor, Tensor]:
+    """The pose of a camera that looks at a point.
+
+    Args:
+        eye: [3] center of the camera in the world.
+        target: [3] point on the optical axis, not ``eye``.
+        up: [3] direction that is upward in the picture, not parallel to the optical axis.
+
+    Returns:
+        World-to-camera rotation [3, 3] and translation [3], float64.
+    """
+    center = np.asarray(eye, np.float64)
+    forward = unit_array(np.asarray(target, np.float64) - center)
+    right = unit_array(np.cross(forward, np.asarray(up, np.float64)))
+    rotation = np.stack((right, np.cross(forward, right), forward))
+    return torch.from_numpy(rotation), torch.from_numpy(-rotation @ center)
+
+
+def quaternion(rotation: ArrayLike) -> tuple[float, float, float, float]:
+    """Unit quaternion (w, x, y, z) of a rotation matrix [3, 3]; its sign is either."""
+    x, y, z, w = Rotation.from_matrix(np.asarray(rotation)).as_quat().tolist()
+    return w, x, y, z

@@ -1,0 +1,1 @@
+"""What is made of a run: pictures, scores and files for other programs."""

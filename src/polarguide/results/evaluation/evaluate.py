@@ -1,0 +1,251 @@
+"""Scoring a run on its test views, with its speed and where its numbers come from."""
+
+from __future__ import annotations
+
+import math
+import platform
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import polarguide
+from polarguide import _native, optics
+from polarguide.capture import View
+from polarguide.capture.view import listed
+from polarguide.core.errors import PolarguideError
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.system import peak_memory_mib
+from polarguide.fields.model import FieldModel
+from polarguide.optics import Mount
+from polarguide.results.evaluation.error_sheet import ERRORS_FILE, ErrorSheet
+from polarguide.results.evaluation.mesh import mesh_scores
+from polarguide.results.evaluation.metrics import HAZE_DEPTH
+from polarguide.results.evaluation.record import METRICS_FILE, write_metrics
+from polarguide.results.evaluation.scores import ErrorsByObject, ViewScores, score_view
+from polarguide.results.evaluation.sources import code_digest, commit
+from polarguide.results.evaluation.target import SceneFacts, ViewTarget
+from polarguide.results.rendering.mesh import RESOLUTION, Surface, fused_surface, implicit_surface
+from polarguide.runs.folder import RunLog
+from polarguide.runs.forecast import Stopwatch
+from polarguide.runs.opened import OpenedRun
+from polarguide.training.angles.fit import fit_angle
+
+
+@torch.no_grad()
+def cross_fitted(view: View, final: Tensor, stokes: Tensor | None) -> Tensor:
+    """The picture that a model predicts of ``view.photograph()``, behind an analyzer that is fitted on the other half.
+
+    Gain, angle and strength of the analyzer are fitted on the left half of the picture for the right one, and on the
+    right one for the left (``angles.fit``), so that no pixel takes part in the fit that it is scored by.
+
+    Args:
+        view: whose pictures do not measure S0.
+        final: [H, W, 3] rendered, S0/2.
+        stokes: [3, H, W, 3] as predicted; None: no prediction, the gain alone is fitted.
+
+    Returns:
+        [H, W, 3] linear, on the device of ``final``.
+    """
+    local = view.to(final.device)
+    measured, rays = local.photograph().to(final), local.camera.rays(device=final.device)
+    good = (~(local.invalid | local.saturated)).to(final)
+    polarized = torch.zeros_like(final).expand(2, *final.shape) if stokes is None else stokes[1:]
+    predicted = torch.cat((2 * final[None], polarized)).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+    left = torch.arange(final.shape[1], device=final.device) < final.shape[1] // 2
+    by_right, by_left = (
+        _behind(measured, predicted, good * half, rays, view.mount) for half in (~left, left)
+    )
+    return torch.where(left[None, :, None], by_right, by_left)
+
+
+def _behind(measured: Tensor, stokes: Tensor, weight: Tensor, rays: Tensor, mount: Mount) -> Tensor:
+    """The whole picture behind the analyzer that fits where the weight is."""
+    found = fit_angle(measured, stokes, weight, rays, mount)
+    if found is None:
+        counted = weight[..., None]
+        gain = (counted * measured).sum() / (counted * stokes[0] / 2).sum().clamp(min=1e-12)
+        return gain * stokes[0] / 2
+    cosine, sine = optics.analyzer(math.radians(found.angle), rays, mount)[..., None].to(stokes)
+    polarized = found.modulation * (stokes[1] * cosine + stokes[2] * sine)
+    return found.gain * (stokes[0] + polarized) / 2
+
+
+MINIMUM_SECONDS = 1.5
+MOST_SECONDS = 40.0
+HELD_MORE = "the process had held more memory before it scored"
+NOT_ALONE = "other work ran on the machine meanwhile"
+
+
+def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT) -> dict[str, Any]:
+    """Score a run's test views and write ``metrics.json`` and ``errors.png`` into its folder.
+
+    Args:
+        run: the run; it is asked for layers only.
+        speed: whether to measure frames a second, which makes sense only while nothing else runs.
+        reporter: told how far it is.
+
+    Returns:
+        The record as written: means over the views, ``views`` by name, ``objects``, ``materials`` and ``provenance``.
+
+    Raises:
+        PolarguideError: the scene cannot be read, or has no test views.
+    """
+    held_before = peak_memory_mib()
+    tests = run.scene.test_views
+    if not tests:
+        raise PolarguideError(
+            run.scene.root,
+            expected="test views to score the run on",
+            found="none: it was trained on all views",
+            remedy='Name some in split.json, {"test": ["<view>", ...]}, and train again.',
+        )
+    facts = SceneFacts.of(run.scene)
+    for warning in facts.warnings:
+        reporter.warn(warning)
+    fitted = [view.name for view in tests if not view.measures_radiance]
+    if fitted:
+        reporter.say(
+            f"scored behind an analyzer that is fitted on the other half of the picture: {listed(fitted)}"
+        )
+    views, by_object, sheet = {}, ErrorsByObject(facts.objects), ErrorSheet(len(tests))
+    with reporter.track("scoring", len(tests)) as advance:
+        for view in tests:
+            views[view.name] = _score(run, view, facts, by_object, sheet)
+            advance(len(views))
+    sheet.write(run.folder / ERRORS_FILE)
+    memory = _peak(held_before)  # before the mesh, which is no part of what a run needs
+    with reporter.track("measuring the mesh"):
+        mesh = mesh_scores(lambda: _surface(run), tests)
+    objects, materials = by_object.records()
+    seconds, alone = RunLog(run.folder).elapsed()
+    fps = _speed(run, normals=False) if speed else None
+    return write_metrics(
+        run.folder / METRICS_FILE,
+        views=views,
+        run={
+            "fps": fps,
+            "fps_reason": None if fps is not None else NOT_ALONE if speed else "not asked for",
+            "fps_layers": _speed(run, depth=True) if speed else None,
+            "train_seconds": seconds if alone and seconds > 0 else None,
+            "train_seconds_reason": None if alone and seconds > 0 else "no log of it" if alone else NOT_ALONE,
+            "gaussians": run.model.gaussians,
+            "steps": run.steps,
+            **memory,
+            **mesh,
+        },
+        objects=objects,
+        materials=materials,
+        provenance=_provenance(run),
+    )
+
+
+def _score(
+    run: OpenedRun, view: View, facts: SceneFacts, by_object: ErrorsByObject, sheet: ErrorSheet
+) -> ViewScores:
+    """Score a view; its errors are added to those by object, and its pictures to the sheet."""
+    # First what is known of it: copied later, it would have to wait until the rendering is done.
+    target = ViewTarget.of_view(view, facts, run.model.device)
+    result = run.model.render(view.camera, depth=True, surface=True)
+    stokes = run.model.stokes(result, view.camera)
+    if not view.measures_radiance:
+        result = replace(result, final=cross_fitted(view, result.final, stokes))
+    in_front = None
+    if target.depth is not None:
+        in_front = run.model.alpha_in_front(view.camera, HAZE_DEPTH * target.depth)
+    sheet.add(view, target, result, stokes)
+    return score_view(target, result, stokes=stokes, in_front=in_front, by_object=by_object)
+
+
+def _peak(before: float | None) -> dict[str, Any]:
+    """The most memory that this process has held since it had held ``before`` at most, in MiB."""
+    peak = peak_memory_mib()
+    if peak is None or before is None:
+        return {"peak_memory_mib": None, "peak_memory_mib_reason": "the system does not tell"}
+    if peak == before:  # as after a training in this process
+        return {"peak_memory_mib": None, "peak_memory_mib_reason": HELD_MORE}
+    return {"peak_memory_mib": peak, "peak_memory_mib_reason": None}
+
+
+def _surface(run: OpenedRun) -> Surface:
+    """What the mesh scores look at: of a field its zero set, of Gaussians their depths fused."""
+    if isinstance(run.model, FieldModel):
+        return implicit_surface(run.cameras, run.model, resolution=RESOLUTION)
+    fused, _, _ = fused_surface(
+        run.cameras, lambda camera: run.model.render(camera, depth=True, surface=True), resolution=RESOLUTION
+    )
+    return fused
+
+
+def _speed(run: OpenedRun, **layers: bool) -> float | None:
+    def draw(view: View) -> None:
+        run.model.render(view.camera, **layers)
+        if run.model.device.type == "cuda":
+            torch.cuda.synchronize(run.model.device)
+
+    return frames_per_second(draw, run.scene.test_views)
+
+
+def _device(device: torch.device) -> str:
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else _native.simd()
+    return f"{device} ({name}, {_native.thread_count()} threads)"
+
+
+def _provenance(run: OpenedRun) -> dict[str, Any]:
+    configuration = run.configuration
+    return {
+        "recipe": configuration.recipe,
+        "seed": configuration.settings.seed,
+        "commit": commit(),
+        "sources": code_digest(),
+        "versions": {
+            "polarguide": polarguide.__version__,
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+        },
+        "device": _device(run.model.device),
+        "downscale": configuration.downscale,
+        "scene_hash": run.scene.digest,
+        "scene": run.scene.name,
+        "refractive_index": configuration.settings.refractive_index,
+    }
+
+
+def frames_per_second(draw: Callable[[View], object], views: Sequence[View]) -> float | None:
+    """Median over views of 1 / seconds for ``draw``, after one warm-up of each; nothing is waited for but the call.
+
+    Where that would take longer than ``MOST_SECONDS``, as with pictures that take seconds each, as many views as fit
+    into it are timed once, after a warm-up of the first.
+
+    Args:
+        draw: renders one view and returns when it is done.
+        views: what to render; each is timed at least three times.
+
+    Returns:
+        Frames a second, or None where other work ran on the machine meanwhile.
+    """
+    first = _seconds(draw, views[0])
+    rounds, slow = 3, 4 * len(views) * first > MOST_SECONDS
+    if slow:
+        rounds, views = 1, views[: max(1, int(MOST_SECONDS / first))]
+    else:
+        for view in views[1:]:
+            draw(view)
+    times: list[list[float]] = [[] for _ in views]
+    stopwatch = Stopwatch()
+    begin = time.perf_counter()
+    while len(times[0]) < rounds or (not slow and time.perf_counter() - begin < MINIMUM_SECONDS):
+        for taken, view in zip(times, views, strict=True):
+            taken.append(_seconds(draw, view))
+    _, alone = stopwatch.read()
+    return 1 / statistics.median(statistics.median(taken) for taken in times) if alone else None
+
+
+def _seconds(draw: Callable[[View], object], view: View) -> float:
+    start = time.perf_counter()
+    draw(view)
+    return time.perf_counter() - start

@@ -1,0 +1,167 @@
+"""A run's numbers in a file: ``metrics.json``."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypedDict
+
+import msgspec
+
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import write_text
+from polarguide.core.records import decode, read_record, shortened
+from polarguide.results.evaluation.scores import ViewScores, summarize
+from polarguide.results.evaluation.table import HIGHEST_PSNR, METRICS, RUN_METRICS, VIEW_METRICS, Metric
+
+METRICS_FILE = "metrics.json"
+_WRITE_AGAIN = "Score the run again with this version: polarguide eval."
+
+
+class Provenance(TypedDict):
+    """What has to be known to repeat a run. Others may stand beside it."""
+
+    recipe: str
+    seed: int
+    commit: str | None
+    versions: dict[str, str]
+    device: str
+    downscale: int
+    scene_hash: str
+
+
+_Decibels = Annotated[float, msgspec.Meta(le=HIGHEST_PSNR)] | None
+
+
+def _fields(metrics: tuple[Metric, ...], *reasons: str) -> list[Any]:
+    """Fields of a record: the metrics, and reasons of those that may be null for another one than missing truth."""
+    values = [(metric.key, _Decibels if metric.unit == "dB" else float | None) for metric in metrics]
+    return [*values, *((f"{key}_reason", str | None, None) for key in reasons)]
+
+
+_VIEW_REASONS = ("lpips", "flip", "stokes_error")
+_RUN_REASONS = (*_VIEW_REASONS, "fps", "train_seconds", "peak_memory_mib", "mesh_fscore_1")
+
+
+class ObjectErrors(msgspec.Struct, kw_only=True):
+    """Errors over the pixels of an object, or of all objects of a class of material, in all test views."""
+
+    pixels: int
+    views: int
+    psnr: _Decibels
+    normal_mae_deg: float | None
+    specular_psnr: _Decibels
+    diffuse_psnr: _Decibels
+    stokes_error: float | None
+    material: str | None = None
+    metal_share: float | None = None
+
+
+_VIEW = msgspec.defstruct("View", _fields(VIEW_METRICS, *_VIEW_REASONS))
+_RUN = msgspec.defstruct(
+    "Run",
+    [
+        *_fields(METRICS, *_RUN_REASONS),
+        ("views", Annotated[dict[str, Any], msgspec.Meta(min_length=1)]),
+        ("provenance", Provenance),
+        ("objects", dict[str, ObjectErrors], msgspec.field(default_factory=dict)),
+        ("materials", dict[str, ObjectErrors], msgspec.field(default_factory=dict)),
+    ],
+    kw_only=True,
+)
+
+
+def write_metrics(
+    path: str | Path,
+    *,
+    views: Mapping[str, ViewScores],
+    run: Mapping[str, float | int | str | None],
+    provenance: Mapping[str, Any],
+    objects: Mapping[str, Any] | None = None,
+    materials: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Write ``metrics.json`` in one step: a reader sees the old file or the whole new one.
+
+    Top level: the means of ``summarize``, the keys of ``run``, ``views``, ``objects``, ``materials`` and
+    ``provenance``. NaN becomes null.
+
+    Args:
+        path: the file; its folder must exist.
+        views: the scores by view name, at least one.
+        run: values of ``RUN_METRICS`` by key, null where left out, and the reasons of what is null, as ``fps_reason``.
+        provenance: the keys of ``Provenance``, and others as you like.
+        objects, materials: errors by object and by class of material, as of ``ErrorsByObject.records``.
+
+    Returns:
+        What was written.
+
+    Raises:
+        PolarguideError: the record does not pass ``validate_metrics``.
+    """
+    finite: dict[str, Any] = {
+        name: {key: _finite(value) for key, value in scores.items()} for name, scores in views.items()
+    }
+    record: dict[str, Any] = {
+        **summarize(finite),
+        **{metric.key: None for metric in RUN_METRICS},
+        **{key: _finite(value) for key, value in run.items()},
+        "views": finite,
+        "objects": dict(objects or {}),
+        "materials": dict(materials or {}),
+        "provenance": dict(provenance),
+    }
+    validate_metrics(record, where=path)
+    write_text(Path(path), json.dumps(record, indent=2, allow_nan=False) + "\n")
+    return record
+
+
+def read_metrics(run: Path) -> dict[str, Any]:
+    """The scores in a run folder, as ``write_metrics`` wrote them.
+
+    Raises:
+        PolarguideError: the run has not been scored, or the file is not such a record.
+    """
+    path = run / METRICS_FILE
+    if not path.exists():
+        raise PolarguideError(
+            path, expected="the scores of a run", found="none", remedy="Run polarguide eval."
+        )
+    record = read_record(path, dict[str, Any], remedy=_WRITE_AGAIN)
+    validate_metrics(record, path)
+    return record
+
+
+def validate_metrics(record: Any, where: str | Path = METRICS_FILE) -> None:
+    """Check a record against the schema of ``metrics.json``.
+
+    Args:
+        record: the parsed file.
+        where: what an error message calls it.
+
+    Raises:
+        PolarguideError: naming the first key at fault, what was expected there, and what was found.
+    """
+    decode(record, _RUN, where, remedy=_WRITE_AGAIN)
+    _check_reason(record, where)
+    for name, scores in record["views"].items():
+        decode(scores, _VIEW, f"{where}, view {name}", remedy=_WRITE_AGAIN)
+        _check_reason(scores, f"{where}, view {name}")
+
+
+def _check_reason(scores: Mapping[str, Any], where: object) -> None:
+    """Refuse an absent LPIPS without a reason."""
+    reason = scores.get("lpips_reason")
+    if scores["lpips"] is None and not reason:
+        raise PolarguideError(
+            f"{where} (lpips_reason)",
+            expected="a reason, because lpips is null",
+            found=shortened(reason),
+            remedy=_WRITE_AGAIN,
+        )
+
+
+def _finite(value: Any) -> Any:
+    """A value as JSON can hold it."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,314 @@
+"""The one table of metrics: how each is measured on a view, and how scores, console, tables and report show it.
+
+A new metric is a row here, beside the function in ``metrics.py`` that it calls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+from torch import Tensor
+
+from polarguide.results.evaluation.metrics import (
+    beyond_share,
+    coverage_error,
+    depth_error_percent,
+    haze_share,
+    layer_error,
+    mean_alpha,
+    normal_mae_deg,
+    normal_within_11,
+    squared_error,
+    ssim,
+    stokes_error,
+)
+from polarguide.results.evaluation.target import ViewTarget
+
+HIGHEST_PSNR = 100.0
+"""What a PSNR above it, and the infinite one of equal pictures, is recorded as: JSON has no infinity."""
+MESH_LABEL = "mesh F-score 1 %"
+
+Layers = Mapping[str, Tensor | None]
+"""Rendered layers of a view by name: ``final``, ``normal``, ``specular``, ``diffuse``, ``depth``, ``alpha``, the
+predicted ``polarization`` and the weight ``in_front`` of the surface; None where there is none."""
+Measure = Callable[[ViewTarget, Layers], Tensor | None]
+"""A metric of one view as a tensor []; None where it is not defined. In place of decibels the mean squared error."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One quantity of a run.
+
+    Attributes:
+        key: its name in ``metrics.json``.
+        label: what people read. unit: after the value; empty for none.
+        digits: decimal places in tables.
+        better: which direction is better; None: neither, and nothing is set in bold.
+        of: whether each view has a value, and a run their mean, or only the run.
+        measure: its value on a view; None where it is not a single tensor (LPIPS, FLIP), or not of a view.
+        shown: "tables": console, Markdown, LaTeX and the report have it; "files": only CSV and ``results.json``;
+            "record": only ``metrics.json``.
+        timed: whether it counts only when measured alone; such a value may be absent without a fault.
+        factor: what the value is multiplied by in tables.
+    """
+
+    key: str
+    label: str
+    unit: str
+    digits: int
+    better: Literal["higher", "lower"] | None
+    of: Literal["view", "run"] = "view"
+    measure: Measure | None = None
+    shown: Literal["tables", "files", "record"] = "tables"
+    timed: bool = False
+    factor: float = 1.0
+
+    @property
+    def arrow(self) -> str:
+        """Points to the better side; empty where there is none."""
+        return {"higher": "↑", "lower": "↓", None: ""}[self.better]
+
+    @property
+    def heading(self) -> str:
+        """Label, unit and arrow."""
+        return " ".join(filter(None, (self.label, f"({self.unit})" if self.unit else "", self.arrow)))
+
+    def text(self, value: float) -> str:
+        """A recorded value as the console shows it."""
+        number = f"{value:,}" if isinstance(value, int) else f"{value:.3f}"
+        return f"{number} {self.unit if self.factor == 1.0 else ''}".rstrip()
+
+
+def _compared(compare: Callable[..., Tensor], layer: str, *known: str) -> Measure:
+    """A measure of a rendered layer by what the target knows, such as its true values and one of its regions.
+
+    Args:
+        compare: takes the layer, and the attributes of the target that ``known`` names.
+    """
+
+    def measure(target: ViewTarget, layers: Layers) -> Tensor | None:
+        given = [layers[layer], *(getattr(target, name) for name in known)]
+        return None if any(values is None for values in given) else compare(*given)
+
+    return measure
+
+
+def _layer(name: str, *, aligned: bool = False, region: str = "foreground") -> Measure:
+    """The squared error of a layer against its true lobe on the foreground, or another region."""
+    return _compared(partial(layer_error, aligned=aligned), name, name, region)
+
+
+def _mesh(key: str, label: str, *, shown: Literal["tables", "files"] = "files") -> Metric:
+    """A share of the mesh, or of what it should be."""
+    return Metric(key, label, "%", 1, "higher", of="run", shown=shown, factor=100.0)
+
+
+METRICS: tuple[Metric, ...] = (
+    Metric(
+        "psnr", "PSNR", "dB", 2, "higher", measure=_compared(squared_error, "final", "photograph", "valid")
+    ),
+    Metric(
+        "psnr_foreground",
+        "PSNR foreground",
+        "dB",
+        2,
+        "higher",
+        measure=_compared(squared_error, "final", "photograph", "foreground"),
+    ),
+    Metric(
+        "psnr_reflective",
+        "PSNR reflective",
+        "dB",
+        2,
+        "higher",
+        measure=_compared(squared_error, "final", "photograph", "reflective"),
+    ),
+    Metric(
+        "ssim", "SSIM", "", 3, "higher", measure=_compared(ssim, "final", "photograph", "valid", "windows")
+    ),
+    Metric("lpips", "LPIPS", "", 3, "lower"),
+    Metric("flip", "FLIP", "", 3, "lower"),
+    Metric(
+        "normal_mae_deg",
+        "normal error",
+        "deg",
+        1,
+        "lower",
+        measure=_compared(normal_mae_deg, "normal", "normal", "surface"),
+    ),
+    Metric(
+        "normal_within_11",
+        "normals within 11.25 deg",
+        "%",
+        1,
+        "higher",
+        measure=_compared(normal_within_11, "normal", "normal", "surface"),
+        factor=100.0,
+    ),
+    Metric("specular_psnr", "specular PSNR", "dB", 2, "higher", measure=_layer("specular")),
+    Metric("diffuse_psnr", "diffuse PSNR", "dB", 2, "higher", measure=_layer("diffuse")),
+    Metric(
+        "specular_psnr_aligned",
+        "specular PSNR aligned",
+        "dB",
+        2,
+        "higher",
+        measure=_layer("specular", aligned=True),
+        shown="files",
+    ),
+    Metric(
+        "diffuse_psnr_aligned",
+        "diffuse PSNR aligned",
+        "dB",
+        2,
+        "higher",
+        measure=_layer("diffuse", aligned=True),
+        shown="files",
+    ),
+    Metric(
+        "specular_psnr_dielectric",
+        "specular PSNR without metals",
+        "dB",
+        2,
+        "higher",
+        measure=_layer("specular", region="dielectric"),
+        shown="files",
+    ),
+    Metric(
+        "diffuse_psnr_dielectric",
+        "diffuse PSNR without metals",
+        "dB",
+        2,
+        "higher",
+        measure=_layer("diffuse", region="dielectric"),
+        shown="files",
+    ),
+    Metric(
+        "stokes_error",
+        "Stokes error",
+        "",
+        3,
+        "lower",
+        measure=_compared(stokes_error, "polarization", "polarization", "polarized", "photograph"),
+    ),
+    Metric(
+        "depth_error_median_percent",
+        "depth error",
+        "%",
+        2,
+        "lower",
+        measure=_compared(depth_error_percent, "depth", "depth", "near", "extent"),
+    ),
+    Metric(
+        "haze",
+        "haze",
+        "%",
+        2,
+        "lower",
+        measure=_compared(haze_share, "in_front", "smooth"),
+        shown="files",
+        factor=100.0,
+    ),
+    Metric(
+        "depth_beyond",
+        "depth beyond",
+        "%",
+        2,
+        "lower",
+        measure=_compared(beyond_share, "depth", "depth", "smooth"),
+        shown="files",
+        factor=100.0,
+    ),
+    Metric(
+        "coverage_error",
+        "coverage error",
+        "%",
+        2,
+        "lower",
+        measure=_compared(coverage_error, "alpha", "mask", "valid"),
+        shown="files",
+        factor=100.0,
+    ),
+    Metric(
+        "alpha_outside",
+        "alpha outside the mask",
+        "%",
+        2,
+        "lower",
+        measure=_compared(mean_alpha, "alpha", "beyond"),
+        shown="files",
+        factor=100.0,
+    ),
+    _mesh("mesh_fscore_1", MESH_LABEL, shown="tables"),
+    _mesh("mesh_fscore_05", "mesh F-score 0.5 %"),
+    _mesh("mesh_accuracy_1", "mesh accuracy 1 %"),
+    _mesh("mesh_accuracy_05", "mesh accuracy 0.5 %"),
+    _mesh("mesh_completeness_1", "mesh completeness 1 %"),
+    _mesh("mesh_completeness_05", "mesh completeness 0.5 %"),
+    Metric("gaussians", "Gaussians", "", 0, None, of="run"),
+    Metric("fps", "FPS", "", 1, "higher", of="run", timed=True),
+    Metric("fps_layers", "FPS all layers", "", 1, "higher", of="run", shown="files", timed=True),
+    Metric("train_seconds", "training", "s", 0, "lower", of="run", timed=True),
+    Metric("steps", "steps", "", 0, None, of="run", shown="record"),
+    Metric("peak_memory_mib", "peak memory", "MiB", 0, "lower", of="run", shown="record"),
+)
+OBJECT_METRICS = ("psnr", "normal_mae_deg", "specular_psnr", "diffuse_psnr", "stokes_error")
+"""Keys of the metrics that are recorded by object and by material."""
+VIEW_METRICS = tuple(metric for metric in METRICS if metric.of == "view")
+"""Those of one view, which are averaged over views."""
+RUN_METRICS = tuple(metric for metric in METRICS if metric.of == "run")
+"""Those that belong to a run. Each may be null."""
+COLUMNS = tuple(metric for metric in METRICS if metric.shown != "record")
+"""Those that comparisons collect."""
+METAL_SHARE = Metric("metal_share", "taken for metal", "%", 1, None, factor=100.0)
+"""Share of a part's pixels that are more than half metal, of recipes that know metals."""
+PART_METRICS = (*(metric for metric in COLUMNS if metric.of == "view"), METAL_SHARE)
+"""Those that an object or a class of material may have."""
+
+
+def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> list[tuple[str, str]]:
+    """The metrics of a run as people read them.
+
+    Args:
+        record: of a run, as ``metrics.json`` has it.
+        scores_only: leave out what belongs to the run alone (times, counts) and what has no value.
+
+    Returns:
+        Labels and values with their units, in the order of the table; "n/a" and why for a metric without a value. One
+        that has no reason recorded, for want of ground truth or of a layer, is left out: see ``absent_metrics``.
+        Below the PSNR stands that of the worst view, which a mean hides.
+    """
+    lines = []
+    for metric in METRICS:
+        value = record.get(metric.key)
+        if metric.shown != "tables" or (scores_only and (metric.of == "run" or value is None)):
+            continue
+        reason = record.get(f"{metric.key}_reason")
+        if value is not None or reason:
+            lines.append((metric.label, f"n/a ({reason})" if value is None else metric.text(value)))
+        if metric.key == "psnr":
+            lines += _worst_view(record, metric)
+    return lines
+
+
+def _worst_view(record: Mapping[str, Any], metric: Metric) -> list[tuple[str, str]]:
+    """The lowest value of a metric among the views, with its name; nothing for a single view."""
+    known = {name: s[metric.key] for name, s in record.get("views", {}).items() if s[metric.key] is not None}
+    if len(known) < 2:
+        return []
+    name = min(known, key=lambda view: known[view])
+    return [(f"{metric.label}, worst view", f"{metric.text(known[name])} ({name})")]
+
+
+def absent_metrics(record: Mapping[str, Any]) -> list[str]:
+    """Labels of what ``shown_metrics`` leaves out: no value, and no reason beside missing ground truth or layers."""
+    return [
+        metric.label
+        for metric in METRICS
+        if metric.shown == "tables"
+        and record.get(metric.key) is None
+        and not record.get(f"{metric.key}_reason")
+    ]

@@ -1,0 +1,306 @@
+"""A run as the files of other programs, and as a web page."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from polarguide.capture import read_model
+from polarguide.capture.layout import refuse_scene
+from polarguide.capture.presentation import balanced
+from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.files import holds_files, make_folder, require_inside, temporary_folder, write_text
+from polarguide.core.options import ExportFormat, PathLike, check_choice, check_finite
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.fields.model import FieldModel
+from polarguide.geometry.camera import Camera
+from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
+from polarguide.results.evaluation.table import shown_metrics
+from polarguide.results.export.mesh import surface_points, write_mesh, write_points
+from polarguide.results.export.placement import (
+    Origin,
+    Placement,
+    comments,
+    rewrite_splats,
+    write_colmap,
+    write_transforms,
+)
+from polarguide.results.export.share import share_page
+from polarguide.results.export.splats import write_sog, write_spz
+from polarguide.results.rendering.mesh import RESOLUTION, ColoredMesh, implicit_mesh, scene_mesh
+from polarguide.results.rendering.relight import needs_radiance, panorama, write_exr
+from polarguide.runs.model import GaussianModel, write_run_ply
+from polarguide.runs.opened import OpenedRun
+from polarguide.shading.gbuffer import RenderRequest, render
+from polarguide.shading.model import Parameters
+from polarguide.shading.result import RenderResult
+from polarguide.visualization import figures
+
+TRANSFORMS = "transforms.json"
+
+PANORAMA_HEIGHT = 512
+SPLATS = ("ply", "spz", "sog", "points")
+"""Formats of Gaussians."""
+
+
+def export(
+    run: OpenedRun,
+    format: ExportFormat,
+    out: PathLike | None = None,
+    *,
+    resolution: int = RESOLUTION,
+    spz_version: int = 3,
+    reporter: Reporter = SILENT,
+) -> list[Path]:
+    """Write a run as the files of other programs, as it is presented: cropped, in meters, upright (see ``Placement``).
+
+    Args:
+        run: the run; its scene is read for all but ply, spz and sog.
+        format: ply, spz and sog are ordinary splats, with reflections baked as far as harmonics carry them; mesh (GLB
+            and PLY) is fused from rendered depth, with diffuse colors and learned normals; points are opaque Gaussians
+            with normals; environment is the learned light as a panorama (EXR and PNG); cameras are a COLMAP model and
+            transforms.json.
+        out: folder to write; ``export`` in the run's folder by default.
+        resolution: voxels of the mesh along its longest side, 16 to 1024.
+        spz_version: of the SPZ file, 3 or 4; readers are split between them.
+        reporter: told how far it is.
+
+    Returns:
+        The files and folders written.
+
+    Raises:
+        PolarguideError: a package is missing, or the recipe has nothing of this kind.
+    """
+    folder = run.folder / "export" if out is None else Path(out)
+    if out is None:
+        require_inside(run.folder, folder)
+    refuse_scene(folder)
+    writers: dict[str, Callable[[], list[Path]]] = {
+        "ply": lambda: [_ply(run, presented, folder / "splats.ply")],
+        "spz": lambda: [_spz(run, presented, folder / "splats.spz", spz_version)],
+        "sog": lambda: [_sog(run, presented, folder / "splats.sog")],
+        "mesh": lambda: _mesh(run, presented, folder, resolution, reporter),
+        "points": lambda: _points(run, presented, folder),
+        "environment": lambda: _environment(run, presented, folder),
+        "cameras": lambda: _cameras(run, presented, folder),
+    }
+    check_choice("format", format, writers)
+    check_finite("resolution", resolution, 16, 1024)
+    check_finite("spz_version", spz_version, 3, 4)
+    if format in SPLATS:
+        run.gaussian_model(f"format {format}")
+    presented = _Presented(run)
+    make_folder(folder)
+    with reporter.track(f"writing {format}", None):
+        return writers[format]()
+
+
+def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", caption: str = "") -> Path:
+    """Write a run as one web page that renders it with its reflections, and needs nothing beside itself.
+
+    The photographs' poses are its views; the first test view is where it begins.
+
+    Args:
+        run: the run; its scene is read.
+        path: file to write, ending in .html; ``share.html`` in the run's folder by default.
+        title: heading of the page; that of the presentation, or the scene's name, by default.
+        caption: text below it; the recipe and its steps by default. The word about polarization follows.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        PolarguideError: a name that ends in something else, or scores that cannot be read.
+    """
+    path = run.folder / "share.html" if path is None else Path(path)
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise PolarguideError(
+            "out", expected="a name that ends in .html", found=str(path), remedy="Choose such a name."
+        )
+    model = run.gaussian_model("share")
+    presented = _Presented(run)
+    assert presented.gaussians is not None
+    views = run.scene.test_views + run.scene.train_views
+    scored = (run.folder / METRICS_FILE).exists()
+    scores = shown_metrics(read_metrics(run.folder), scores_only=True) if scored else []
+    health = run.health
+    page = share_page(
+        presented.gaussians,
+        model.light,
+        model.shading,
+        {view.name: view.camera for view in views},
+        first=views[0].name,
+        title=title or presented.presentation.title or run.scene.name,
+        caption=f"{caption or f'{run.recipe.name}, {run.steps:,} steps'} · polarization: {run.polarization}",
+        metrics=[
+            *((f"{label}, test views", text) for label, text in scores),
+            ("Gaussians", f"{len(presented.gaussians['means']):,}"),
+        ],
+        notes=[f"Warning: {warning}" for warning in health.warnings] if health is not None else [],
+        presentation=presented.presentation,
+    )
+    make_folder(path.parent)
+    write_text(path, page)
+    return path
+
+
+class _Presented:
+    """A run as its presentation shows it: the Gaussians within the crop box, their placement, and the origin of files.
+
+    Raises:
+        PolarguideError: the presentation cannot be read, or nothing lies within its crop box.
+    """
+
+    def __init__(self, run: OpenedRun) -> None:
+        self.presentation = run.presentation
+        model = run.model
+        gaussians = model.state.gaussians if isinstance(model, GaussianModel) else None
+        self.gaussians: Parameters | None = gaussians
+        self.kept: Tensor | None = None
+        if gaussians is not None and (crop := self.presentation.crop) is not None:
+            self.kept = crop.inside(gaussians["means"].detach(), run.camera_frame)
+            if not bool(self.kept.any()):
+                raise PolarguideError(
+                    "the crop box",
+                    expected="Gaussians in it",
+                    found=f"none of {len(self.kept)}",
+                    remedy="Move it: polarguide present RUN --crop, or in polarguide view.",
+                )
+            self.gaussians = {name: gaussians[name].detach()[self.kept] for name in gaussians.names}
+        around = run.frame if self.presentation.up_axis is not None else None
+        self.placement = Placement.of(self.presentation, around)
+        scene = run.configuration.scene_digest[:12]
+        made_of = (
+            f"{run.recipe.name}, {run.steps} steps, scene sha256 {scene}, polarization {run.polarization}"
+        )
+        self.origin = Origin(self.presentation, made_of)
+
+    @property
+    def comments(self) -> list[str]:
+        """For the head of a file."""
+        return comments(self.origin, self.placement)
+
+
+def _ply(run: OpenedRun, presented: _Presented, path: Path, placement: Placement | None = None) -> Path:
+    with temporary_folder(path.with_suffix(".whole")) as folder:
+        whole = folder / path.name
+        model = run.gaussian_model("format ply")
+        write_run_ply(whole, model.state, model.shading, _camera_centers(run))
+        kept = None if presented.kept is None else presented.kept.cpu()
+        rewrite_splats(path, whole, placement or presented.placement, kept, presented.comments)
+    return path
+
+
+def _camera_centers(run: OpenedRun) -> Tensor | None:
+    """Centers of the scene's cameras [M, 3], which tell on what side surfaces are seen; warns if it is not there."""
+    try:
+        model = read_model(run.scene_folder)
+        return torch.stack([model.camera(name).center for name in model.names])
+    except PolarguideError:
+        warnings.warn(
+            f"The scene of {run.folder} is not at {run.scene_folder} any more: normals are turned away from the "
+            "middle of the Gaussians, not to the nearest camera.",
+            PolarguideWarning,
+            stacklevel=2,
+        )
+        return None
+
+
+def _spz(run: OpenedRun, presented: _Presented, path: Path, version: int) -> Path:
+    """From a PLY that is gone afterwards. In units of the scene: its positions are multiples of 1/4096 of a unit."""
+    with temporary_folder(path.with_suffix(".ply")) as place:
+        ply = _ply(
+            run, presented, place / "splats.ply", replace(presented.placement, scale=1.0, metric=False)
+        )
+        write_spz(path, ply, version)
+    return path
+
+
+def _sog(run: OpenedRun, presented: _Presented, path: Path) -> Path:
+    """From a PLY that is gone afterwards."""
+    credit = presented.presentation.credit
+    about = {"extras": {**presented.origin.record(), **presented.placement.record()}}
+    with temporary_folder(path.with_suffix(".ply")) as place:
+        ply = _ply(run, presented, place / "splats.ply")
+        write_sog(path, ply, {**({"copyright": credit} if credit else {}), **about})
+    return path
+
+
+def _mesh(
+    run: OpenedRun, presented: _Presented, folder: Path, resolution: int, reporter: Reporter
+) -> list[Path]:
+    if isinstance(run.model, FieldModel):
+        mesh = implicit_mesh(run.cameras, run.model, resolution=resolution)
+    else:
+        mesh = _fused(run, presented, resolution)
+    if (crop := presented.presentation.crop) is not None:
+        inside = crop.inside(torch.from_numpy(mesh.surface.vertices), run.camera_frame).numpy()
+        mesh = mesh.within(inside)
+    paths = [folder / "mesh.glb", folder / "mesh.ply"]
+    for path in paths:
+        write_mesh(path, mesh, run.frame, presented.placement, presented.origin)
+    reporter.say(f"{len(mesh.surface.vertices):,} vertices, {len(mesh.surface.faces):,} triangles")
+    return paths
+
+
+def _fused(run: OpenedRun, presented: _Presented, resolution: int) -> ColoredMesh:
+    """The mesh of Gaussians."""
+    model = run.gaussian_model("format mesh")
+    gaussians = presented.gaussians
+    assert gaussians is not None
+
+    def seen(camera: Camera) -> RenderResult:
+        return render(
+            gaussians,
+            camera,
+            model.backend.rasterize,
+            RenderRequest(depth=True, at_median_depth=True),
+            shading=model.shading,
+            light=model.light,
+        )
+
+    with torch.no_grad():
+        return scene_mesh(run.cameras, seen, resolution=resolution)
+
+
+def _points(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
+    path, model, placement = folder / "points.ply", run.gaussian_model("format points"), presented.placement
+    assert presented.gaussians is not None
+    views, rasterize = run.scene.views, model.backend.rasterize
+    places, normals, colors = surface_points(presented.gaussians, model.shading, views, rasterize)
+    write_points(path, placement.points(places), placement.directions(normals), colors, presented.comments)
+    return [path]
+
+
+def _environment(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
+    cubemap = needs_radiance(run.model.shading, what="format")
+    picture = panorama(run.light[cubemap.name], cubemap, run.frame, PANORAMA_HEIGHT)
+    paths = [folder / "environment.exr", folder / "environment.png"]
+    credit = presented.presentation.credit
+    write_exr(paths[0], picture, {"owner": credit} if credit else {})
+    figures.write_png(paths[1], figures.radiance_to_rgb(balanced(picture, presented.presentation.gains)))
+    return paths
+
+
+def _cameras(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
+    scene, placement = run.scene, presented.placement
+    model = folder / "sparse" / "0"
+    require_inside(folder, model)
+    if model.is_dir() and holds_files(model) and not (folder / TRANSFORMS).exists():
+        raise PolarguideError(
+            model,
+            expected="no model, or one of an earlier export",
+            found="another",
+            remedy="Give another --out.",
+        )
+    cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
+    points = placement.points(scene.points)
+    write_colmap(model, cameras, points, scene.point_colors, comments=presented.comments)
+    about = {**presented.origin.record(), **placement.record()}
+    write_transforms(folder / TRANSFORMS, cameras, about)
+    return [model, folder / TRANSFORMS]

@@ -1,0 +1,144 @@
+"""A trained scene's surface as files: a triangle mesh, and a plain point cloud with normals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement
+from torch import Tensor
+
+from polarguide.capture import View
+from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.files import atomic, write_whole
+from polarguide.gaussians.gaussians import CORE_SHAPES
+from polarguide.gaussians.geometry import shortest_axis_normals
+from polarguide.geometry.scene_frame import SceneFrame
+from polarguide.optics.color import srgb_encode
+from polarguide.raster import Rasterize
+from polarguide.results.export.placement import (
+    GENERATOR,
+    IN_PLACE,
+    NOBODY,
+    Origin,
+    Placement,
+    comments,
+    with_comments,
+)
+from polarguide.results.rendering.mesh import ColoredMesh
+from polarguide.shading.model import Parameters, ShadingModel
+from polarguide.training.actions import outward_directions
+
+
+def write_mesh(
+    path: Path,
+    mesh: ColoredMesh,
+    around: SceneFrame,
+    placement: Placement = IN_PLACE,
+    origin: Origin = NOBODY,
+) -> None:
+    """Write a mesh: PLY with display colors, or GLB, upright (+y), with linear colors as glTF has them.
+
+    Args:
+        path: the file, .ply or .glb. mesh: in the scene's axes. around: its frame.
+        placement: of the PLY; the GLB has its units alone. origin: whom the file is owed to.
+
+    Raises:
+        PolarguideError: trimesh is not installed.
+    """
+    trimesh = optional_import("trimesh", "--format mesh")
+    binary = path.suffix.lower() == ".glb"
+    shown = torch.from_numpy(mesh.colors)
+    values = (shown if binary else srgb_encode(shown)).mul(255).round().to(torch.uint8).numpy()
+    vertices, normals = (torch.from_numpy(t) for t in (mesh.surface.vertices, mesh.surface.normals))
+    if binary:
+        vertices = placement.scale * vertices
+    else:
+        vertices, normals = placement.points(vertices), placement.directions(normals)
+    made = trimesh.Trimesh(
+        vertices=vertices.numpy(),
+        faces=mesh.surface.faces,
+        vertex_normals=normals.numpy(),
+        vertex_colors=np.concatenate((values, np.full((len(values), 1), 255, np.uint8)), axis=1),
+        process=False,
+        validate=False,
+    )
+    if binary:
+        pose = np.eye(4)
+        pose[:3, :3] = around.panorama_axes().T.numpy()
+        scene = trimesh.Scene()
+        scene.add_geometry(made, node_name="mesh", geom_name="mesh", transform=pose)
+
+        def about(tree: dict[str, Any]) -> None:
+            tree["asset"] |= _asset(placement, origin)
+
+        data = scene.export(file_type="glb", include_normals=True, tree_postprocessor=about)
+    else:
+        data = with_comments(made.export(file_type="ply", vertex_normal=True), comments(origin, placement))
+    write_whole(path, data)
+
+
+def _asset(placement: Placement, origin: Origin) -> dict[str, Any]:
+    """What a glTF file says of itself. Its unit is the meter; where the scale is not known, ``units`` says so."""
+    units = "meters" if placement.metric else "units of the scene; how long one is, is not known"
+    credit = origin.presentation.credit
+    return {
+        "generator": GENERATOR,
+        **({"copyright": credit} if credit else {}),
+        "extras": {**origin.record(), "units": units},
+    }
+
+
+OPAQUE = 0.5
+FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
+    (name, "u1") for name in ("red", "green", "blue")
+]
+
+
+@torch.no_grad()
+def surface_points(
+    gaussians: Parameters, shading: ShadingModel, views: Iterable[View], rasterize: Rasterize
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Positions, outward unit normals and display colors, each [M, 3], of opaque Gaussians that a view sees.
+
+    Raises:
+        PolarguideError: there are none.
+    """
+    outward = outward_directions(gaussians, views, rasterize)
+    opaque = torch.sigmoid(gaussians["opacity_logits"]) >= OPAQUE
+    kept = (opaque & (outward.norm(dim=1) > 0)).nonzero()[:, 0]
+    if not len(kept):
+        raise PolarguideError(
+            "--format points",
+            expected="opaque Gaussians that a view sees",
+            found="none",
+            remedy="Train for more steps.",
+        )
+    means, side = gaussians["means"][kept], outward[kept]
+    normals = shortest_axis_normals(
+        means, gaussians["quaternions"][kept], gaussians["log_scales"][kept], torch.zeros(3)
+    )
+    normals = torch.where((normals * side).sum(dim=1, keepdim=True) < 0, -normals, normals)
+    few = {name: gaussians[name][kept] for name in (*CORE_SHAPES, *shading.parameters)}
+    linear = shading.diffuse_colors(few, -normals.contiguous())
+    colors = srgb_encode(linear.clamp(0, 1))
+    return means, normals, colors
+
+
+def write_points(
+    path: Path, points: Tensor, normals: Tensor, colors: Tensor, comments: Sequence[str] = ()
+) -> None:
+    """Write a PLY of points, with comments."""
+    table = np.empty(len(points), dtype=FIELDS)
+    values = np.concatenate((points.numpy(), normals.numpy()), axis=1)
+    for index, (name, _) in enumerate(FIELDS[:6]):
+        table[name] = values[:, index]
+    shades = np.rint(colors.numpy() * 255).astype(np.uint8)
+    for index, name in enumerate(("red", "green", "blue")):
+        table[name] = shades[:, index]
+    with atomic(path) as temporary:
+        element = PlyElement.describe(table, "vertex", comments=list(comments))
+        PlyData([element], byte_order="<").write(temporary)

@@ -1,0 +1,313 @@
+"""A trained scene as one HTML file: the Gaussians, their learned light, and a program that shades them per pixel."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import normalize, pad
+
+from polarguide import __version__
+from polarguide.capture.presentation import Presentation
+from polarguide.gaussians.geometry import shortest_axis_normals
+from polarguide.gaussians.ply import refit_sh_to_display
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.scene_frame import scene_frame
+from polarguide.geometry.trajectory import camera_record
+from polarguide.raster.interface import MINIMUM_ALPHA
+from polarguide.runs.model import gaussian_colors
+from polarguide.shading.cubemap import ringed_texels
+from polarguide.shading.model import PLAIN_LAYERS, Light, PageShading, Parameters, ShadingModel
+from polarguide.visualization.pages import page, page_part
+
+PACKAGE = "polarguide.results.export"
+
+TEXEL = 16
+HARMONICS = ("harmonics", "own_harmonics")
+SLOTS = {
+    "mean": (0, "3<f4"),
+    "opacity": (12, "<u2"),
+    "share": (14, "<u2"),
+    "rotation": (16, "4<i2"),
+    "scales": (24, "3<f2"),
+    "harmonics_scale": (30, "<f2"),
+    "color": (32, "3<f2"),
+    "axis": (38, "3<i2"),
+    "side": (44, "<u2"),
+    "features": (48, "4<i2"),
+    "harmonics": (48, "45i1"),
+    "own_color": (96, "3<f2"),
+    "own_harmonics_scale": (102, "<f2"),
+    "own_harmonics": (112, "45i1"),
+    "metal": (160, "4<f2"),
+}
+"""First byte and NumPy type of what a record can hold; a shading model gives ``share`` and what has a color.
+
+A record is a few texels of 16 bytes, what a texture of the graphics card can hold. All numbers are little-endian;
+``f16`` is a half float, ``u16`` an unsigned and ``i16`` a signed 16-bit fraction (of 65535 and 32767).
+
+===== ==================================================================================================
+texel content
+===== ==================================================================================================
+0     mean 3 x float32; opacity u16; ``share`` u16 (strength or roughness)
+1     rotation (w, x, y, z) 4 x i16; logarithms of the scales 3 x f16; scale of ``harmonics`` f16
+2     ``color`` of degree 0 (or albedo) 3 x f16; normal axis 3 x i16; side u16 (1: the axis points outward)
+3-5   ``harmonics`` of degrees 1 to 3, 45 signed bytes in steps of their scale; or ``features`` 4 x i16 in texel 3
+6-9   light of its own: ``own_color`` of degree 0 3 x f16, scale f16; then ``own_harmonics`` as above
+10    ``metal``: reflectance 3 x f16, roughness f16; 0 of what is not a metal
+===== ==================================================================================================
+
+The harmonics' scale is each Gaussian's own: the largest of its 45 values is 127 steps. A shading model says which of
+these values its records have; they are as long as the last of them needs.
+"""
+
+
+@torch.no_grad()
+def records(gaussians: Parameters, values: Mapping[str, Tensor]) -> NDArray[Any]:
+    """Quantize Gaussians; those too faint to be drawn at all are left out.
+
+    Args:
+        gaussians: the Gaussians. values: of the shading model, [N, ...] by the names of ``SLOTS``.
+
+    Returns:
+        [K] records of whole texels, with named fields; in the order of a curve that fills space, so that neighbors
+        in it are alike.
+    """
+    opacity = torch.sigmoid(gaussians["opacity_logits"])
+    kept = (opacity >= MINIMUM_ALPHA).nonzero()[:, 0]
+    kept = kept[torch.from_numpy(curve_order(gaussians["means"][kept].numpy()))]
+    axis, side = _axes(gaussians, kept)
+    fields = {
+        "mean": gaussians["means"][kept],
+        "opacity": opacity[kept],
+        "rotation": normalize(gaussians["quaternions"][kept], dim=-1),
+        "scales": gaussians["log_scales"][kept],
+        "axis": axis,
+        **{name: value[kept] for name, value in values.items()},
+    }
+    harmonics = {name: harmonics_steps(fields.pop(name)) for name in HARMONICS if name in fields}
+    data = np.zeros(
+        len(kept), record_type([*fields, "side", *harmonics, *(f"{name}_scale" for name in harmonics)])
+    )
+    data["side"] = side.numpy()
+    for name, value in fields.items():
+        data[name] = _quantized(value, data.dtype[name].base)
+    for name, (steps, scale) in harmonics.items():
+        data[name], data[f"{name}_scale"] = steps, scale
+    return data
+
+
+def record_type(names: Sequence[str]) -> np.dtype[Any]:
+    """The type of a record with some of ``SLOTS``, as many texels long as these need."""
+    offsets, formats = zip(*(SLOTS[name] for name in names), strict=True)
+    end = max(at + np.dtype(form).itemsize for at, form in zip(offsets, formats, strict=True))
+    size = -(-end // TEXEL) * TEXEL
+    return np.dtype({"names": names, "offsets": offsets, "formats": formats, "itemsize": size})
+
+
+def _quantized(values: Tensor, kind: np.dtype[Any]) -> NDArray[Any]:
+    """Values in [0, 1] or [-1, 1] as whole numbers up to the type's largest; floats as they are, within its range."""
+    if kind.kind == "f":
+        return values.clamp(-6e4, 6e4).numpy() if kind.itemsize == 2 else values.numpy()
+    return np.rint(values.numpy().astype(np.float64) * np.iinfo(kind).max)
+
+
+def planes(data: NDArray[Any]) -> bytes:
+    """Records byte by byte, first all first bytes: neighbors are alike, so that they compress well."""
+    return np.ascontiguousarray(data.view(np.uint8).reshape(len(data), data.itemsize).T).tobytes()
+
+
+def harmonics_steps(rest: Tensor) -> tuple[NDArray[np.int8], NDArray[np.float16]]:
+    """Harmonics [N, 15, 3] as signed bytes [N, 45] (coefficient by coefficient, RGB), and their steps [N]."""
+    flat = rest.flatten(1).numpy()
+    step = (np.abs(flat).max(axis=1, initial=0.0) / 127).astype("<f2")
+    step = np.maximum(step, np.float16(6e-8))
+    steps = np.clip(np.rint(flat / step[:, None].astype(np.float32)), -127, 127)
+    return steps.astype(np.int8), step
+
+
+def _axes(gaussians: Parameters, kept: Tensor) -> tuple[Tensor, Tensor]:
+    """Normal axes [K, 3], and 1 [K] where they are turned outward, 0 where the camera alone decides."""
+    means, origin = gaussians["means"][kept], torch.zeros(3)
+    axes = shortest_axis_normals(means, gaussians["quaternions"][kept], gaussians["log_scales"][kept], origin)
+    outward = gaussians.get("outward")
+    if outward is None:
+        return axes, torch.zeros(len(kept))
+    along = (axes * outward[kept]).sum(dim=1)
+    return torch.where(along < 0, -1.0, 1.0)[:, None] * axes, (along != 0).float()
+
+
+def curve_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Order [N] of points [N, 3] along a Z curve (Morton 1966) with 1,024 cells each way."""
+    if not len(means):
+        return np.zeros(0, dtype=np.int64)
+    low, high = np.quantile(means, 0.01, axis=0), np.quantile(means, 0.99, axis=0)
+    cells = np.clip((means - low) / np.maximum(high - low, 1e-12) * 1023, 0, 1023).astype(np.int64)
+    return curve_places(torch.from_numpy(cells)).argsort(stable=True).numpy()
+
+
+def curve_places(cells: Tensor) -> Tensor:
+    """Places [N] of cells [N, 3], int64 below 1,024, along a Z curve."""
+    code = torch.zeros(len(cells), dtype=torch.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return code
+
+
+SCRIPTS = (
+    "algebra.js",
+    "sorter.js",
+    "renderer.js",
+    "navigation.js",
+    "controls.js",
+    "presentation.js",
+    "unpack.js",
+    "main.js",
+)
+NOTHING = Presentation()
+SHADERS = {
+    "records": "records.glsl",
+    "derive": "derive.frag",
+    "splat_vert": "splat.vert",
+    "splat_frag": "splat.frag",
+    "full": "full.vert",
+    "light": "light.glsl",
+    "shade": "shade.frag",
+}
+LAYERS = ("final", "diffuse", "specular", "base", "strength", "normal", "metalness")
+"""Layers that the page can show, in its order."""
+BAKED = (
+    "This page has no shaders for the reflections of this model. Each Gaussian shows its color toward the eye, with "
+    "reflections baked into spherical harmonics of degree 3, which keep broad highlights and no mirror images."
+)
+
+
+def share_page(
+    gaussians: Parameters,
+    light: Light,
+    shading: ShadingModel,
+    cameras: Mapping[str, Camera],
+    *,
+    first: str,
+    title: str,
+    caption: str = "",
+    metrics: Sequence[tuple[str, str]] = (),
+    notes: Sequence[str] = (),
+    presentation: Presentation = NOTHING,
+) -> str:
+    """The page.
+
+    Args:
+        gaussians: the Gaussians.
+        light: parameters of the learned light by name. shading: of the recipe, for the run's refractive index.
+        cameras: poses to choose from by name, at least one. first: name of the one to begin with.
+        title, caption: any text; it is escaped.
+        metrics: labels and values, any text. notes: paragraphs before them, any text.
+        presentation: white balance, up axis, scale and credit.
+
+    Returns:
+        HTML that asks for nothing from outside; its own policy forbids it to.
+    """
+    shaded = shading.page(gaussians, light)
+    layers: Sequence[str] = shading.layers
+    if shaded is None:
+        shaded, layers = baked_page(gaussians, light, shading), PLAIN_LAYERS
+    quantized = records(gaussians, shaded.values)
+    scene: dict[str, Any] = {
+        "kind": shaded.kind,
+        "texels": quantized.itemsize // TEXEL,
+        "count": len(quantized),
+        "layers": [
+            name for name in LAYERS if name in layers and (name != "metalness" or "metal" in shaded.values)
+        ],
+        "index": 1.5,
+        "resolution": int(shaded.light[0].shape[1]) if shaded.light else 1,
+        "levels": max(1, len(shaded.light)),
+        **_frame(cameras, first, presentation),
+        **shaded.constants,
+    }
+    arrays: dict[str, NDArray[np.generic] | None] = {
+        "light": light_numbers(shaded.light) if shaded.light else None,
+        "network": network_numbers(shaded.network) if shaded.network else None,
+        "viridis": viridis(),
+    }
+    script = '"use strict";\n' + "\n".join(page_part(PACKAGE, name) for name in SCRIPTS)
+    credit = (presentation.credit and f"© {presentation.credit}", presentation.provenance)
+    return page(
+        PACKAGE,
+        "page.html",
+        script=script,
+        more=" blob:; worker-src blob:",
+        version=__version__,
+        title=title,
+        caption=caption,
+        notes=(*notes, *shaded.notes),
+        metrics=metrics,
+        credit=" · ".join(text for text in credit if text),
+        meta={
+            "author": presentation.author,
+            "dcterms.license": presentation.license,
+            "dcterms.provenance": presentation.provenance,
+        },
+        scene=scene,
+        shaders={name: page_part(PACKAGE, file) for name, file in SHADERS.items()},
+        records=_packed(planes(quantized)),
+        **{name: "" if values is None else _packed(values.tobytes()) for name, values in arrays.items()},
+    )
+
+
+def baked_page(gaussians: Parameters, light: Light, shading: ShadingModel) -> PageShading:
+    """The page of a model for which there are no shaders: linear harmonics of its Gaussians' own colors, and a note."""
+    count = len(gaussians["means"])
+    dc, rest = refit_sh_to_display(
+        lambda directions: gaussian_colors(gaussians, light, shading, directions).cpu(), count
+    )
+    return PageShading("plain", {"color": dc[:, 0], "harmonics": rest}, notes=[BAKED])
+
+
+def _frame(cameras: Mapping[str, Camera], first: str, presentation: Presentation) -> dict[str, Any]:
+    around = presentation.upright(scene_frame(list(cameras.values())))
+    return {
+        "white": list(presentation.white_balance or (1.0, 1.0, 1.0)),
+        "metersPerUnit": presentation.meters_per_unit,
+        "up": around.up.tolist(),
+        "center": around.center.tolist(),
+        "distance": around.distance,
+        "first": list(cameras).index(first),
+        "cameras": [{"name": name, **camera_record(camera)} for name, camera in cameras.items()],
+    }
+
+
+def _packed(raw: bytes) -> str:
+    return base64.b64encode(gzip.compress(raw, 9, mtime=0)).decode()
+
+
+@torch.no_grad()
+def light_numbers(levels: Sequence[Tensor]) -> NDArray[np.float16]:
+    """Cubemaps [6, R, R, C] with their rings, one after the other, channels filled up to a multiple of four."""
+    numbers = []
+    for texture in levels:
+        texels = ringed_texels(texture.detach().clamp(-6e4, 6e4))
+        numbers.append(pad(texels, (0, -texels.shape[-1] % 4)).flatten())
+    return torch.cat(numbers).numpy().astype("<f2")
+
+
+@torch.no_grad()
+def network_numbers(matrices: Sequence[Tensor]) -> NDArray[np.float32]:
+    """Matrices [rows, columns] one after the other, columns filled up to a multiple of four."""
+    padded = [pad(matrix.detach(), (0, -matrix.shape[1] % 4)).flatten() for matrix in matrices]
+    return torch.cat(padded).numpy().astype("<f4")
+
+
+def viridis() -> NDArray[np.uint8]:
+    """The color map of scalar layers, [256, 3] RGB."""
+    colors = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[None], cv2.COLORMAP_VIRIDIS)
+    return np.ascontiguousarray(colors[0, :, ::-1], dtype=np.uint8)

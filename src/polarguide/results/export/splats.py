@@ -1,0 +1,218 @@
+"""Splats in two compressed formats, from the PLY of a run: Niantic's SPZ and PlayCanvas' SOG.
+
+SOG is pictures in a ZIP file, after its specification, version 2:
+https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog
+
+Its writer is ours, because GaussForge 0.6 writes 65,000 Gaussians in eight seconds, but had not finished 88,623 after
+six minutes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.files import atomic, write_whole
+from polarguide.gaussians.ply import read_ply, write_ply
+from polarguide.results.export.share import curve_places
+
+# Signs of the harmonics of degree 1 to 3, in the order of a PLY, after half a turn about x: y and z change theirs.
+_HALF_TURN_HARMONICS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
+
+
+def write_spz(path: Path, ply: Path, version: int = 3) -> None:
+    """Convert a PLY of Gaussians; our own fields in it are left out, as the format has no place for them.
+
+    SPZ is in its own axes (right, up, back), so half a turn about x from ours; readers turn it back. Positions in it
+    are multiples of 1/4096 of the world's unit; colors and scales keep 8 bits, harmonics 5 or 4.
+
+    Args:
+        path: the file to write. ply: as ``write_run_ply`` writes it. version: 3, or 4 (zstd in place of gzip).
+
+    Raises:
+        PolarguideError: the converter is not installed, or refuses.
+    """
+    converter = optional_import("gaussforge", "--format spz").GaussForge()
+    converted = converter.convert(_half_turned(ply).read_bytes(), "ply", "spz", spz_version=version)
+    if "error" in converted:
+        raise PolarguideError(
+            ply,
+            expected="Gaussians that spz can hold",
+            found=str(converted["error"]),
+            remedy="Export them as ply.",
+        )
+    write_whole(path, bytes(converted["data"]))
+
+
+def _half_turned(ply: Path) -> Path:
+    """The same Gaussians beside the file, half a turn about the world's x further."""
+    gaussians = read_ply(ply)
+    gaussians.pop("extra")
+    gaussians["means"] = gaussians["means"] * torch.tensor([1.0, -1.0, -1.0])
+    # Half a turn of the world and of each Gaussian's own axes, which does not change its shape.
+    gaussians["quaternions"] = gaussians["quaternions"] * torch.tensor([1.0, 1.0, -1.0, -1.0])
+    gaussians["sh_rest"] = gaussians["sh_rest"] * torch.tensor(_HALF_TURN_HARMONICS)[None, :, None]
+    turned = ply.with_name("turned.ply")
+    write_ply(turned, **gaussians)
+    return turned
+
+
+CODES = 256
+PALETTE_ROW = 64
+LARGEST_PALETTE = 8192
+ROUNDS = 8
+SEED = 0
+Pixels = NDArray[np.uint8]
+
+
+def write_sog(path: Path, ply: Path, asset: Mapping[str, Any] = {}) -> None:
+    """Convert a PLY of Gaussians; our own fields in it are left out. A fixed file for a fixed PLY.
+
+    Positions keep 16 bits of their signed logarithm, rotations 8 bits a component, the rest a code of 256 values;
+    harmonics beyond the first become one of at most 8,192.
+
+    Args:
+        path: the file to write. ply: as ``write_run_ply`` writes it. asset: what ``meta.json`` says of the file.
+    """
+    gaussians = {name: values for name, values in read_ply(ply).items() if name != "extra"}
+    order = _morton_order(gaussians["means"])
+    gaussians = {name: values[order] for name, values in gaussians.items()}
+    width = math.ceil(math.sqrt(len(order)))
+    pictures: dict[str, Pixels] = {}
+    meta: dict[str, Any] = {"version": 2, "asset": {"generator": "polarguide", **asset}, "count": len(order)}
+    meta["means"] = _means(gaussians["means"], width, pictures)
+    meta["scales"] = _coded("scales.webp", gaussians["log_scales"], None, width, pictures)
+    pictures["quats.webp"] = _picture(_smallest_three(gaussians["quaternions"]), width)
+    meta["quats"] = {"files": ["quats.webp"]}
+    opacity = _bytes(torch.sigmoid(gaussians["opacity_logits"].reshape(-1, 1)))
+    meta["sh0"] = _coded("sh0.webp", gaussians["sh_dc"].reshape(-1, 3), opacity, width, pictures)
+    meta["shN"] = _harmonics(gaussians["sh_rest"], width, pictures)
+    with atomic(path) as temporary, zipfile.ZipFile(temporary, "w") as file:
+        _store(file, "meta.json", json.dumps(meta).encode())
+        for name, pixels in pictures.items():
+            _store(file, name, _lossless(pixels))
+
+
+def _store(file: zipfile.ZipFile, name: str, data: bytes) -> None:
+    """Without the time, so that the same splats make the same file."""
+    file.writestr(zipfile.ZipInfo(name), data)
+
+
+def _lossless(pixels: Pixels) -> bytes:
+    order = [2, 1, 0, 3][: pixels.shape[2]]
+    done, data = cv2.imencode(".webp", pixels[..., order], [cv2.IMWRITE_WEBP_QUALITY, 101])
+    assert done
+    return data.tobytes()
+
+
+def _picture(values: Tensor, width: int) -> Pixels:
+    """Rows [N, 3 or 4] of bytes as a picture [H, width, 4]; opaque where there is no fourth."""
+    count, channels = values.shape
+    pixels = np.zeros((math.ceil(count / width) * width, 4), dtype=np.uint8)
+    pixels[:, 3] = 255
+    pixels[:count, :channels] = values.to(torch.uint8).numpy()
+    return pixels.reshape(-1, width, 4)
+
+
+def _bytes(values: Tensor) -> Tensor:
+    """[0, 1] to [0, 255]."""
+    return (values.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def _means(means: Tensor, width: int, pictures: dict[str, Pixels]) -> dict[str, Any]:
+    logs = means.double().sign() * torch.log1p(means.double().abs())
+    low, high = logs.min(dim=0).values, logs.max(dim=0).values
+    codes = ((logs - low) / (high - low).clamp(min=1e-12) * 65535).round().to(torch.int32)
+    files = ["means_l.webp", "means_u.webp"]
+    for name, part in zip(files, (codes & 255, codes >> 8), strict=True):
+        pictures[name] = _picture(part, width)
+    return {"mins": low.tolist(), "maxs": high.tolist(), "files": files}
+
+
+def _smallest_three(quaternions: Tensor) -> Tensor:
+    """[N, 4] (w, x, y, z) as three components and which one was left out, the largest, made positive."""
+    unit = torch.nn.functional.normalize(quaternions.double(), dim=1)
+    largest = unit.abs().argmax(dim=1, keepdim=True)
+    unit = torch.where(unit.gather(1, largest) < 0, -unit, unit)
+    others = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest[:, 0]]
+    three = _bytes(unit.gather(1, others) / math.sqrt(2) + 0.5)
+    return torch.cat((three, (252 + largest).to(torch.uint8)), dim=1)
+
+
+def _coded(
+    name: str, values: Tensor, alpha: Tensor | None, width: int, pictures: dict[str, Pixels]
+) -> dict[str, Any]:
+    """Values [N, 3] by a common code, and alpha [N, 1] beside."""
+    codes, book = _codebook(values)
+    pictures[name] = _picture(codes if alpha is None else torch.cat((codes, alpha), dim=1), width)
+    return {"codebook": book.tolist(), "files": [name]}
+
+
+def _codebook(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Codes of the same shape, and the 256 values that they stand for, ascending (Lloyd's algorithm from quantiles)."""
+    flat = values.double().flatten()
+    ranks = (torch.arange(CODES, dtype=torch.float64) + 0.5) / CODES * len(flat)
+    book = flat.sort().values[ranks.long().clamp(max=len(flat) - 1)]
+    for _ in range(ROUNDS):
+        codes = torch.bucketize(flat, 0.5 * (book[1:] + book[:-1]))
+        count = torch.bincount(codes, minlength=CODES)
+        sums = torch.bincount(codes, weights=flat, minlength=CODES)
+        book = torch.where(count > 0, sums / count.clamp(min=1), book).sort().values
+    codes = torch.bucketize(flat, 0.5 * (book[1:] + book[:-1]))
+    return codes.reshape(values.shape).to(torch.uint8), book
+
+
+def _harmonics(rest: Tensor, width: int, pictures: dict[str, Pixels]) -> dict[str, Any]:
+    """A palette of the harmonics [N, 15, 3], and each Gaussian's place in it."""
+    count, coefficients, _ = rest.shape
+    size = min(LARGEST_PALETTE, count, 1024 * 2 ** max(0, int(math.log2(max(count, 1024) / 1024))))
+    labels, palette = _clusters(rest.flatten(1), size)
+    codes, book = _codebook(palette)
+    gaussians = math.ceil(size / PALETTE_ROW)
+    pixels = np.zeros((gaussians * PALETTE_ROW, coefficients, 3), dtype=np.uint8)
+    pixels[:size] = codes.reshape(size, coefficients, 3).numpy()
+    files = ["shN_centroids.webp", "shN_labels.webp"]
+    pictures[files[0]] = pixels.reshape(gaussians, PALETTE_ROW * coefficients, 3)
+    split = torch.stack((labels & 255, labels >> 8, torch.zeros_like(labels)), dim=1)
+    pictures[files[1]] = _picture(split, width)
+    return {
+        "count": size,
+        "bands": math.isqrt(coefficients + 1) - 1,
+        "codebook": book.tolist(),
+        "files": files,
+    }
+
+
+def _clusters(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Which of ``count`` means each point [N, D] belongs to, [N] int64, and the means (Lloyd's algorithm)."""
+    generator = torch.Generator().manual_seed(SEED)
+    means = points[torch.randperm(len(points), generator=generator)[:count]].clone()
+    for _ in range(ROUNDS):
+        labels = _nearest(points, means)
+        sums = torch.zeros_like(means).index_add_(0, labels, points)
+        members = torch.bincount(labels, minlength=count)[:, None]
+        means = torch.where(members > 0, sums / members.clamp(min=1), means)
+    return _nearest(points, means), means
+
+
+def _nearest(points: Tensor, means: Tensor) -> Tensor:
+    half = 0.5 * means.square().sum(dim=1)
+    return torch.cat([(part @ means.T - half).argmax(dim=1) for part in points.split(4096)])
+
+
+def _morton_order(means: Tensor) -> Tensor:
+    """Indices that put neighbors in space side by side, so that the pictures compress."""
+    # Ranks, not places: far Gaussians would squeeze all others into one cell.
+    ranks = means.argsort(dim=0).argsort(dim=0)
+    return curve_places((ranks * 1024) // max(1, len(means))).argsort(stable=True)

@@ -1,0 +1,192 @@
+"""A run along a path of cameras, as a video (MP4, H.264) or as pictures."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from polarguide.capture.layout import refuse_scene
+from polarguide.capture.memory import require_memory
+from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.files import atomic, make_folder, require_inside
+from polarguide.core.options import PathLike, check_finite
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.trajectory import interpolated, orbit, read_path
+from polarguide.runs.opened import OpenedRun, checked_layers
+from polarguide.visualization import figures
+from polarguide.visualization.figures import Picture
+from polarguide.visualization.layers import layer_picture
+
+
+def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: float) -> int:
+    """Write uint8 RGB pictures [H, W, 3] of one size; odd sides lose their last row or column, as H.264 wants.
+
+    Returns:
+        How many were written.
+
+    Raises:
+        PolarguideError: imageio-ffmpeg is not installed, or the encoder fails.
+    """
+    encoder = optional_import("imageio_ffmpeg", "--video")
+    count = 0
+    # The encoder chooses the format by the name's suffix.
+    with atomic(path) as temporary:
+        named = temporary.with_name(temporary.name + ".mp4")
+        writer = None
+        try:
+            for picture in pictures:
+                height, width = (side - side % 2 for side in picture.shape[:2])
+                if writer is None:
+                    writer = encoder.write_frames(
+                        str(named),
+                        (width, height),
+                        fps=frames_per_second,
+                        codec="libx264",
+                        macro_block_size=2,
+                        output_params=["-crf", "18", "-movflags", "+faststart"],
+                    )
+                    writer.send(None)
+                writer.send(np.ascontiguousarray(picture[:height, :width]))
+                count += 1
+            if writer is not None:
+                writer.close()
+                _require_whole(encoder, named, count)
+            named.replace(temporary)
+        except (OSError, RuntimeError) as error:
+            raise PolarguideError(
+                path,
+                expected="that the video can be encoded",
+                found=str(error).strip().splitlines()[-1][:200] if str(error).strip() else "a failure",
+                remedy="Make room, choose another place or fewer layers.",
+            ) from None
+        finally:
+            if writer is not None:
+                with contextlib.suppress(OSError, RuntimeError):
+                    writer.close()  # the encoder would go on to write what is unlinked here
+            named.unlink(missing_ok=True)
+    return count
+
+
+def _require_whole(encoder: Any, path: Path, count: int) -> None:
+    """Count the pictures of a video: the encoder is another program, whose end on a full disk nobody reports.
+
+    Raises:
+        OSError: there are fewer than were written.
+    """
+    try:
+        found, _ = encoder.count_frames_and_secs(path)
+    except RuntimeError:  # it cannot be read at all
+        found = 0
+    if found != count:
+        raise OSError(f"a file of {found} of {count} pictures, as on a full disk")
+
+
+SWINGS = {"orbit": 0.0, "spiral": 0.25}
+"""Paths around the scene: by what share of the cameras' distance they go up and down."""
+FRAMES_PER_SECOND = 30.0
+RENDERED = 160
+"""Bytes that a pixel takes at least while it is rendered: layers, and what they are made of."""
+
+
+def path_cameras(run: OpenedRun, path: str, frames: int) -> tuple[list[Camera], float]:
+    """Cameras of a path, and their frames a second.
+
+    Args:
+        run: its cameras are the ones to move around.
+        path: ``orbit``, ``spiral``, ``interpolate``, or a JSON file of cameras.
+        frames: how many, except of a file.
+
+    Raises:
+        PolarguideError: too many frames, or a file that cannot be read.
+    """
+    check_finite("frames", frames, 1, 100_000)
+    cameras = list(run.cameras.values())
+    if path == "interpolate":
+        return interpolated(cameras, frames), FRAMES_PER_SECOND
+    if path in SWINGS:
+        return orbit(cameras, frames, swing=SWINGS[path], around=run.frame), FRAMES_PER_SECOND
+    return read_path(Path(path))
+
+
+def write_film(
+    run: OpenedRun,
+    out: PathLike,
+    *,
+    path: str = "orbit",
+    layers: Sequence[str] = ("final",),
+    frames: int = 120,
+    reporter: Reporter = SILENT,
+) -> None:
+    """Render layers side by side along a path.
+
+    Args:
+        run: the run; its scene is read.
+        out: MP4 file to write, or a folder for PNG files.
+        path, frames: of the cameras; see ``path_cameras``.
+        layers: names of layers.
+
+    Raises:
+        PolarguideError: a layer that the recipe has not, cameras of several sizes, or a video that cannot be encoded.
+    """
+    out, names = Path(out), checked_layers(list(layers))
+    refuse_scene(out if out.suffix.lower() != ".mp4" else out.parent)
+    if out.parent == run.folder:  # somebody else may have made the run's folder
+        require_inside(run.folder, out)
+    cameras, speed = path_cameras(run, path, frames)
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    if len(sizes) > 1:
+        raise PolarguideError(
+            "path",
+            expected="cameras of one size",
+            found=", ".join(f"{width}x{height}" for width, height in sizes[:4]),
+            remedy="Give all the same width and height.",
+        )
+    width, height = sizes[0]
+    remedy = "Give the cameras of the path a smaller width and height."
+    require_memory(Path(path), RENDERED * width * height, f"pictures of {width}x{height}", remedy=remedy)
+    pictures = _pictures(run, names, cameras, reporter)
+    if out.suffix.lower() == ".mp4":
+        make_folder(out.parent)
+        count = write_video(out, pictures, frames_per_second=speed)
+        reporter.say(f"video: {out} ({count} pictures, {count / speed:.1f} s)")
+        return
+    make_folder(out)
+    about = {"Polarization": run.polarization}
+    for number, picture in enumerate(pictures):
+        figures.write_png(out / f"path_{number:05d}.png", picture, about=about)
+    reporter.say(f"pictures: {out}/path_*.png")
+
+
+def _pictures(
+    run: OpenedRun, layers: list[str], cameras: list[Camera], reporter: Reporter
+) -> Iterator[Picture]:
+    """Layers side by side, a picture for each camera."""
+    depths = _depths(run, cameras) if "depth" in layers else None
+    gains, surface = run.presentation.gains, bool({"normal", "depth"} & {*layers})
+    with reporter.track("rendering", len(cameras)) as advance:
+        for number, camera in enumerate(cameras):
+            result = run.model.render(camera, depth="depth" in layers, surface=surface)
+            run.chosen_layers(result, layers)
+            pictures = [layer_picture(result, name, camera, depths, gains=gains) for name in layers]
+            advance(number + 1)
+            yield np.concatenate([picture for picture in pictures if picture is not None], axis=1)
+
+
+def _depths(run: OpenedRun, cameras: list[Camera]) -> tuple[float, float]:
+    """One range of depths for the whole path, so that its colors do not flicker: that of a few of its cameras."""
+    values = []
+    for camera in cameras[:: max(1, len(cameras) // 4)]:
+        result = run.model.render(camera, depth=True, surface=True)
+        assert result.depth is not None
+        values.append(result.depth[result.alpha > 0.5])
+    joined = torch.cat(values)[:1_000_000]
+    if not joined.numel():
+        return 0.0, 1.0
+    near, far = float(joined.quantile(0.02)), float(joined.quantile(0.95))
+    return near, max(far, near + 1e-6)

@@ -1,0 +1,303 @@
+"""A trained scene as a triangle mesh with its learned normals and diffuse colors.
+
+Depth maps are fused to a truncated signed distance field (Curless and Levoy 1996), whose zero set is the surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+
+from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.fields.model import FieldModel
+from polarguide.geometry.camera import Camera, seen_at
+from polarguide.geometry.scene_frame import scene_frame
+from polarguide.geometry.vectors import dot, unit
+from polarguide.shading.result import RenderResult
+
+TRUNCATION = 4.0  # voxels
+_SLAB = 1 << 21  # voxels at a time
+
+
+class NoSurfaceError(PolarguideError):
+    """There is nothing that several views see."""
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A grid of voxels: ``low`` [3] is its corner, ``size`` a voxel's side, ``counts`` how many there are each way."""
+
+    low: Tensor
+    size: float
+    counts: tuple[int, int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A triangle mesh: vertices [V, 3] float64 in the world, faces [F, 3], normals [V, 3] outward, unit."""
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    normals: NDArray[np.float64]
+
+    def with_faces(self, faces: NDArray[np.int64]) -> tuple[Surface, NDArray[np.int64]]:
+        """The surface of some of the faces, and which of the vertices it has, [K]."""
+        used, numbers = np.unique(faces, return_inverse=True)
+        return Surface(self.vertices[used], numbers.reshape(faces.shape), self.normals[used]), used
+
+
+def seen_points(camera: Camera, depth: Tensor, mask: Tensor) -> Tensor:
+    """World points [M, 3] float64 of the pixels in ``mask`` [H, W] at camera depths [H, W]."""
+    rays = camera.rays()[mask].double()
+    local = rays * (depth[mask].double() / rays[:, 2])[:, None]
+    return camera.to_world(local) + camera.center
+
+
+def box_around(points: Sequence[Tensor], center: Tensor, reach: float, resolution: int) -> Box:
+    """The box of what the cameras look at: points [M, 3] within ``reach`` of the center, without their outermost 0.5 %.
+
+    Raises:
+        PolarguideError: nothing is there.
+    """
+    near = torch.cat([p[(p - center).norm(dim=1) < reach] for p in points])
+    if len(near) < 100:
+        raise NoSurfaceError(
+            "mesh", expected="surfaces before the cameras", found="none", remedy="Train for more steps."
+        )
+    values = near.numpy()
+    low, high = np.quantile(values, 0.005, axis=0), np.quantile(values, 0.995, axis=0)
+    size = float((high - low).max()) / resolution
+    low, high = low - 3 * size, high + 3 * size
+    nx, ny, nz = (int(n) for n in np.maximum(2, np.ceil((high - low) / size)))
+    return Box(torch.from_numpy(low), size, (nx, ny, nz))
+
+
+def fuse(box: Box, views: Iterable[tuple[Camera, Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Mean signed distance in truncations, in [-1, 1], positive before the surface; and how many views saw each voxel.
+
+    Args:
+        box: the grid. views: camera, camera depth [H, W] and where it counts [H, W] bool.
+
+    Returns:
+        Both of the grid's shape, float32.
+    """
+    total, weight = torch.zeros(box.counts), torch.zeros(box.counts)
+    nx, ny, nz = box.counts
+    step = max(1, _SLAB // (ny * nz))
+    axes = [box.low[k] + box.size * (torch.arange(n) + 0.5) for k, n in enumerate(box.counts)]
+    for camera, depth, mask in views:
+        known = torch.where(mask, depth, torch.zeros_like(depth)).flatten()
+        turn, shift = camera.rotation, camera.translation
+        for begin in range(0, nx, step):
+            part = slice(begin, min(begin + step, nx))
+            local = [
+                (turn[i, 0] * axes[0][part] + shift[i]).float()[:, None, None]
+                + (turn[i, 1] * axes[1]).float()[None, :, None]
+                + (turn[i, 2] * axes[2]).float()[None, None, :]
+                for i in range(3)
+            ]
+            z = local[2].clamp(min=1e-6)
+            column = (local[0] / z * camera.fx + camera.cx).floor()
+            row = (local[1] / z * camera.fy + camera.cy).floor()
+            inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+            place = (
+                row.clamp(0, camera.height - 1) * camera.width + column.clamp(0, camera.width - 1)
+            ).long()
+            surface = known[place.flatten()].reshape(place.shape)
+            distance = (surface - local[2]) / (TRUNCATION * box.size)
+            counts = inside & (local[2] > 1e-6) & (surface > 0) & (distance > -1)
+            total[part] += torch.where(counts, distance.clamp(max=1), 0.0)
+            weight[part] += counts
+    return total / weight.clamp(min=1), weight
+
+
+def surface_of(box: Box, field: Tensor, weight: Tensor, *, least: int = 2, smallest: float = 0.01) -> Surface:
+    """The zero set where enough views looked, without small loose pieces (marching cubes, Lewiner et al. 2003).
+
+    Args:
+        field, weight: as of ``fuse``. least: views that must have seen a voxel.
+        smallest: pieces with fewer faces than this share of the largest are dropped.
+
+    Raises:
+        PolarguideError: scikit-image is not installed, or there is no surface.
+    """
+    marching_cubes: Callable[..., tuple[NDArray, NDArray, NDArray, NDArray]] = optional_import(
+        "skimage.measure", "a mesh"
+    ).marching_cubes
+    known = (weight >= least).numpy()
+    try:
+        # Its normals point to smaller values, into the surface; with "descent" its faces turn outward.
+        vertices, faces, inward, _ = marching_cubes(
+            field.numpy(), 0.0, mask=known, gradient_direction="descent"
+        )
+    except (RuntimeError, ValueError):
+        raise NoSurfaceError(
+            "mesh", expected="a surface that several views see", found="none", remedy="Train for more steps."
+        ) from None
+    world = vertices.astype(np.float64) * box.size + box.low.numpy() + 0.5 * box.size
+    return largest_pieces(Surface(world, faces.astype(np.int64), -inward.astype(np.float64)), smallest)
+
+
+def largest_pieces(surface: Surface, smallest: float) -> Surface:
+    """The connected pieces that have at least a share of the largest one's faces."""
+    count = len(surface.vertices)
+    ends = surface.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(ends), dtype=np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    _, piece = connected_components(graph, directed=False)
+    sizes = np.bincount(piece[surface.faces[:, 0]], minlength=int(piece.max()) + 1)
+    faces = surface.faces[sizes[piece[surface.faces[:, 0]]] >= smallest * sizes.max()]
+    return surface.with_faces(faces)[0]
+
+
+RESOLUTION = 192
+"""Voxels along the longest side, unless something else is asked for."""
+OPAQUE = 0.8
+COARSE = 64
+"""Voxels along the sides of the box in which a field's surface is looked for."""
+# Pixels whose surface is seen at a flatter angle than this cosine do not give depth.
+_STEEPEST = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class ColoredMesh:
+    """A mesh with linear diffuse colors [V, 3] in [0, 1]."""
+
+    surface: Surface
+    colors: NDArray[np.float64]
+
+    def within(self, kept: NDArray[np.bool_]) -> ColoredMesh:
+        """The faces all of whose vertices are kept, [V] bool.
+
+        Raises:
+            PolarguideError: there are none.
+        """
+        faces = self.surface.faces[kept[self.surface.faces].all(axis=1)]
+        if not len(faces):
+            raise PolarguideError(
+                "the crop box", expected="a surface in it", found="none", remedy="Make it larger, or move it."
+            )
+        surface, used = self.surface.with_faces(faces)
+        return ColoredMesh(surface, self.colors[used])
+
+
+@torch.no_grad()
+def scene_mesh(
+    cameras: Mapping[str, Camera], render: Callable[[Camera], RenderResult], *, resolution: int
+) -> ColoredMesh:
+    """Fuse the depth that a scene's cameras see.
+
+    Args:
+        cameras: at least two. render: gives a view with depth and normals.
+        resolution: voxels along the longest side of what the cameras see.
+
+    Raises:
+        PolarguideError: there is no surface, or a library is missing.
+    """
+    surface, views, box = fused_surface(cameras, render, resolution=resolution)
+    return painted(surface, views, box)
+
+
+@torch.no_grad()
+def fused_surface(
+    cameras: Mapping[str, Camera], render: Callable[[Camera], RenderResult], *, resolution: int
+) -> tuple[Surface, list[tuple[Camera, DepthSamples]], Box]:
+    """The surface of ``scene_mesh`` before it is painted, what each camera saw of it, and the grid it was fused in."""
+    optional_import("skimage.measure", "a mesh")
+    views = [(camera, _kept(render(camera).to("cpu"), camera)) for camera in cameras.values()]
+    around = scene_frame(list(cameras.values()))
+    points = [seen_points(camera, seen.depth, seen.mask) for camera, seen in views]
+    box = box_around(points, around.center, around.distance, resolution)
+    field, weight = fuse(box, ((camera, seen.depth, seen.mask) for camera, seen in views))
+    return surface_of(box, field, weight), views, box
+
+
+def implicit_surface(cameras: Mapping[str, Camera], model: FieldModel, *, resolution: int) -> Surface:
+    """The zero set of a model's distance, where at least two cameras may see it: nearer than their own distance.
+
+    Args:
+        cameras: at least two. model: of the run. resolution: voxels along the longest side.
+
+    Raises:
+        PolarguideError: there is no surface, or a library is missing.
+    """
+    optional_import("skimage.measure", "a mesh")
+    around = scene_frame(list(cameras.values()))
+    reach = around.distance
+    coarse = 2 * reach / COARSE
+    whole = Box(around.center - reach, coarse, (COARSE, COARSE, COARSE))
+    places, distance = _sampled(whole, model)
+    near = places[(distance.abs() < coarse) & (_in_pictures(cameras, places) >= 2)]
+    box = box_around([near], around.center, reach, resolution)
+    places, distance = _sampled(box, model)
+    seen = _in_pictures(cameras, places)
+    return surface_of(box, distance, seen)
+
+
+def implicit_mesh(cameras: Mapping[str, Camera], model: FieldModel, *, resolution: int) -> ColoredMesh:
+    """``implicit_surface`` with the model's own normals and colors; see there."""
+    surface = implicit_surface(cameras, model, resolution=resolution)
+    normals, colors = model.surface(torch.from_numpy(surface.vertices))
+    return ColoredMesh(Surface(surface.vertices, surface.faces, normals.numpy()), colors.clamp(0, 1).numpy())
+
+
+def _sampled(box: Box, model: FieldModel) -> tuple[Tensor, Tensor]:
+    """Places [X, Y, Z, 3] of a box's voxels, and the distances [X, Y, Z] there."""
+    x, y, z = (box.low[k] + box.size * (torch.arange(n) + 0.5) for k, n in enumerate(box.counts))
+    return torch.stack(torch.meshgrid(x, y, z, indexing="ij"), dim=-1), model.lattice((x, y, z))
+
+
+def _in_pictures(cameras: Mapping[str, Camera], places: Tensor) -> Tensor:
+    """How many cameras have places [..., 3] in their pictures, hidden ones included: [...]."""
+    counts = torch.zeros(places.shape[:-1])
+    for camera in cameras.values():
+        for part, count in zip(places, counts, strict=True):
+            count += seen_at((part - camera.center).view(-1, 3), camera)[2].view(count.shape)
+    return counts
+
+
+@dataclass(frozen=True, eq=False)
+class DepthSamples:
+    """Of one view: depth [H, W], where it counts [H, W], diffuse color and world normal [H, W, 3]."""
+
+    depth: Tensor
+    mask: Tensor
+    diffuse: Tensor
+    normal: Tensor
+
+
+def _kept(result: RenderResult, camera: Camera) -> DepthSamples:
+    assert result.depth is not None
+    assert result.normal is not None
+    normal = unit(result.normal, 1e-3)
+    cosine = -dot(camera.world_rays(), normal)
+    diffuse = result.base if result.diffuse is None else result.diffuse
+    return DepthSamples(result.depth, (result.alpha > OPAQUE) & (cosine > _STEEPEST), diffuse, normal)
+
+
+def painted(surface: Surface, views: list[tuple[Camera, DepthSamples]], box: Box) -> ColoredMesh:
+    """Colors and normals of the views that see each vertex, weighted by how squarely they do."""
+    vertices = torch.from_numpy(surface.vertices)
+    own = torch.from_numpy(surface.normals)
+    color, normal = torch.zeros_like(vertices), torch.zeros_like(vertices)
+    total = torch.zeros(len(vertices), dtype=torch.float64)
+    for camera, seen in views:
+        pixel, z, inside = seen_at(vertices - camera.center, camera)
+        near = (seen.depth[pixel] - z).abs() < TRUNCATION * box.size
+        squarely = dot(unit(camera.center - vertices), own).clamp(min=0)
+        weight = (inside & near & seen.mask[pixel]) * squarely
+        color += weight[:, None] * seen.diffuse[pixel]
+        normal += weight[:, None] * seen.normal[pixel]
+        total += weight
+    # What no view sees squarely keeps the normal of its surface, and the color gray.
+    learned = unit(normal, 1e-9)
+    agrees = (total > 0) & (dot(learned, own) > 0)
+    normals = torch.where(agrees[:, None], learned, own)
+    colors = torch.where((total > 0)[:, None], color / total.clamp(min=1e-9)[:, None], 0.2)
+    return ColoredMesh(Surface(surface.vertices, surface.faces, normals.numpy()), colors.clamp(0, 1).numpy())

@@ -1,0 +1,135 @@
+"""What somebody points at: a place on the surface, its normal, its color; and gains that make a color gray."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from polarguide.capture import View
+from polarguide.capture.presentation import Vector
+from polarguide.core.errors import PolarguideError
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import unit
+from polarguide.shading.result import RenderResult
+
+SEEN = 0.5  # alpha from which there is a surface
+LEAST_GAIN, MOST_GAIN = 0.02, 50.0
+DARKEST, BRIGHTEST = 2e-3, 0.98  # of a color that may be picked as white
+PATCH = 2  # pixels to each side over which a picked color is averaged
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoint:
+    """A place on the surface.
+
+    Attributes:
+        point: [3] float64 in the world. normal: [3] float64 unit, toward the camera, or None where none is known.
+        color: [3] linear radiance of the final layer around it.
+    """
+
+    point: Tensor
+    normal: Tensor | None
+    color: Tensor
+
+
+def surface_at(result: RenderResult, camera: Camera, x: float, y: float) -> SurfacePoint | None:
+    """What a rendering with depth shows at a place of its picture; None outside, or where there is no surface.
+
+    Args:
+        result: with the size of the camera. camera: it was rendered with.
+        x, y: pixels from the top left corner; the center of the first pixel is (0.5, 0.5).
+    """
+    if not (0 <= x < camera.width and 0 <= y < camera.height):
+        return None
+    assert result.depth is not None
+    column, row = int(x), int(y)
+    depth = float(result.depth[row, column])
+    if float(result.alpha[row, column]) < SEEN or depth <= 0:
+        return None
+    local = torch.tensor([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0], dtype=torch.float64)
+    ray = camera.rotation.T @ local
+    normal: Tensor | None = None
+    if result.normal is not None:
+        blended = _patch(result.normal, row, column).double().mean(dim=(0, 1))
+        if float(blended.norm()) > 0.1:
+            normal = unit(blended, 1e-9)
+            normal = -normal if float(normal @ ray) > 0 else normal
+    color = _patch(result.final, row, column).mean(dim=(0, 1))
+    return SurfacePoint(camera.center + depth * ray, normal, color)
+
+
+def photograph_color(view: View, x: float, y: float, where: str) -> Tensor:
+    """The mean color [3] of a photograph's valid pixels around a place, see ``surface_at``.
+
+    Raises:
+        PolarguideError: it lies outside, or no pixel there is valid; ``where`` names the option.
+    """
+    camera = view.camera
+    if not (0 <= x < camera.width and 0 <= y < camera.height):
+        raise PolarguideError(
+            where,
+            expected=f"a place in {view.name}, which is {camera.width} x {camera.height}",
+            found=f"{x:g},{y:g}",
+            remedy="Count pixels from the top left corner.",
+        )
+    row, column = int(y), int(x)
+    valid = ~_patch(view.invalid | view.saturated, row, column)
+    if not bool(valid.any()):
+        raise PolarguideError(
+            where,
+            expected="pixels that are neither saturated nor invalid",
+            found=f"none around {x:g},{y:g} of {view.name}",
+            remedy="Pick a place that is gray or white, but not too bright.",
+        )
+    return _patch(view.photograph(), row, column)[valid].mean(dim=0)
+
+
+def _patch(picture: Tensor, row: int, column: int) -> Tensor:
+    """[h, w, ...] around a pixel."""
+    top, left = max(0, row - PATCH), max(0, column - PATCH)
+    return picture[top : row + PATCH + 1, left : column + PATCH + 1]
+
+
+def gains_of(color: Tensor, where: str = "white_balance") -> Vector:
+    """Gains that make a linear color [3] gray and leave green as it is, as cameras state their white balance.
+
+    Raises:
+        PolarguideError: it is too dark, clips, or is no gray under any usual light; ``where`` names the option.
+    """
+    values = [float(value) for value in color]
+    if not (min(values) > 0 and max(values) >= DARKEST and max(values) <= BRIGHTEST):
+        found = ", ".join(f"{value:.3g}" for value in values)
+        raise PolarguideError(
+            where,
+            expected=f"a color of {DARKEST:g} to {BRIGHTEST:g} of full scale in its brightest channel, none of them 0",
+            found=f"R, G, B {found}",
+            remedy="Pick a place that is gray or white, neither dark nor clipped.",
+        )
+    gains = [values[1] / value for value in values]
+    if not all(LEAST_GAIN <= gain <= MOST_GAIN for gain in gains):
+        raise PolarguideError(
+            where,
+            expected=f"gains of {LEAST_GAIN:g} to {MOST_GAIN:g}",
+            found=", ".join(f"{gain:.3g}" for gain in gains),
+            remedy="Pick a place that is gray or white.",
+        )
+    return gains[0], 1.0, gains[2]
+
+
+def gray_world(views: Iterable[View], where: str = "white_balance") -> Vector:
+    """Gains after which the photographs' mean is gray (Buchsbaum 1980), over valid pixels; green stays.
+
+    Raises:
+        PolarguideError: there are no such pixels, or all are black; ``where`` names the option.
+    """
+    total, count = torch.zeros(3, dtype=torch.float64), 0
+    for view in views:
+        valid = ~(view.invalid | view.saturated)
+        total += view.photograph()[valid].double().sum(dim=0)
+        count += int(valid.sum())
+    mean = total / max(count, 1)
+    # The gains do not depend on how bright the pictures are: black around an object changes nothing.
+    return gains_of(0.5 * mean / max(float(mean.max()), 1e-12), where)

@@ -1,0 +1,169 @@
+"""Layers of a run's views as PNG files, with a contact sheet beside the ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from polarguide.capture import Scene, View
+from polarguide.capture.layout import refuse_scene
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import atomic, make_folder, require_inside, write_whole
+from polarguide.core.options import PathLike, PictureFormat, check_choice
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.records import to_json
+from polarguide.results.rendering.relight import write_exr
+from polarguide.runs.opened import OpenedRun, checked_layers
+from polarguide.shading.result import RenderResult
+from polarguide.visualization import figures
+from polarguide.visualization.figures import contact_sheet
+from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture, true_depth_range
+
+SHEET_VIEWS = 8
+CONTACT_SHEET = "contact_sheet.png"
+UNITS_FILE = "layers.json"
+_RADIANCE = "linear radiance, R G B; 1 is full scale of the photograph S0/2"
+UNITS = {
+    **dict.fromkeys(("final", "base", "reflection", "specular", "diffuse"), _RADIANCE),
+    "strength": "share of the reflection, 0 to 1",
+    "metalness": "share of metals, 0 to 1",
+    "normal": "world axes of the scene, x y z; blended, so up to length 1, and 0 where nothing is",
+    "depth": "distance along the camera's axis, in the scene's units",
+    "alpha": "coverage, 0 to 1",
+}
+"""What the numbers of each layer mean."""
+
+
+def select_views(scene: Scene, choice: str) -> tuple[View, ...]:
+    """The views of a choice: ``test``, ``train``, ``all``, or names separated by commas.
+
+    Raises:
+        PolarguideError: there is no such view, or none at all.
+    """
+    groups = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}
+    names = [name.strip() for name in choice.split(",") if name.strip()]
+    chosen = groups[choice] if choice in groups else tuple(scene.view(name) for name in names)
+    if not chosen:
+        raise PolarguideError(
+            "views", expected="at least one view", found="none", remedy="Name a view, or take train."
+        )
+    return chosen
+
+
+def write_pictures(
+    run: OpenedRun,
+    out: PathLike | None = None,
+    *,
+    views: str = "test",
+    layers: Sequence[str] | None = None,
+    format: PictureFormat = "png",
+    transparent: bool = False,
+    reporter: Reporter = SILENT,
+) -> Path:
+    """Write layers of some views, one file each, and a contact sheet of them and the ground truth.
+
+    Args:
+        run: the run; its scene is read.
+        out: folder to write; ``render`` in the run's folder by default.
+        views: ``test``, ``train``, ``all``, or names separated by commas.
+        layers: names of layers, all of the run's by default; one that the recipe has not is left out, and named to
+            the reporter.
+        format: png as a display shows layers, with the white balance of the run's presentation; exr and npy hold their
+            linear numbers, in the units that ``layers.json`` beside them states. The contact sheet is PNG.
+        transparent: PNG files are transparent where nothing is, by alpha; their colors are those of what is there, so
+            that no dark rim shows on another background. Not on the contact sheet.
+
+    Returns:
+        The path of the contact sheet.
+
+    Raises:
+        PolarguideError: there is no such view or layer.
+    """
+    check_choice("format", format, get_args(PictureFormat))
+    if transparent and format != "png":
+        raise PolarguideError(
+            "transparent", expected="format png", found=format, remedy="Leave one of the two out."
+        )
+    folder = run.folder / "render" if out is None else Path(out)
+    refuse_scene(folder)
+    if out is None:
+        require_inside(run.folder, folder)
+    names = checked_layers(list(run.layers if layers is None else layers))
+    chosen = select_views(run.scene, views)
+    make_folder(folder)
+    shown: list[tuple[str, dict[str, Picture]]] = []
+    missing: set[str] = set()
+    gains = run.presentation.gains
+    polarization = run.polarization
+    about = {"Polarization": polarization}
+    with reporter.track("rendering", len(chosen)) as advance:
+        for number, view in enumerate(chosen):
+            result = run.result(view.camera).to("cpu")
+            depths = true_depth_range(view)
+            pictures = {
+                name: layer_picture(
+                    result, name, view.camera, depths, exposed=name == "reflection", gains=gains
+                )
+                for name in names
+            }
+            for name, picture in pictures.items():
+                if picture is None:
+                    missing.add(name)
+                elif format == "png" and transparent:
+                    rendered = _unblended(result)
+                    exposed = name == "reflection"
+                    whole = layer_picture(rendered, name, view.camera, depths, exposed=exposed, gains=gains)
+                    assert whole is not None
+                    alpha = (result.alpha.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+                    figures.write_png(folder / f"{view.name}_{name}.png", whole, alpha, about)
+                elif format == "png":
+                    figures.write_png(folder / f"{view.name}_{name}.png", picture, about=about)
+                else:
+                    _write_numbers(folder / f"{view.name}_{name}.{format}", getattr(result, name))
+            if len(shown) < SHEET_VIEWS:
+                known = ground_truth_pictures(view, gains)
+                cells = {name: picture for name, picture in pictures.items() if picture is not None}
+                shown.append(
+                    (view.name, cells | {f"{name}, true": known[name] for name in cells if name in known})
+                )
+            advance(number + 1)
+    if format != "png":
+        write_whole(
+            folder / UNITS_FILE, to_json({name: UNITS[name] for name in names if name not in missing})
+        )
+    sheet = folder / CONTACT_SHEET
+    figures.write_png(sheet, _sheet(shown, names, f"polarization: {polarization}"), about=about)
+    if missing:
+        reporter.say(f"this recipe has no layer {', '.join(sorted(missing))}")
+    return sheet
+
+
+def _sheet(shown: Sequence[tuple[str, dict[str, Picture]]], names: Sequence[str], caption: str) -> Picture:
+    """A row a view, and beside each layer what is true of it. A column that some view has not is left out."""
+    wanted = [column for name in names for column in (name, f"{name}, true")]
+    columns = [column for column in wanted if all(column in cells for _, cells in shown)]
+    rows = [[cells[column] for column in columns] for _, cells in shown]
+    return contact_sheet(rows, [name for name, _ in shown], columns, caption=caption)
+
+
+def _unblended(result: RenderResult) -> RenderResult:
+    """Layers of radiance as of what is there alone: over alpha, where anything is."""
+    alpha = result.alpha.clamp(min=1e-3)[..., None]
+    layers = {name: getattr(result, name) for name in ("final", "base", "specular", "diffuse")}
+    return replace(result, **{name: t / alpha for name, t in layers.items() if t is not None})
+
+
+def _write_numbers(path: Path, values: Tensor) -> None:
+    """Linear numbers of a layer, [H, W] or [H, W, 3], float32."""
+    found = values.detach().cpu().float().contiguous()
+    if path.suffix == ".exr":
+        write_exr(path, found if found.ndim == 3 else found[..., None].expand(-1, -1, 3))
+        return
+    with atomic(path) as temporary, open(temporary, "wb") as file:
+        np.save(file, found.numpy())

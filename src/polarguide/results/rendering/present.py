@@ -1,0 +1,290 @@
+"""Set how a scene or a run is presented, from what the command line or a program says."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from polarguide.capture import Scene, load_scene, read_model
+from polarguide.capture.layout import find_layout
+from polarguide.capture.presentation import (
+    CREDITS,
+    PRESENTATION_FILE,
+    Presentation,
+    Vector,
+    parse_length,
+    read_presentation,
+    shown_length,
+    write_presentation,
+)
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import require_folder
+from polarguide.core.options import DeviceName, PathLike
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.records import decode
+from polarguide.core.text import decimal
+from polarguide.results.rendering.picking import gains_of, gray_world, photograph_color, surface_at
+from polarguide.runs.folder import CONFIGURATION
+from polarguide.runs.opened import OpenedRun
+
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+def present(
+    folder: PathLike,
+    *,
+    white_balance: str | None = None,
+    up_axis: str | None = None,
+    points: Sequence[str] = (),
+    distance: str | None = None,
+    meters_per_unit: str | None = None,
+    crop: str | None = None,
+    title: str | None = None,
+    author: str | None = None,
+    license: str | None = None,
+    provenance: str | None = None,
+    device: DeviceName = "cpu",
+    reporter: Reporter = SILENT,
+) -> Presentation:
+    """Set how a scene or a run is presented, in its ``presentation.json``. What is not given stays as it is.
+
+    A PLACE is X,Y,Z in the scene's axes; VIEW, for the camera of a photograph; or VIEW,X,Y, for the surface that a
+    run shows at a pixel of a photograph, counted from the top left corner.
+
+    Args:
+        folder: of a scene, whose runs then have it from there, or of a run.
+        white_balance: ``none``, ``gray`` (the mean of the photographs becomes gray), gains of R, G and B such as
+            ``1.9,1,1.6``, or VIEW,X,Y: a place in a photograph that should be white or gray.
+        up_axis: ``none`` (as the cameras say), an axis such as ``z`` or ``-y``, three numbers, or VIEW,X,Y: a place
+            whose surface is level; up is its normal there.
+        points: two PLACEs whose distance is known. distance: it, such as ``85mm``.
+        meters_per_unit: how long one unit of the scene is, or ``none``.
+        crop: ``none``, or left,right,down,up,front,back in percent of the cameras' distance, as the viewer counts.
+        title, author, license, provenance: one line of text each; ``none`` or nothing removes it.
+        device: what surfaces are rendered on.
+        reporter: told what takes long.
+
+    Returns:
+        The presentation of the folder: for a run, its own over its scene's.
+
+    Raises:
+        PolarguideError: no such folder, or a value that cannot be read; nothing is written then.
+    """
+    place = _Place(Path(folder), device, reporter)
+    own = read_presentation(place.folder)
+    changes: dict[str, Any] = {}
+    if white_balance is not None:
+        changes["white_balance"] = None if white_balance == "none" else _white_balance(white_balance, place)
+    if up_axis is not None:
+        changes["up_axis"] = None if up_axis == "none" else _up_axis(up_axis, place)
+    if points or distance is not None or meters_per_unit is not None:
+        changes["meters_per_unit"] = _scale(points, distance, meters_per_unit, place)
+    if crop is not None:
+        up = changes["up_axis"] if "up_axis" in changes else place.shown(own).up_axis
+        changes["crop"] = None if crop == "none" else _crop(crop, up)
+    texts = {"title": title, "author": author, "license": license, "provenance": provenance}
+    changes |= {
+        name: "" if (text := texts[name]) == "none" else text for name in CREDITS if texts[name] is not None
+    }
+    place.refuse_inherited(name for name, value in changes.items() if value in (None, ""))
+    record = {**own.to_record(), **changes}
+    made = decode(record, Presentation, "presentation", remedy="Correct the value; nothing was written.")
+    if changes:
+        write_presentation(place.folder, made)
+    return place.shown(made)
+
+
+class _Place:
+    """A scene's or a run's folder, of which only what is asked for is read."""
+
+    def __init__(self, folder: Path, device: DeviceName, reporter: Reporter) -> None:
+        require_folder(
+            folder, expected="the folder of a scene or a run", remedy="Give what prepare or train wrote."
+        )
+        self.folder, self._device, self._reporter = folder, device, reporter
+        self._is_run = os.path.lexists(folder / CONFIGURATION)
+        if not self._is_run:
+            find_layout(folder)
+
+    @cached_property
+    def _run(self) -> OpenedRun:
+        return OpenedRun.open(self.folder, device=self._device, reporter=self._reporter)
+
+    @property
+    def _scene_folder(self) -> Path:
+        return self._run.scene_folder if self._is_run else self.folder
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene, or that of the run."""
+        return self._run.scene if self._is_run else load_scene(self.folder, reporter=self._reporter)
+
+    def shown(self, own: Presentation) -> Presentation:
+        """What applies, where the folder's own says this."""
+        return own.over(read_presentation(self._scene_folder)) if self._is_run else own
+
+    def refuse_inherited(self, names: Any) -> None:
+        """Refuse to remove from a run what its scene says.
+
+        Raises:
+            PolarguideError: the scene says it.
+        """
+        removed = list(names)
+        if not (self._is_run and removed):
+            return
+        above = read_presentation(self._scene_folder)
+        for name in removed:
+            if getattr(above, name) not in (None, ""):
+                raise PolarguideError(
+                    name,
+                    expected="a value of the run's own to remove",
+                    found=f"one of its scene's ({self._scene_folder / PRESENTATION_FILE})",
+                    remedy=f"Remove it there (polarguide present {self._scene_folder}), or give the run another.",
+                )
+
+    def pixel(self, text: str) -> tuple[str, float, float] | None:
+        """A view and a place in it, if the text is VIEW,X,Y."""
+        name, *numbers = text.rsplit(",", 2)
+        places = _numbers(",".join(numbers))
+        if len(places) != 2 or (_numbers(name) and name not in find_layout(self._scene_folder).names):
+            return None
+        return name, places[0], places[1]
+
+    def surface(self, name: str, x: float, y: float, where: str) -> tuple[Tensor, Tensor | None]:
+        """Point and normal of the surface at a pixel of a view.
+
+        Raises:
+            PolarguideError: no surface is there, or the folder is not a run's.
+        """
+        if not self._is_run:
+            raise PolarguideError(
+                where,
+                expected="a run, whose depth tells where the surface is",
+                found=f"the scene {self.folder}",
+                remedy="Give the folder of a run of it, or numbers X,Y,Z.",
+            )
+        camera = self.scene.view(name).camera
+        found = surface_at(self._run.result(camera, depth=True).to("cpu"), camera, x, y)
+        if found is None:
+            raise PolarguideError(
+                where,
+                expected=f"a surface at a place in {name}, which is {camera.width} x {camera.height}",
+                found=f"none at {x:g},{y:g}",
+                remedy="Pick a place on an object; polarguide view shows where it is.",
+            )
+        return found.point, found.normal
+
+    def point(self, text: str) -> Tensor:
+        """A PLACE as a point [3] in the world.
+
+        Raises:
+            PolarguideError: the text is not a PLACE.
+        """
+        pixel = self.pixel(text)
+        if pixel is not None:
+            return self.surface(*pixel, "points")[0]
+        numbers = _numbers(text)
+        if len(numbers) == 3:
+            return torch.tensor(numbers, dtype=torch.float64)
+        return read_model(self._scene_folder).camera(text).center
+
+
+def _white_balance(text: str, place: _Place) -> Vector | None:
+    if text == "gray":
+        return gray_world(place.scene.train_views)
+    if (pixel := place.pixel(text)) is not None:
+        name, x, y = pixel
+        return gains_of(photograph_color(place.scene.view(name), x, y, "white_balance"))
+    expected = "none, gray, three gains such as 1.9,1,1.6, or VIEW,X,Y"
+    red, green, blue = _require_numbers(text, 3, "white_balance", expected)
+    return red, green, blue
+
+
+def _up_axis(text: str, place: _Place) -> Vector | None:
+    if (axis := AXES.get(text.removeprefix("-").removeprefix("+").lower())) is not None:
+        sign = -1.0 if text.startswith("-") else 1.0
+        return sign * axis[0], sign * axis[1], sign * axis[2]
+    if (pixel := place.pixel(text)) is not None:
+        _, normal = place.surface(*pixel, "up_axis")
+        if normal is None:
+            raise _wrong("up_axis", "a place whose normal is known", text)
+        x, y, z = normal.tolist()
+    else:
+        expected = "none, an axis such as z or -y, three numbers, or VIEW,X,Y"
+        x, y, z = _require_numbers(text, 3, "up_axis", expected)
+    return x, y, z
+
+
+def _scale(
+    points: Sequence[str], distance: str | None, meters_per_unit: str | None, place: _Place
+) -> float | None:
+    if meters_per_unit is not None:
+        if points or distance is not None:
+            raise _wrong("meters_per_unit", "either this, or --points and --distance", "both")
+        if meters_per_unit == "none":
+            return None
+        return _require_numbers(meters_per_unit, 1, "meters_per_unit", "a number above 0, or none")[0]
+    if len(points) != 2 or distance is None:
+        found = f"{len(points)} points and {'a' if distance else 'no'} distance"
+        raise _wrong("points", "two points, and their --distance", found)
+    meters = parse_length(distance)
+    apart = float((place.point(points[0]) - place.point(points[1])).norm())
+    if apart < 1e-9:
+        raise _wrong("points", "two points that lie apart", "one and the same")
+    return meters / apart
+
+
+def _crop(text: str, up: Vector | None) -> dict[str, Any]:
+    sides = _require_numbers(text, 6, "crop", "none, or left,right,down,up,front,back in percent")
+    left, right, down, above, front, back = (side / 100 for side in sides)
+    return {"low": (left, down, front), "high": (right, above, back), "up": up}
+
+
+def _numbers(text: str) -> list[float]:
+    """Numbers separated by commas; an empty list where the text is something else."""
+    try:
+        return [decimal(part) for part in text.split(",")]
+    except ValueError:
+        return []
+
+
+def _require_numbers(text: str, count: int, where: str, expected: str) -> list[float]:
+    """So many numbers separated by commas.
+
+    Raises:
+        PolarguideError: the text is something else.
+    """
+    numbers = _numbers(text)
+    if len(numbers) != count:
+        raise _wrong(where, expected, text)
+    return numbers
+
+
+def _wrong(where: str, expected: str, found: str) -> PolarguideError:
+    return PolarguideError(where, expected=expected, found=found, remedy="Correct the value.")
+
+
+def described(presentation: Presentation) -> list[str]:
+    """The fields that are set, a line each; "nothing is set" for an empty presentation."""
+    lines = {
+        "white balance": _listed(presentation.white_balance),
+        "up axis": _listed(presentation.up_axis),
+        "scale": ""
+        if presentation.meters_per_unit is None
+        else f"1 unit is {shown_length(1.0, presentation.meters_per_unit)}",
+    }
+    if (crop := presentation.crop) is not None:
+        sides = (100 * side for pair in zip(crop.low, crop.high, strict=True) for side in pair)
+        lines["crop"] = f"{_listed(tuple(sides))} % of the cameras' distance"
+    lines |= {name: getattr(presentation, name) for name in CREDITS}
+    return [f"{name}: {text}" for name, text in lines.items() if text] or ["nothing is set"]
+
+
+def _listed(numbers: Sequence[float] | None) -> str:
+    return "" if numbers is None else ", ".join(f"{number:.4g}" for number in numbers)

@@ -1,0 +1,139 @@
+"""Pictures of what polarization says about a scene, before or after training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from polarguide import optics
+from polarguide.capture import Scene, View
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import make_folder
+from polarguide.core.options import PathLike, check_finite, index_of
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.results.rendering.pictures import CONTACT_SHEET, SHEET_VIEWS, select_views
+from polarguide.runs.opened import OpenedRun
+from polarguide.training.priors import facing_chromatic, guide_normals
+from polarguide.training.recipe import Priors
+from polarguide.visualization import figures
+from polarguide.visualization.figures import Picture, contact_sheet
+
+
+def write_priors(
+    scene: Scene,
+    out: PathLike,
+    *,
+    run: OpenedRun | None = None,
+    views: str = "test",
+    refractive_index: float | None = None,
+    threshold: float = 0.05,
+    reporter: Reporter = SILENT,
+) -> Path:
+    """Pictures of what polarization says about a scene, one PNG each, and a contact sheet of them.
+
+    S0, DoLP, AoLP, zenith, both separations, polarization normals, those that color differences tell, and the mask of
+    usable pixels. The exact separation needs normals: those of a trained run, else the polarization normals themselves,
+    with their ambiguity resolved only by the surface facing the camera.
+
+    Args:
+        scene: a scene with poses.
+        out: folder to write.
+        run: a run trained on this scene at this size, whose normals resolve the ambiguity.
+        views: ``test``, ``train``, ``all``, or names separated by commas.
+        refractive_index: of the surfaces; None: that of the scene.
+        threshold: DoLP above which a pixel's normal is used.
+
+    Returns:
+        The path of the contact sheet.
+
+    Raises:
+        PolarguideError: there is no such view, its pictures do not determine its polarization, or the run was trained
+            at another size.
+    """
+    check_finite("threshold", threshold, 0.0, 1.0)
+    index = index_of(refractive_index, scene.refractive_index)
+    check_finite("refractive_index", index, 1.0001, 4.0)
+    if run is not None and run.configuration.downscale != scene.downscale:
+        raise PolarguideError(
+            "downscale",
+            expected=f"{run.configuration.downscale}, as {run.folder} was trained",
+            found=str(scene.downscale),
+            remedy="Give the same factor.",
+        )
+    chosen = select_views(scene, views)
+    for view in chosen:
+        if not view.is_determined:
+            raise view.undetermined("polarization at every pixel")
+    make_folder(out := Path(out))
+    rows: list[list[Picture]] = []
+    labels: list[str] = []
+    names: list[str] = []
+    with reporter.track("drawing", len(chosen)) as advance:
+        for number, view in enumerate(chosen):
+            pictures = prior_pictures(view, run, index, threshold)
+            names = list(pictures)
+            for name, picture in pictures.items():
+                figures.write_png(out / f"{view.name}_{name}.png", picture)
+            if len(rows) < SHEET_VIEWS:
+                rows.append(list(pictures.values()))
+                labels.append(view.name)
+            advance(number + 1)
+    sheet = out / CONTACT_SHEET
+    figures.write_png(sheet, contact_sheet(rows, labels, names))
+    return sheet
+
+
+@torch.no_grad()
+def prior_pictures(view: View, run: OpenedRun | None, index: float, threshold: float) -> dict[str, Picture]:
+    """All prior pictures of one view, by the name their file gets."""
+    rays = view.camera.rays()
+    stokes = view.stokes()
+    luminance = optics.luminance(stokes)
+    dolp, aolp = optics.dolp(luminance), optics.aolp(luminance)
+    zenith = optics.diffuse_zenith(dolp, index)
+    guide, source = _guide(view, run, rays, luminance, index)
+    mask = optics.polarization_mask(
+        luminance, threshold=threshold, invalid=view.invalid, saturated=view.saturated
+    )
+    candidates = optics.physical_candidates(luminance, rays, index)
+    normal = optics.disambiguate(candidates, guide, rays, azimuth_weight=0.5).normal
+    good = ~(view.invalid | view.saturated)
+    chromatic, certain = facing_chromatic(stokes, guide, rays, index, good, Priors())
+    paper = optics.paper_separation(stokes, zenith, index)
+    exact = optics.exact_separation(stokes, guide, rays, index)
+    degrees = torch.rad2deg(zenith)
+    return {
+        "S0": figures.radiance_to_rgb(view.photograph()),
+        "DoLP": figures.dolp_to_rgb(dolp),
+        "AoLP": figures.aolp_to_rgb(aolp, dolp),
+        "zenith_diffuse": figures.scalar_to_rgb(degrees, 0.0, 90.0),
+        "specular_paper": figures.radiance_to_rgb(paper.specular / 2),
+        "diffuse_paper": figures.radiance_to_rgb(paper.diffuse / 2),
+        f"specular_exact_{source}": figures.radiance_to_rgb(exact.specular / 2),
+        f"diffuse_exact_{source}": figures.radiance_to_rgb(exact.diffuse / 2),
+        f"normal_{source}": figures.normal_to_rgb(
+            view.camera.to_world(normal * mask[..., None]), view.camera
+        ),
+        "normal_by_color": figures.normal_to_rgb(
+            view.camera.to_world(chromatic * (certain[..., None] > 0)), view.camera
+        ),
+        "mask": figures.scalar_to_rgb(mask.float(), 0.0, 1.0),
+    }
+
+
+def _guide(
+    view: View, run: OpenedRun | None, rays: Tensor, luminance: Tensor, index: float
+) -> tuple[Tensor, str]:
+    """Normals in camera axes that resolve the ambiguity, and where they come from."""
+    if run is not None:
+        normal = run.result(view.name, depth=False).to("cpu").normal
+        assert normal is not None
+        return guide_normals(view.camera.to_camera(normal), rays, Priors.minimum_normal)[0], "by_run"
+    upward = torch.tensor([0.0, -0.5, -1.0]).expand_as(rays)
+    guess = torch.nn.functional.normalize(upward, dim=-1)
+    chosen = optics.disambiguate(
+        optics.physical_candidates(luminance, rays, index), guess, rays, azimuth_weight=0.0
+    ).normal
+    return chosen, "by_polarization"

@@ -1,0 +1,162 @@
+"""Other light for a run; the learned environment as a panorama, and panoramas as environments.
+
+A panorama [H, 2 H, 3] is upright in the scene: row i, column j is at latitude ``pi (1/2 - (i + 1/2) / H)`` over the
+cameras' common level and at longitude ``pi ((j + 1/2) / H - 1)`` from the middle, to the right. Files hold linear
+radiance on the scale of the photographs (S0 / 2).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, pad
+
+from polarguide.capture.formats.arrays import read_radiance
+from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.files import atomic, in_utf8
+from polarguide.core.options import PathLike
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.geometry.scene_frame import SceneFrame
+from polarguide.runs.opened import OpenedRun
+from polarguide.shading.cubemap import cubemap_lookup, texel_directions
+from polarguide.shading.model import RadianceCubemap, ShadingModel
+
+LARGEST = 8192 * 4096
+RELIT_RESOLUTION = 128
+"""Texels along the sides of a cubemap that is made of another light, or of the learned one turned."""
+
+
+def relight(
+    run: OpenedRun, panorama: PathLike | None = None, degrees: float = 0.0, *, reporter: Reporter = SILENT
+) -> None:
+    """Put a panorama in the learned environment's place, or turn it, in the run as it is in memory.
+
+    Args:
+        run: the run; its scene is read.
+        panorama: file of linear radiance (.hdr, .exr), to be reflected in place of the learned environment.
+        degrees: by which to turn the environment, counter-clockwise seen from above.
+        reporter: told what stays as it was learned.
+
+    Raises:
+        PolarguideError: the recipe learns no radiance, or the file cannot be read.
+    """
+    if panorama is None and degrees % 360 == 0:
+        return
+    what = "rotate_environment" if panorama is None else "environment"
+    if not math.isfinite(degrees):
+        raise PolarguideError(what, expected="degrees", found=str(degrees), remedy="Give a number.")
+    cubemap = needs_radiance(run.model.shading, what=what)
+    light = run.model.light
+    around = run.frame
+    if panorama is not None:
+        texels = texels_of(read_panorama(Path(panorama)), cubemap, around, RELIT_RESOLUTION)
+        light[cubemap.name] = texels.to(light[cubemap.name].device)
+    light[cubemap.name] = turned_cubemap(light[cubemap.name].detach(), around.turn(degrees), RELIT_RESOLUTION)
+    if run.model.shading.local_note:
+        reporter.say(f"note: {run.model.shading.local_note}")
+
+
+def needs_radiance(shading: ShadingModel, *, what: str) -> RadianceCubemap:
+    """The radiance that a shading model's light holds; ``what`` asks for it.
+
+    Raises:
+        PolarguideError: the model has no light, or none that is a cubemap of radiance.
+    """
+    cubemap = shading.radiance_cubemap
+    if cubemap is not None:
+        return cubemap
+    raise PolarguideError(
+        what,
+        expected="a recipe that learns the radiance of its surroundings",
+        found="one whose light is something else" if shading.reflects else "a run without reflection",
+        remedy="Take a run of 3dgs-dr, polarguide or polarguide-stokes.",
+    )
+
+
+@torch.no_grad()
+def panorama(texels: Tensor, cubemap: RadianceCubemap, around: SceneFrame, height: int) -> Tensor:
+    """Radiance [H, 2 H, 3] of raw texels [6, R, R, 3]."""
+    steps = torch.arange(2 * height, dtype=torch.float64) + 0.5
+    latitude, longitude = (
+        math.pi * (0.5 - steps[:height, None] / height),
+        math.pi * (steps[None] / height - 1),
+    )
+    x, y, z = torch.broadcast_tensors(
+        latitude.cos() * longitude.sin(), latitude.sin(), -latitude.cos() * longitude.cos()
+    )
+    directions = torch.stack((x, y, z), dim=-1).reshape(-1, 3) @ around.panorama_axes().T
+    found = cubemap_lookup(texels.detach(), directions.to(texels.dtype))
+    return cubemap.radiance(found).reshape(height, 2 * height, 3)
+
+
+@torch.no_grad()
+def texels_of(picture: Tensor, cubemap: RadianceCubemap, around: SceneFrame, resolution: int) -> Tensor:
+    """Raw texels [6, R, R, 3] of a panorama [H, W, 3] of radiance, as far as raw values can hold it."""
+    directions = texel_directions(resolution).double() @ around.panorama_axes()
+    x, y, z = directions.unbind(-1)
+    across, down = torch.atan2(x, -z) / math.pi, -2 / math.pi * torch.asin(y.clamp(-1, 1))
+    # One column more on each side: the panorama goes round.
+    wide = pad(picture.double().movedim(-1, 0)[None], (1, 1, 0, 0), mode="circular")
+    width = picture.shape[1]
+    places = torch.stack((across * width / (width + 2), down), dim=-1).reshape(
+        1, 6 * resolution, resolution, 2
+    )
+    found = grid_sample(wide, places, mode="bilinear", padding_mode="border", align_corners=False)
+    light = found[0].movedim(0, -1).reshape(6, resolution, resolution, 3)
+    return cubemap.raw(light).float()
+
+
+@torch.no_grad()
+def turned_cubemap(texels: Tensor, turn: Tensor, resolution: int) -> Tensor:
+    """Raw texels [6, R, R, C] after turning what they show by a rotation [3, 3] of the world."""
+    directions = (texel_directions(resolution).double() @ turn).reshape(-1, 3)
+    found = cubemap_lookup(texels, directions.to(texels))
+    return found.reshape(6, resolution, resolution, -1)
+
+
+def write_exr(path: Path, picture: Tensor, attributes: Mapping[str, str] = {}) -> None:
+    """Write linear radiance [H, W, 3] as 32-bit floats, with standard attributes of the format, such as ``owner``.
+
+    Raises:
+        PolarguideError: OpenEXR is not installed.
+    """
+    exr = optional_import("OpenEXR", "an EXR file")
+    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage, **attributes}
+    pixels = np.ascontiguousarray(picture.detach().numpy().astype(np.float32))
+    with atomic(path) as temporary, in_utf8(temporary) as name, exr.File(header, {"RGB": pixels}) as file:
+        try:
+            file.write(str(name))
+        except RuntimeError as error:
+            raise OSError(str(error).strip().splitlines()[-1]) from None
+
+
+def read_panorama(path: Path) -> Tensor:
+    """Read a panorama of linear radiance, Radiance HDR or OpenEXR: [H, W, 3] float32, not negative.
+
+    Raises:
+        PolarguideError: no such file, not twice as wide as high, not such a picture, without light, or NaN somewhere.
+    """
+    expected = "a panorama of linear radiance, .hdr or .exr, twice as wide as high"
+    remedy = "Give an equirectangular picture."
+    if not path.is_file() or path.suffix.lower() not in (".hdr", ".exr"):
+        found = "no such file" if not path.is_file() else f"a name that ends in {path.suffix or 'nothing'}"
+        raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
+    pixels = read_radiance(path)
+    if pixels.shape[1] != 2 * pixels.shape[0] or pixels.size > 3 * LARGEST:
+        found = f"a picture of shape {list(pixels.shape)}"
+        raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
+    values = torch.tensor(pixels)
+    missing = int(values.isnan().any(dim=-1).sum())
+    if missing or not bool((values > 0).any()):
+        raise PolarguideError(
+            path,
+            expected="radiance at every pixel, and light somewhere",
+            found=f"NaN at {missing} of {values[..., 0].numel()} pixels" if missing else "no value above 0",
+            remedy="Export the panorama again, or paint the pixels.",
+        )
+    return values.clamp(0, 6e4)

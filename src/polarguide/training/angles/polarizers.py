@@ -1,0 +1,334 @@
+"""What a training finds out about the polarizers of its pictures: unknown angles, and known ones that contradict."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from statistics import median
+
+import torch
+from torch import Tensor
+
+from polarguide.capture import Scene, View
+from polarguide.capture.exposures import Exposure
+from polarguide.capture.exposures import found as found_exposure
+from polarguide.training.angles.fit import fit_angle
+from polarguide.training.recipe import Recipe
+from polarguide.training.rules import AngleRules
+from polarguide.training.settings import ResolvedSettings
+from polarguide.training.state import ANGLE_COLUMNS
+
+TO_DEVIATION = 1.4826
+"""Standard deviation of normal errors over the median of their absolute values."""
+REMEDY = (
+    "Note the angle of each shot; or take three or four shots of each view at known angles, from a tripod; or treat "
+    "the pictures as ordinary photographs: prepare them with --angles none."
+)
+"""What to do where most angles are doubtful."""
+Predict = Callable[[View], Tensor]
+"""Stokes vectors [3, H, W, 3] that the present state predicts for a view."""
+
+
+@dataclass(frozen=True)
+class Judgment:
+    """What the training says of a picture.
+
+    Attributes:
+        view, number: the view, and the place of the picture among its exposures.
+        said: what the capture says. believed: what the training goes by.
+        angle: the mean of the fits that tell one, or else of those that guess one, degrees.
+        gain, modulation, spread, doubt, misfit, misfit_across: of the last of these, see ``FittedAngle``.
+        scatter: of the angles about their mean, degrees; 90 where less than half of the fits have one.
+        usual: median of what the telling pictures of the same fit are ``off``: how well the model predicts any.
+        unexplained: misfit of the last of all fits over the median of all pictures, times that over the misfit across:
+            large where the picture is explained worse than others are, and hardly better than by a turned polarizer.
+        rules: by which it is judged.
+    """
+
+    view: str
+    number: int
+    said: Exposure
+    believed: Exposure
+    angle: float
+    gain: float
+    modulation: float
+    spread: float
+    doubt: float
+    misfit: float = 0.0
+    misfit_across: float = 0.0
+    scatter: float = 0.0
+    unexplained: float = 0.0
+    usual: float = 0.0
+    rules: AngleRules = field(default_factory=AngleRules, repr=False)
+
+    @property
+    def unfiltered(self) -> bool:
+        """Whether it was taken without a filter, as it looks."""
+        return self.modulation + self.doubt < self.rules.weak
+
+    @property
+    def vague(self) -> bool:
+        """Whether the picture does not tell its angle."""
+        return (self.spread > self.rules.vague or self.modulation < self.rules.weak) and not self.unfiltered
+
+    @property
+    def tells(self) -> bool:
+        """Whether the picture tells its angle."""
+        return not self.vague and not self.unfiltered
+
+    @property
+    def guesses(self) -> bool:
+        """Whether its angle is worth believing where nothing else is known."""
+        return self.spread <= self.rules.lost and self.modulation >= self.rules.weak
+
+    @property
+    def unsettled(self) -> bool:
+        """Whether it tells an angle, and the fits do not agree on which."""
+        return self.tells and self.scatter > self.rules.disagree
+
+    @property
+    def poorly_explained(self) -> bool:
+        """Whether it tells an angle, and may well be at another all the same."""
+        return self.tells and self.unexplained > self.rules.poor
+
+    @property
+    def off(self) -> float:
+        """Degrees from what is said to what was fitted, in [-90, 90); 0 where nothing is said."""
+        return 0.0 if self.said.angle is None else (self.angle - self.said.angle + 90.0) % 180.0 - 90.0
+
+    @property
+    def limit(self) -> float:
+        """Degrees that a picture has to be ``off`` to contradict what is said: more than others are, since where all
+        are off, the model is what is wrong. From 90 on, nothing contradicts.
+        """
+        return max(self.rules.contradicts, 3 * self.spread, 3 * TO_DEVIATION * self.usual)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the picture contradicts what is said: also one that hardly tells its angle, whose limit is wide."""
+        return not self.unfiltered and abs(self.off) > self.limit
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the angle that the training goes by may well be wrong."""
+        sought = not self.said.known and (not self.tells or self.unsettled or self.poorly_explained)
+        return sought or self.unfiltered or self.contradicts
+
+
+class Polarizers:
+    """The pictures behind polarizers that are to be fitted, and what has been found.
+
+    Pictures of a polarization camera are not; nor is anything where the recipe has no use for it. Angles are sought in
+    the second half of a schedule. Where the training begins again with what was found, they are sought twice, the
+    second time by what the first has found.
+
+    Args:
+        scene: the capture. recipe: the method. steps: of the training. search: of the schedule by which unknown
+            angles are sought where the training begins again after it; 0: it does not.
+        table: what was found before, [F, P, 8] float64: what each ``fit`` gave; None: nothing.
+
+    Attributes:
+        beliefs: the exposures that a training goes by, by the name of the view; of views that were fitted.
+
+    Raises:
+        ValueError: the table has another number of rows.
+    """
+
+    def __init__(
+        self, scene: Scene, recipe: Recipe, steps: int, table: Tensor | None = None, search: int = 0
+    ) -> None:
+        uses = predicts_filters(recipe)
+        self._views = [view for view in scene.train_views if uses and not view.is_four]
+        self._places = [
+            (view, k)
+            for view in self._views
+            for k, exposure in enumerate(view.exposures)
+            if exposure.filtered
+        ]
+        self._unknown = any(not view.exposures[k].known for view, k in self._places)
+        rules = self._rules = recipe.angle_rules
+        times = [rules.first] if self._unknown else [*rules.checks]
+        while self._unknown and times[-1] + rules.every <= rules.last + 1e-9:
+            times.append(times[-1] + rules.every)
+        length = search if search and self._unknown else steps
+        rounds = (times, rules.again) if search and self._unknown else (times,)
+        self._rounds = [
+            sorted({round(share * length) for share in shares}) for shares in rounds if self._places
+        ]
+        if table is not None and table.shape[1] != len(self._places):
+            raise ValueError(f"angles of {table.shape[1]} pictures, not {len(self._places)}")
+        self.table = table
+        self.ignored = not uses and any(not view.measures_radiance for view in scene.train_views)
+        self.beliefs = self._beliefs()
+
+    def due(self, step: int) -> bool:
+        """Whether angles are to be fitted before a step; none is once all fits have been made."""
+        return not self.settled and step in self._rounds[self.ended]
+
+    @property
+    def ended(self) -> int:
+        """Searches of which all fits have been made."""
+        made = 0 if self.table is None else len(self.table)
+        return sum(made >= end for end in itertools.accumulate(map(len, self._rounds)))
+
+    @property
+    def settled(self) -> bool:
+        """Whether all fits have been made."""
+        return self.ended == len(self._rounds)
+
+    @property
+    def search(self) -> int:
+        """Steps until unknown angles are found; 0 where there are none."""
+        return sum(times[-1] for times in self._rounds) if self._unknown else 0
+
+    @property
+    def searched(self) -> int:
+        """Those of them that belong to searches that have ended."""
+        return sum(times[-1] for times in self._rounds[: self.ended]) if self._unknown else 0
+
+    def believed(self, view: View) -> View:
+        """A view with what is believed of its exposures."""
+        exposures = self.beliefs.get(view.name)
+        return view if exposures is None or exposures == view.exposures else view.with_exposures(exposures)
+
+    def resolved(self, scene: Scene) -> Scene:
+        """A scene with what is believed of its exposures."""
+        return replace(scene, views=tuple(self.believed(view) for view in scene.views))
+
+    def fit(self, predict: Predict) -> Tensor:
+        """Fit all angles.
+
+        Returns:
+            [P, 8] float64: of each picture the values of ``FittedAngle``, and 1 where there was anything to go by.
+        """
+        rows = []
+        for view in self._views:
+            stokes = predict(view)
+            local = view.to(stokes.device)
+            weight = (~(local.invalid | local.saturated)).to(stokes)
+            rays = local.camera.rays(device=stokes.device)
+            for k, intensity in enumerate(local.intensities()):
+                if not view.exposures[k].filtered:
+                    continue
+                fitted = fit_angle(intensity, stokes, weight, rays, view.mount)
+                row = [0.0, 1.0, 0.0, 90.0, 1.0, 0.0, 0.0, 0.0]
+                if fitted is not None:
+                    row = [*dataclasses.astuple(fitted), 1.0]
+                rows.append(row)
+        return torch.tensor(rows, dtype=torch.float64).reshape(-1, ANGLE_COLUMNS)
+
+    def take(self, table: Tensor) -> set[str]:
+        """Go by a table of all fits [F, P, 8] from now on; the names of the views of which it changes the beliefs."""
+        self.table = table
+        before, self.beliefs = self.beliefs, self._beliefs()
+        return {name for name, exposures in self.beliefs.items() if before.get(name) != exposures}
+
+    def judgments(self) -> list[Judgment]:
+        """What is said and believed of each picture; empty before the first fit."""
+        if self.table is None:
+            return []
+        common = self._common_gain()
+        fits = [self._judged(fit) for fit in self._latest()]
+        found = []
+        for rows, poor in zip(zip(*fits, strict=True), self._unexplained(), strict=True):
+            said = rows[0].said
+            telling = [row for row in rows if row.tells] or [row for row in rows if row.guesses]
+            judgment = replace((telling or rows)[-1], unexplained=poor)
+            if telling:
+                angles, spreads = [row.angle for row in telling], [row.spread for row in telling]
+                angle, scatter = mean_angle(angles, spreads, self._rules.least_spread)
+                few = len(telling) < len(rows) / 2
+                judgment = replace(judgment, angle=angle, scatter=90.0 if few else scatter)
+            if wrong := [row for row in rows if row.contradicts]:
+                judgment = replace(wrong[-1], unexplained=poor)
+            found.append(judgment if said.known else replace(judgment, believed=_belief(judgment, common)))
+        return found
+
+    def _judged(self, fit: Tensor) -> list[Judgment]:
+        """What one fit [P, 8] says of each picture."""
+        rows = [
+            replace(
+                Judgment(view.name, k, view.exposures[k], view.exposures[k], *row[: ANGLE_COLUMNS - 1]),
+                rules=self._rules,
+            )
+            for (view, k), row in zip(self._places, fit.tolist(), strict=True)
+        ]
+        offs = [abs(row.off) for row in rows if row.tells and row.said.angle is not None]
+        usual = median(offs) if offs else 0.0
+        return [replace(row, usual=usual) for row in rows]
+
+    def _latest(self) -> Tensor:
+        """The fits of the latest search that has any; those of earlier ones are worse."""
+        assert self.table is not None
+        ends = itertools.accumulate(map(len, self._rounds), initial=0)
+        return self.table[max(end for end in ends if end < len(self.table)) :]
+
+    def _unexplained(self) -> list[float]:
+        """Of each picture what ``Judgment.unexplained`` says; 0 where there was nothing to go by."""
+        assert self.table is not None
+        misfit, across, told = self.table[-1, :, -3:].unbind(1)
+        known = told > 0
+        middle = misfit[known].median() if bool(known.any()) else misfit.new_ones(())
+        relative = misfit**2 / (middle * across).clamp(min=1e-12)
+        values: list[float] = torch.where(known, relative, torch.zeros_like(relative)).tolist()
+        return values
+
+    def _common_gain(self) -> float | None:
+        """What gains are relative to; None where they differ no more than those of locked exposures, as fitted."""
+        assert self.table is not None
+        last = zip(self._places, self.table[-1], strict=True)
+        rows = [row for (view, k), row in last if not view.exposures[k].known]
+        gains = [float(row[1]) for row in rows if row[-1]]
+        if len(gains) < self._rules.fewest:
+            return None
+        middle = median(gains)
+        spread = TO_DEVIATION * median(abs(math.log(gain / middle)) for gain in gains)
+        return middle if spread > self._rules.locked else None
+
+    def _beliefs(self) -> dict[str, tuple[Exposure, ...]]:
+        believed: dict[str, list[Exposure]] = {}
+        views = {view.name: view for view in self._views}
+        for judgment in self.judgments():
+            exposures = believed.setdefault(judgment.view, list(views[judgment.view].exposures))
+            exposures[judgment.number] = judgment.believed
+        return {name: tuple(exposures) for name, exposures in believed.items()}
+
+
+def predicts_filters(recipe: Recipe) -> bool:
+    """Whether a recipe learns from what is behind a filter: it renders S0, S1 and S2."""
+    return recipe.shading.reflects and any(stage.weights.stokes > 0 for stage in recipe.stages)
+
+
+def search_steps(recipe: Recipe, settings: ResolvedSettings) -> int:
+    """Steps of the schedule by which unknown angles are sought before a training begins; 0: it does not begin again."""
+    return min(recipe.angle_rules.search_steps, settings.steps) if settings.begin_again else 0
+
+
+def _belief(judgment: Judgment, common: float | None) -> Exposure:
+    """What is believed of a picture of which nothing is said: a photograph where there is no angle to believe."""
+    said = judgment.said
+    if judgment.unfiltered:
+        return replace(said, filtered=False)
+    if not judgment.guesses:
+        return said
+    gain = said.gain if common is None else said.gain * judgment.gain / common
+    return found_exposure(said, judgment.angle, gain)
+
+
+def mean_angle(angles: Sequence[float], spreads: Sequence[float], least_spread: float) -> tuple[float, float]:
+    """Mean of angles in degrees that count modulo 180, each by one over its spread in degrees, but not
+    more than by one over ``least_spread``, and their scatter.
+
+    The scatter is half the circular standard deviation of the doubled angles, sqrt(-2 log R) with R the length of their
+    mean (Mardia and Jupp, Directional Statistics, 2.3), in degrees.
+    """
+    weights = [1 / max(spread, least_spread) for spread in spreads]
+    doubled = [math.radians(2 * angle) for angle in angles]
+    sine = sum(weight * math.sin(angle) for weight, angle in zip(weights, doubled, strict=True))
+    cosine = sum(weight * math.cos(angle) for weight, angle in zip(weights, doubled, strict=True))
+    length = min(max(math.hypot(sine, cosine) / sum(weights), 1e-6), 1.0)
+    mean = math.degrees(math.atan2(sine, cosine) / 2) % 180.0
+    return mean, min(math.degrees(math.sqrt(-2 * math.log(length))) / 2, 90.0)

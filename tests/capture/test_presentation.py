@@ -1,0 +1,127 @@
+"""The record of how a capture is presented: what it takes, what it means, and what goes before what."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from random_runs import ring
+
+from polarguide.capture.presentation import (
+    PRESENTATION_FILE,
+    Crop,
+    Presentation,
+    balanced,
+    parse_length,
+    read_presentation,
+    shown_length,
+    write_presentation,
+)
+from polarguide.core.errors import PolarguideError
+from polarguide.geometry.scene_frame import scene_frame
+
+AROUND = scene_frame(list(ring().values()))
+WHOLE = Presentation(
+    white_balance=(1.5, 1.0, 0.75),
+    up_axis=(0.0, 0.0, 2.0),
+    meters_per_unit=0.25,
+    crop=Crop((-0.1, -0.2, -0.3), (0.1, 0.2, 0.3), (1.0, 0.0, 0.0)),
+    title="Cup",
+    author="René",
+    license="CC-BY-4.0",
+    provenance="inv. 7",
+)
+
+
+def test_what_is_written_is_read_and_what_is_missing_is_left_out(tmp_path: Path) -> None:
+    assert read_presentation(tmp_path) == Presentation()
+    for presentation in (WHOLE, Presentation(author="A")):
+        write_presentation(tmp_path, presentation)
+        assert read_presentation(tmp_path) == presentation
+    assert json.loads((tmp_path / PRESENTATION_FILE).read_text()) == {"author": "A"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"white_balance": [1, 1]}', r"\(white_balance\)"),
+        ('{"white_balance": [1, 0, 1]}', r"\(white_balance\[1\]\): expected 0.02 to 50, found 0"),
+        ('{"white_balance": [1, NaN, 1]}', "finite|0.02 to 50"),
+        ('{"up_axis": [0, 0, 0]}', r"\(up_axis\): expected a direction"),
+        ('{"meters_per_unit": 0}', r"\(meters_per_unit\): expected 1e-09 to "),
+        ('{"meters_per_unit": 1e-300}', r"\(meters_per_unit\): expected 1e-09 to "),
+        ('{"meters_per_unit": "1"}', r"\(meters_per_unit\): expected a number"),
+        ('{"crop": {"low": [0, 0, 0], "high": [1, 0, 1]}}', r"\(crop\): expected a low side less than"),
+        ('{"crop": {"low": [0, 0, 0], "high": [1, 1, 1e9]}}', r"\(crop\)"),
+        ('{"author": "two\\nlines"}', r"\(author\): expected one line"),
+        ('{"licence": "CC0"}', "expected only white_balance, up_axis.*found licence"),
+        ('{"title": "' + 1001 * "x" + '"}', r"\(title\)"),
+        ("[]", "JSON object"),
+    ],
+)
+def test_what_is_wrong_is_refused_by_name(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / PRESENTATION_FILE).write_text(text)
+    with pytest.raises(PolarguideError, match=message) as error:
+        read_presentation(tmp_path)
+    assert PRESENTATION_FILE in error.value.where
+
+
+def test_a_run_s_own_goes_before_its_scene_s_field_by_field() -> None:
+    own = Presentation(meters_per_unit=2.0, author="B")
+    both = own.over(WHOLE)
+    assert (both.meters_per_unit, both.author) == (2.0, "B")
+    assert (both.white_balance, both.crop, both.license) == (WHOLE.white_balance, WHOLE.crop, "CC-BY-4.0")
+    assert Presentation().over(WHOLE) == WHOLE
+    assert WHOLE.credit == "René, CC-BY-4.0"
+    assert not Presentation().credit
+
+
+def test_the_chosen_axis_replaces_that_of_the_cameras() -> None:
+    torch.testing.assert_close(WHOLE.upright(AROUND).up, torch.tensor([0.0, 0, 1], dtype=torch.float64))
+    assert Presentation().upright(AROUND) is AROUND
+
+
+def test_a_crop_box_stands_along_its_own_axis_whatever_is_chosen_later() -> None:
+    box = Crop((-0.25, -0.5, -1.0), (0.25, 0.5, 1.0))
+    corners = box.corners(AROUND)
+    assert corners.shape == (8, 3)
+    inner, outer = (
+        AROUND.center + 0.99 * (corners - AROUND.center),
+        AROUND.center + 1.01 * (corners - AROUND.center),
+    )
+    assert bool(box.inside(inner, AROUND).all())
+    assert not bool(box.inside(outer, AROUND).any())
+    turned = Crop(box.low, box.high, (1.0, 0.0, 0.0))
+    reach = (turned.corners(AROUND) - AROUND.center)[:, 0].abs()
+    torch.testing.assert_close(reach, torch.full_like(reach, 0.5 * AROUND.distance))  # its height is along x
+
+
+@pytest.mark.parametrize(
+    ("text", "meters"),
+    [("85mm", 0.085), ("8.5 cm", 0.085), ("2", 2.0), ("1e-3m", 1e-3), ("10in", 0.254), ("3km", 3000)],
+)
+def test_lengths(text: str, meters: float) -> None:
+    assert parse_length(text) == pytest.approx(meters)
+
+
+@pytest.mark.parametrize("text", ["", "mm", "0", "-1", "1 mile", "1..2", "nan", "inf", "1e99"])
+def test_what_is_no_length(text: str) -> None:
+    with pytest.raises(PolarguideError, match="distance: expected a length above 0 such as 85mm"):
+        parse_length(text)
+
+
+def test_lengths_are_told_with_a_unit() -> None:
+    assert shown_length(0.5, None) == "0.5 units"
+    assert [shown_length(1.0, m) for m in (0.085, 2.0, 1500.0, 0.0042, 2e-5)] == [
+        "8.5 cm", "2 m", "1.5 km", "4.2 mm", "0.02 mm",
+    ]  # fmt: skip
+
+
+def test_white_balance_is_a_factor_on_light() -> None:
+    light = torch.rand(4, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(balanced(light, WHOLE.gains), light * torch.tensor([1.5, 1.0, 0.75]))
+    assert balanced(light, None) is light
+    assert not math.isnan(float(balanced(light, WHOLE.gains).sum()))

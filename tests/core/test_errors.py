@@ -1,0 +1,95 @@
+"""The command that adds a package fits how this copy was installed, and the Python that it runs in."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import shlex
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from polarguide.core import errors
+from polarguide.core.errors import install_extra, install_package
+
+REQUIRES = ["viser==1.1.*", "scikit-image>=0.22", "flip-evaluator>=1.6; python_version < '3.14'",
+            'mitsuba==3.9.*; extra == "synth"', "torchmetrics>=1.4; extra == 'lpips'",
+            'torchvision; extra == "lpips"', 'mitsuba==3.9.*; extra == "test"']  # fmt: skip
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Pretends that the package lies in an environment, with a ``direct_url.json`` as given (None: no such file)."""
+    monkeypatch.setattr(
+        errors, "__file__", str(tmp_path / "lib" / "python" / "polarguide" / "core" / "errors.py")
+    )
+    monkeypatch.setattr(shutil, "which", lambda name: str(Path(sys.executable).with_name(name)))
+
+    def pretend(url: str | None) -> None:
+        folder = tmp_path / "lib" / "polarguide-1.dist-info"
+        folder.mkdir(parents=True)
+        lines = [
+            "Metadata-Version: 2.1",
+            "Name: polarguide",
+            *(f"Requires-Dist: {line}" for line in REQUIRES),
+        ]
+        (folder / "METADATA").write_text("\n".join(lines))
+        if url is not None:
+            (folder / "direct_url.json").write_text(json.dumps({"url": url, "dir_info": {}}))
+        monkeypatch.setattr(importlib.metadata.Distribution, "discover", classmethod(discover))
+
+    def discover(*_: object, **__: object) -> Iterator[importlib.metadata.Distribution]:
+        return iter([importlib.metadata.PathDistribution(tmp_path / "lib" / "polarguide-1.dist-info")])
+
+    return pretend
+
+
+def sources(folder: Path) -> Path:
+    (folder / "src" / "polarguide").mkdir(parents=True)
+    (folder / "pyproject.toml").touch()
+    return folder
+
+
+def test_from_a_source_folder_the_folder_is_named(
+    installed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = sources(tmp_path / "my sources")
+    installed(folder.as_uri())
+    assert shlex.split(install_extra("synth")) == ["pip", "install", f"{folder}[synth]"]
+    monkeypatch.chdir(folder)
+    assert install_extra("synth") == "pip install '.[synth]'"
+    assert install_extra("cuda") == "pip install '.[cuda]'"
+
+
+@pytest.mark.parametrize("url", [None, "file:///removed", "https://example.org/polarguide.whl"])
+def test_without_one_the_packages_are_named(installed, url: str | None) -> None:
+    installed(url)
+    assert install_extra("synth") == "pip install 'mitsuba==3.9.*'"
+    assert install_extra("lpips") == "pip install 'torchmetrics>=1.4' torchvision"
+
+
+def test_packages_have_the_versions_that_are_required(installed) -> None:
+    installed(None)
+    assert (
+        install_package("viser")
+        == install_package("websockets.asyncio.server")
+        == "pip install 'viser==1.1.*'"
+    )
+    assert install_package("skimage.measure") == "pip install 'scikit-image>=0.22'"
+    assert install_package("flip_evaluator") == "pip install 'flip-evaluator>=1.6'"
+    assert install_package("unheard_of") == "pip install unheard-of"
+
+
+def test_the_pip_of_another_python_is_not_used(installed, monkeypatch: pytest.MonkeyPatch) -> None:
+    installed(None)
+    monkeypatch.setattr(shutil, "which", lambda name: f"/elsewhere/bin/{name}")
+    assert shlex.split(install_package("viser")) == [sys.executable, "-m", "pip", "install", "viser==1.1.*"]
+
+
+def test_a_checkout_that_was_never_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = sources(tmp_path / "checkout")
+    monkeypatch.setattr(errors, "__file__", str(folder / "src" / "polarguide" / "core" / "errors.py"))
+    assert shlex.split(install_extra("synth"))[-1] == f"{folder}[synth]"

@@ -1,0 +1,139 @@
+"""The picture of the errors: its columns, its scales, and what is gray in it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from known_scene import HEIGHT, WIDTH, known_scene, rendered
+
+from polarguide.results.evaluation import error_sheet
+from polarguide.results.evaluation.error_sheet import COLUMNS, ErrorSheet
+from polarguide.results.evaluation.target import SceneFacts, ViewTarget
+from polarguide.visualization import figures
+
+CPU = torch.device("cpu")
+
+
+def drawn(monkeypatch, tmp_path: Path, scene, *, layers=True, views=None):
+    """The tiles by row and column heading, and the scales, that a sheet of a scene is made of."""
+    seen = {}
+
+    def catch(rows, labels, columns, footer=()):
+        seen.update(rows=rows, labels=labels, columns=columns, footer=footer)
+        return np.zeros((4, 4, 3), np.uint8)
+
+    monkeypatch.setattr(error_sheet, "contact_sheet", catch)
+    facts = SceneFacts.of(scene)
+    shown = scene.views if views is None else views
+    sheet = ErrorSheet(len(shown))
+    for view in shown:
+        result, stokes, _ = rendered(view, 5)
+        if not layers:
+            result.specular = result.diffuse = stokes = None
+        sheet.add(view, ViewTarget.of_view(view, facts, CPU), result, stokes)
+    sheet.write(tmp_path / "errors.png")
+    return seen
+
+
+def test_heat_maps_have_the_colors_of_their_errors(monkeypatch, tmp_path):
+    scene = known_scene()
+    seen = drawn(monkeypatch, tmp_path, scene)
+    view = scene.views[0]
+    result, stokes, _ = rendered(view, 5)
+    tiles = dict(zip(seen["columns"], seen["rows"][0], strict=True))
+    picture = figures.error_to_rgb(result.final, view.photograph())
+    valid = ~view.invalid.numpy()
+    assert (np.abs(tiles["picture error"].astype(int) - picture)[valid] <= 1).all()
+    assert (tiles["picture error"][~valid] == error_sheet.NOT_COUNTED).all()
+    outside = ~view.ground_truth.mask.numpy()
+    for name in ("normal error", "specular error", "diffuse error", "S1, S2 error"):
+        assert (tiles[name][outside] == error_sheet.NOT_COUNTED).all(), name
+        assert len(np.unique(tiles[name][~outside], axis=0)) > 20, name
+    four = view.intensities()
+    errors = (stokes[1] - (four[0] - four[2])).abs() + (stokes[2] - (four[1] - four[3])).abs()
+    expected = figures.scalar_to_rgb(errors.mean(-1), 0, 0.2, "inferno")
+    counts = (view.ground_truth.mask & ~view.invalid & ~view.saturated).numpy()
+    assert (np.abs(tiles["S1, S2 error"].astype(int) - expected)[counts] <= 1).all()
+
+
+def test_columns_are_those_that_a_run_has(monkeypatch, tmp_path):
+    scene = known_scene()
+    whole = [name if name != "AoLP x DoLP" else "AoLP x DoLP / 0.5" for name in COLUMNS.values()]
+    assert drawn(monkeypatch, tmp_path, scene)["columns"] == whole
+    assert drawn(monkeypatch, tmp_path, scene, layers=False)["columns"] == [
+        "photograph",
+        "picture error",
+        "normal error",
+    ]
+    bare = tuple(dataclasses.replace(view, truth=None) for view in scene.views)
+    stand_in = dataclasses.replace(scene, views=bare)
+    seen = {}
+    monkeypatch.setattr(
+        error_sheet,
+        "contact_sheet",
+        lambda *given, **more: seen.update(columns=given[2]) or np.zeros((4, 4, 3), np.uint8),
+    )
+    facts, sheet = SceneFacts.of(stand_in), ErrorSheet(1)
+    result, stokes, _ = rendered(scene.views[0], 5)
+    sheet.add(bare[0], ViewTarget.of_view(bare[0], facts, CPU), result, stokes)
+    sheet.write(tmp_path / "errors.png")
+    assert seen["columns"] == [
+        "photograph",
+        "picture error",
+        "AoLP x DoLP / 0.5",
+        "predicted",
+        "S1, S2 error",
+    ]
+
+
+def test_a_key_to_its_colors_stands_below_every_column(monkeypatch, tmp_path):
+    seen = drawn(monkeypatch, tmp_path, known_scene())
+    keys = dict(zip(seen["columns"], seen["footer"], strict=True))
+    assert len(keys) == len(COLUMNS)
+    assert (keys["photograph"][:22] == error_sheet.NOT_COUNTED).all()
+    for name in ("AoLP x DoLP / 0.5", "predicted"):
+        # Full DoLP on top, none at the bottom; 0, 60 and 120 degrees are red, green and blue.
+        top = keys[name][0]
+        assert [int(top[x].argmax()) for x in (0, 85, 170, 255)] == [0, 1, 2, 0]
+        assert top.max() == 255
+        assert not keys[name][21].any()
+    for name in ("picture error", "normal error", "specular error", "diffuse error", "S1, S2 error"):
+        assert keys[name][0, -1].sum() > 600 > 60 > keys[name][0, 0].sum()
+
+
+def test_many_views_are_thinned_out(monkeypatch, tmp_path):
+    scene = known_scene()
+    views = [dataclasses.replace(scene.views[0], name=f"v{k}") for k in range(20)]
+    facts = SceneFacts.of(scene)
+    result, stokes, _ = rendered(scene.views[0], 5)
+    target = ViewTarget.of_view(scene.views[0], facts, CPU)
+    seen = {}
+    monkeypatch.setattr(
+        error_sheet,
+        "contact_sheet",
+        lambda *given, **more: seen.update(labels=given[1]) or np.zeros((4, 4, 3), np.uint8),
+    )
+    sheet = ErrorSheet(len(views))
+    for view in views:
+        sheet.add(view, target, result, stokes)
+    sheet.write(tmp_path / "errors.png")
+    assert seen["labels"] == [f"v{k}" for k in range(0, 20, 3)]
+
+
+def test_a_sheet_on_disk(tmp_path):
+    scene = known_scene()
+    facts, sheet = SceneFacts.of(scene), ErrorSheet(2)
+    sheet.write(tmp_path / "nothing.png")
+    assert not (tmp_path / "nothing.png").exists()
+    for view in scene.views:
+        result, stokes, _ = rendered(view, 5)
+        result.normal[3, 3] = torch.nan
+        sheet.add(view, ViewTarget.of_view(view, facts, CPU), result, stokes)
+    sheet.write(tmp_path / "errors.png")
+    picture = cv2.imread(str(tmp_path / "errors.png"))
+    assert picture.shape[0] > 2 * HEIGHT
+    assert picture.shape[1] > len(COLUMNS) * WIDTH

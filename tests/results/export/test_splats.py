@@ -1,0 +1,234 @@
+"""Splats as PLY, SPZ and SOG."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import math
+import zipfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from random_runs import random_state
+from scipy.spatial.transform import Rotation
+from torch.nn.functional import normalize
+
+from polarguide.gaussians.geometry import quaternions_to_rotations, shortest_axis_normals
+from polarguide.gaussians.harmonics import sh_basis
+from polarguide.gaussians.ply import read_ply, write_ply
+from polarguide.optics.color import srgb_encode
+from polarguide.results.export.splats import _half_turned, write_sog, write_spz
+from polarguide.runs.model import shown_colors, write_run_ply
+
+COUNT = 7
+FIELDS = {
+    "3dgs": {"linear_dc", "linear_rest"},
+    "3dgs-dr": {"linear_dc", "linear_rest", "strength"},
+    "ref-gs": {"linear_dc", "linear_rest", "albedo", "roughness", "feature", "surface"},
+}
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_the_file_holds_display_colors_and_the_fields_of_the_model(name: str, tmp_path: Path) -> None:
+    state, shading = random_state(name, COUNT)
+    write_run_ply(tmp_path / "run.ply", state, shading)
+    read = read_ply(tmp_path / "run.ply")
+    assert set(read["extra"]) == FIELDS[name]
+    assert all(bool(torch.isfinite(t).all()) for t in (read["sh_dc"], read["sh_rest"]))
+    for field, values in shading.fields(state.gaussians).items():
+        torch.testing.assert_close(read["extra"][field], values.detach())
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_colors_are_in_range_and_change_with_the_view(name: str) -> None:
+    state, shading = random_state(name, COUNT)
+    directions = normalize(torch.randn(5, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
+    colors = shown_colors(state, shading, directions)
+    assert colors.shape == (COUNT, 5, 3)
+    assert 0 <= float(colors.min()) <= float(colors.max()) <= 1
+    assert float(colors.std(dim=1).max()) > 1e-4
+
+
+def test_a_directional_gaussian_shows_its_albedo_and_the_light_in_its_mirror() -> None:
+    state, shading = random_state("ref-gs", COUNT)
+    gaussians, ray = state.gaussians, torch.tensor([[0.0, 0.6, 0.8]])
+    shape = (gaussians[name] for name in ("means", "quaternions", "log_scales"))
+    normals = shortest_axis_normals(*shape, torch.zeros(3))
+    facing = torch.where(normals @ ray[0][:, None] > 0, -normals, normals)
+    linear = shading.colors(gaussians, state.light, ray.expand(COUNT, 3), facing)
+    expected = srgb_encode(linear.detach().clamp(0, 1))
+    torch.testing.assert_close(shown_colors(state, shading, ray)[:, 0], expected)
+
+
+def test_normals_are_the_learned_ones_and_face_the_nearest_camera(tmp_path: Path) -> None:
+    """Read by trimesh, which takes nx, ny, nz for the normals of its vertices."""
+    trimesh = pytest.importorskip("trimesh")
+    state, shading = random_state("3dgs", 50)
+    centers = torch.tensor([[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0]])
+    write_run_ply(tmp_path / "run.ply", state, shading, centers)
+    raw = trimesh.load(tmp_path / "run.ply").metadata["_ply_raw"]["vertex"]["data"]
+    normals = torch.from_numpy(
+        np.stack([raw[name] for name in ("nx", "ny", "nz")], axis=1).astype(np.float64)
+    )
+    torch.testing.assert_close(normals.norm(dim=1), torch.ones(50, dtype=torch.float64), atol=1e-5, rtol=0)
+    means = state.gaussians["means"].detach().double()
+    rotations = Rotation.from_quat(state.gaussians["quaternions"].detach().double()[:, [1, 2, 3, 0]].numpy())
+    axes = torch.from_numpy(rotations.as_matrix())
+    shortest = axes[torch.arange(50), :, state.gaussians["log_scales"].detach().argmin(dim=1)]
+    assert bool(((normals * shortest).sum(dim=1).abs() > 0.9999).all())
+    nearest = centers.double()[(means[:, :1] < 0).long()[:, 0]]
+    assert bool(((normals * (nearest - means)).sum(dim=1) >= -1e-6).all())
+
+
+TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+
+
+def test_the_whole_scene_is_turned(tmp_path: Path) -> None:
+    generator = torch.Generator().manual_seed(1)
+    state, shading = random_state("3dgs", 7)
+    write_run_ply(tmp_path / "run.ply", state, shading)
+    ours = read_ply(tmp_path / "run.ply")
+    turned = read_ply(_half_turned(tmp_path / "run.ply"))
+    torch.testing.assert_close(turned["means"], ours["means"] @ TURN.T)
+    # Both sets of axes span the same ellipsoid.
+    ellipsoids = [
+        quaternions_to_rotations(rows["quaternions"]) * rows["log_scales"].exp()[:, None]
+        for rows in (ours, turned)
+    ]
+    expected, found = (axes @ axes.mT for axes in (TURN @ ellipsoids[0], ellipsoids[1]))
+    torch.testing.assert_close(found, expected)
+    # What is seen along a turned direction is what was seen along the direction.
+    directions = normalize(torch.randn(20, 3, generator=generator), dim=-1)
+    for rest in (ours["sh_rest"], turned["sh_rest"]):
+        assert rest.shape[1] == 15
+        assert bool((rest.abs().amax(dim=(0, 2)) > 1e-3).all()), "every harmonic takes part"
+    before = torch.einsum("dk,nkc->ndc", sh_basis(directions, 3)[:, 1:], ours["sh_rest"])
+    after = torch.einsum("dk,nkc->ndc", sh_basis(directions @ TURN.T, 3)[:, 1:], turned["sh_rest"])
+    torch.testing.assert_close(after, before, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_both_versions_are_written_and_read(tmp_path: Path, version: int) -> None:
+    forge = pytest.importorskip("gaussforge").GaussForge()
+    state, shading = random_state("3dgs", 7)
+    write_run_ply(tmp_path / "run.ply", state, shading)
+    write_spz(tmp_path / "run.spz", tmp_path / "run.ply", version)
+    data = (tmp_path / "run.spz").read_bytes()
+    head = gzip.decompress(data) if version == 3 else data
+    assert head[:4] == b"NGSP"
+    assert int.from_bytes(head[4:8], "little") == version
+    (tmp_path / "back.ply").write_bytes(forge.convert(data, "spz", "ply")["data"])
+    found, ours = read_ply(tmp_path / "back.ply"), read_ply(tmp_path / "run.ply")
+    torch.testing.assert_close(found["means"], ours["means"] @ TURN.T, atol=1 / 4096, rtol=0)
+
+
+MANY = 3000
+
+
+@pytest.fixture(scope="module")
+def ply(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Random Gaussians, some of them far away, one of them invisible."""
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    path = tmp_path_factory.mktemp("sog") / "in.ply"
+    opacity = 3 * normal(MANY)
+    opacity[0] = -30
+    write_ply(
+        path,
+        means=normal(MANY, 3) * torch.exp(2 * normal(MANY, 1)),
+        log_scales=normal(MANY, 3) - 3,
+        quaternions=normal(MANY, 4),
+        opacity_logits=opacity,
+        sh_dc=normal(MANY, 1, 3),
+        sh_rest=0.1 * normal(MANY, 15, 3),
+    )
+    return path
+
+
+def decoded(path: Path) -> dict[str, np.ndarray]:
+    """Rows [N, ...] by name, in the file's order."""
+    with zipfile.ZipFile(io.BytesIO(path.read_bytes())) as file:
+        meta = json.loads(file.read("meta.json"))
+        pictures = {
+            name: cv2.imdecode(np.frombuffer(file.read(name), np.uint8), cv2.IMREAD_UNCHANGED)
+            for name in file.namelist()
+            if name.endswith(".webp")
+        }
+    assert meta["version"] == 2
+    count = meta["count"]
+
+    def pixels(name: str) -> np.ndarray:
+        picture = pictures[name]
+        order = [2, 1, 0, 3][: picture.shape[2]]
+        return picture[..., order].reshape(-1, picture.shape[2]).astype(int)
+
+    low, high = (np.array(meta["means"][key]) for key in ("mins", "maxs"))
+    codes = pixels("means_l.webp")[:count, :3] + 256 * pixels("means_u.webp")[:count, :3]
+    logs = low + codes / 65535 * (high - low)
+    quats = pixels("quats.webp")[:count]
+    three, largest = (quats[:, :3] / 255 - 0.5) * math.sqrt(2), quats[:, 3] - 252
+    turns = np.zeros((count, 4))
+    for row, (values, place) in enumerate(zip(three, largest, strict=True)):
+        turns[row, [k for k in range(4) if k != place]] = values
+        turns[row, place] = math.sqrt(max(0.0, 1 - (values**2).sum()))
+    label = pixels("shN_labels.webp")[:count]
+    label = label[:, 0] + 256 * label[:, 1]
+    palette = np.array(meta["shN"]["codebook"])[pixels("shN_centroids.webp")[:, :3]].reshape(-1, 15, 3)
+    sh0 = pixels("sh0.webp")[:count]
+    return {
+        "means": np.sign(logs) * np.expm1(np.abs(logs)),
+        "log_scales": np.array(meta["scales"]["codebook"])[pixels("scales.webp")[:count, :3]],
+        "turns": turns,
+        "opacity": sh0[:, 3] / 255,
+        "sh_dc": np.array(meta["sh0"]["codebook"])[sh0[:, :3]],
+        "sh_rest": palette[label],
+    }
+
+
+def test_what_is_read_back_is_what_was_written(ply: Path, tmp_path: Path) -> None:
+    write_sog(tmp_path / "a.sog", ply)
+    ours, found = read_ply(ply), decoded(tmp_path / "a.sog")
+    # The order is another one: sort both by opacity and place.
+    means = ours["means"].double().numpy()
+    distance = np.linalg.norm(means[:, None] - found["means"][None], axis=2)
+    at = distance.argmin(axis=1)
+    assert len(set(at)) == MANY
+    step = 2 * (1 + np.abs(means)) * np.log1p(np.abs(means)).max() * 2 / 65535
+    assert (np.abs(found["means"][at] - means) <= step).all()
+    opacity = torch.sigmoid(ours["opacity_logits"].flatten()).numpy()
+    assert np.abs(found["opacity"][at] - opacity).max() <= 0.5 / 255 + 1e-6
+    unit = torch.nn.functional.normalize(ours["quaternions"], dim=1).numpy()
+    assert (1 - np.abs((found["turns"][at] * unit).sum(axis=1))).max() < 1e-4
+    seen = opacity > 0.002  # what cannot be seen may lose its color
+    for name, error in (("log_scales", 0.1), ("sh_dc", 0.1)):
+        expected = ours[name].reshape(MANY, -1).numpy()
+        assert np.quantile(np.abs(found[name][at] - expected)[seen], 0.99) < error, name
+    # Random harmonics are the worst case of a palette: 3,000 in 2,048 places. Many keep a place to themselves.
+    rest = ours["sh_rest"].reshape(MANY, -1).numpy()
+    errors = found["sh_rest"].reshape(MANY, -1)[at] - rest
+    assert np.sqrt(np.mean(errors**2)) < 0.8 * np.sqrt(np.mean(rest**2))
+    assert np.quantile(np.abs(errors).max(axis=1), 0.25) < 0.02
+
+
+def test_the_same_splats_make_the_same_file(ply: Path, tmp_path: Path) -> None:
+    for name in ("a.sog", "b.sog"):
+        write_sog(tmp_path / name, ply)
+    assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
+
+
+def test_few_splats_are_splats_too(tmp_path: Path) -> None:
+    rows = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "opacity_logits": ()}
+    zeros = {name: torch.ones(2, *shape) for name, shape in rows.items()}
+    write_ply(tmp_path / "in.ply", **zeros, sh_dc=torch.zeros(2, 1, 3), sh_rest=torch.zeros(2, 15, 3))
+    write_sog(tmp_path / "out.sog", tmp_path / "in.ply")
+    found = decoded(tmp_path / "out.sog")
+    assert np.allclose(found["means"], 1)
+    assert np.allclose(found["log_scales"], 1)
+    assert (found["sh_rest"] == 0).all()

@@ -1,0 +1,99 @@
+"""Regions and limits: what they take, what they refuse, and when a figure is beyond."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from polarguide.core.errors import PolarguideError
+from polarguide.shots.measurement.fields import Bound, faults, read_limits
+from polarguide.shots.measurement.regions import Region, parse_regions, placed
+
+
+def test_regions_with_and_without_names() -> None:
+    assert parse_regions(["1,2,3,4", "left lens=0,0,10,20"]) == (
+        Region("roi1", 1, 2, 3, 4),
+        Region("left lens", 0, 0, 10, 20),
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["", "1,2,3", "1,2,3,4,5", "a=1,2,3", "1,2,3,x", "=1,2,3,4", "a=1,2,0,4", "-1,2,3,4", "a\nb=1,2,3,4",
+             "1.5,2,3,4", "1,2,3,9999999999", f"{'9' * 5000},0,1,1", "٩,0,1,1"],
+)  # fmt: skip
+def test_regions_that_are_none(text: str) -> None:
+    with pytest.raises(PolarguideError, match=r"^--roi: expected "):
+        parse_regions([text])
+
+
+def test_two_regions_of_one_name() -> None:
+    with pytest.raises(PolarguideError, match="a twice"):
+        parse_regions(["a=1,2,3,4", "a=2,2,3,4"])
+
+
+def test_a_region_beyond_the_picture() -> None:
+    assert placed(parse_regions(["4,0,6,8"]), (10, 8), Path("a.png"))
+    with pytest.raises(
+        PolarguideError, match=r"a.png: expected the region roi1 within 10x8 pixels, found 5,0,6,8"
+    ):
+        placed(parse_regions(["5,0,6,8"]), (10, 8), Path("a.png"))
+    assert placed((), (10, 8), Path("a.png")) == (Region("all", 0, 0, 10, 8),)
+
+
+def written(path: Path, content: object) -> Path:
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_a_regions_limits_take_the_place_of_those_for_all(tmp_path: Path) -> None:
+    content = {
+        "limits": {"dolp_mean": {"max": 0.3}, "saturated": {"max": 0}},
+        "regions": {"lens": {"dolp_mean": {"min": 0.1}}},
+    }
+    limits = read_limits(written(tmp_path / "l.json", content), ["lens", "rim"], reference=False)
+    assert limits.of("rim") == {"dolp_mean": Bound(max=0.3), "saturated": Bound(max=0)}
+    assert limits.of("lens") == {"dolp_mean": Bound(min=0.1), "saturated": Bound(max=0)}
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({"limits": {"dolp_maen": {"max": 1}}}, "found dolp_maen. Perhaps dolp_mean"),
+        ({"limits": {"shot": {"max": 1}}}, "a field of the table"),
+        ({"limits": {"dolp_mean": {"maximum": 1}}}, "found maximum"),
+        ({"limits": {"dolp_mean": {"max": "1"}}}, "number"),
+        ({"limits": {"dolp_mean": {}}}, "min, max or both"),
+        ({"limits": {"dolp_mean": {"min": 2, "max": 1}}}, "a min up to the max"),
+        ({"limits": {"aolp_mean": {"min": -400, "max": 900}}}, "angles from 0 to 180"),
+        ({"limits": {"s0_difference": {"max": 1}}}, "--reference"),
+        ({"regions": {"nose": {"dolp_mean": {"max": 1}}}}, "found nose"),
+        ({"bounds": {}}, "found bounds"),
+        ({"format": 2, "limits": {"dolp_mean": {"max": 1}}}, "format"),
+        ({}, "at least one field"),
+        ([], "object"),
+    ],
+)  # fmt: skip
+def test_limits_that_are_wrong(content: object, said: str, tmp_path: Path) -> None:
+    path = written(tmp_path / "l.json", content)
+    with pytest.raises(PolarguideError) as raised:
+        read_limits(path, ["lens"], reference=False)
+    assert said in str(raised.value)
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_what_is_beyond() -> None:
+    bounds = {"dolp_mean": Bound(0.1, 0.3)}
+    assert faults({"dolp_mean": 0.1}, bounds) == faults({"dolp_mean": 0.3}, bounds) == []
+    assert faults({"dolp_mean": 0.31}, bounds) == ["dolp_mean 0.31 over 0.3"]
+    assert faults({"dolp_mean": 0.05}, bounds) == ["dolp_mean 0.05 under 0.1"]
+    assert faults({"dolp_mean": None}, bounds) == ["dolp_mean has no value"]
+
+
+def test_angles_may_go_through_180() -> None:
+    bounds = {"aolp_mean": Bound(170, 10)}
+    assert [bool(faults({"aolp_mean": a}, bounds)) for a in (0, 10, 11, 90, 169, 170, 179.9)] == [
+        False, False, True, True, True, False, False,
+    ]  # fmt: skip
