@@ -1,14 +1,16 @@
 """Random input for every binding of the native module: right shapes and wrong ones, huge and not finite numbers.
 
-Wrong input has to raise ``ValueError`` or ``TypeError``; the rest has to run. Under sanitizers a fault ends the program.
+Wrong input has to raise ``ValueError`` or ``TypeError``, the rest has to run; sanitizers end the program at a fault.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import random
 from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,6 +44,34 @@ class Draw(random.Random):
         """What is given, or nothing."""
         return None if self.random() < 0.3 else given
 
+    def arguments(self, text: str, sizes: Mapping[str, int], values: Mapping[str, Any]) -> list[Any]:
+        """What a text lists: values by name, and arrays by their sides; ``?`` before those that may be missing."""
+        known = {**sizes, "q": 15, "3": 3, "4": 4, "6": 6}
+        made = []
+        for word in text.split():
+            given = values[word] if word in values else self(*(known[side] for side in word.strip("?")))
+            made.append(self.maybe(given) if "?" in word else given)
+        return made
+
+
+# A row: the functions of a binding, each with its arguments; what the letters in them may be. "q" is 15.
+ROWS: tuple[tuple[dict[str, str], dict[str, Sequence[int]], dict[str, Sequence[Any]]], ...] = (
+    ({"photometric": "hw3 hw3 ?hw COUNT WEIGHT ?hw3"}, {"h": SIZES, "w": SIZES},
+     {"COUNT": (0.0, 1.0, 17.0, 1105.0), "WEIGHT": (0.2,)}),
+    ({"cubemap_forward": "6ssc n3 nc", "cubemap_backward": "6ssc n3 nc ?6ssc ?n3"},
+     {"s": (0, 1, 2, 8, 33), "c": (0, 1, 3, 16), "n": MANY}, {}),
+    ({"harmonics_forward": "DEGREE n3 3 n3 nq3 n3", "harmonics_backward": "DEGREE n3 3 n3 nq3 n3 ?n3 n3 ?nq3"},
+     {"n": MANY}, {"DEGREE": range(-1, 5)}),
+    ({"axes_forward": "n3 n4 n3 3 ?n3 GRAZING n3", "axes_backward": "n3 n4 n3 3 ?n3 GRAZING n3 n4",
+      "mirrored_forward": "n3 3 n3 n3"}, {"n": MANY}, {"GRAZING": (0.0, 0.3, NAN)}),
+    ({"shortest_sum": "n3 n", "shortest_gradient": "n3 n SCALE n3"}, {"n": MANY}, {"SCALE": (1.0, NAN)}),
+    ({"gbuffer_split": "nd n n3 ?n", "gbuffer_join": "n ?n ?nd ?n3 ?n nd ?n"}, {"n": MANY, "d": range(5, 13)}, {}),
+    ({"polarization": "n3 n3 33 n3 n3 ?n6 kn3 k3 ?n NOISE INDEX ?n n3 n3 n3 ?n6"},
+     {"n": MANY, "k": (0, 1, 2, 3, 4, 9)},
+     {"NOISE": (0.1, 0.0, NAN, 3e38), "INDEX": (1.5, 1.5, 1.0, -1.0, 1e30, np.inf, NAN)}),
+    ({"direction": "n3 n3 ?n NOISE FLAG n3"}, {"n": MANY}, {"NOISE": (0.1, 0.0, NAN), "FLAG": (True, False)}),
+)  # fmt: skip
+
 
 def rasterizer(draw: Draw) -> None:
     n, d, h, w = draw.choice(SIZES), draw.randint(1, 12), draw.choice(SIZES), draw.choice(SIZES)
@@ -67,20 +97,6 @@ def rasterizer(draw: Draw) -> None:
     made.backward(*inputs, out, draw(h, w, d), draw(h, w), *gradients, draw.maybe(draw(m, 2)))
 
 
-def photometric(draw: Draw) -> None:
-    h, w = draw.choice(SIZES), draw.choice(SIZES)
-    given = draw(h, w, 3), draw(h, w, 3), draw.maybe(draw(h, w))
-    _native.photometric(*given, draw.choice((0.0, 1.0, h * w)), 0.2, draw.maybe(draw(h, w, 3)))
-
-
-def cubemap(draw: Draw) -> None:
-    side, c, n = draw.choice((0, 1, 2, 8, 33)), draw.choice((0, 1, 3, 16)), draw.choice(MANY)
-    texture, directions = draw(6, side, side, c), draw(n, 3)
-    _native.cubemap_forward(texture, directions, draw(n, c))
-    gradients = draw.maybe(draw(6, side, side, c)), draw.maybe(draw(n, 3))
-    _native.cubemap_backward(texture, directions, draw(n, c), *gradients)
-
-
 def reflect(draw: Draw) -> None:
     n, d, local = draw.choice(MANY), draw.randint(5, 12), draw.random() < 0.5
     features, rays, three = draw(n, d), draw(n, 3), [draw(n, 3) for _ in range(7)]
@@ -95,23 +111,6 @@ def reflect(draw: Draw) -> None:
     by_look_up = three[5], draw.maybe(three[6])
     _native.reflect_backward_layers(features, rays, three[0], *model, *layers, *by_look_up, draw(n, d))
     _native.reflect_backward_directions(features, rays, three[0], draw(n, d))
-
-
-def harmonics(draw: Draw) -> None:
-    n, degree = draw.choice(MANY), draw.randint(-1, 4)
-    given = draw(n, 3), draw(3), draw(n, 3), draw(n, 15, 3)
-    _native.harmonics_forward(degree, *given, draw(n, 3))
-    gradients = draw(n, 3), draw.maybe(draw(n, 3)), draw(n, 3), draw.maybe(draw(n, 15, 3))
-    _native.harmonics_backward(degree, *given, *gradients)
-
-
-def axes(draw: Draw) -> None:
-    n = draw.choice(MANY)
-    given = draw(n, 3), draw(n, 4), draw(n, 3), draw(3), draw.maybe(draw(n, 3))
-    grazing = draw.choice((0.0, 0.3, NAN))
-    _native.axes_forward(*given, grazing, draw(n, 3))
-    _native.axes_backward(*given, grazing, draw(n, 3), draw(n, 4))
-    _native.mirrored_forward(given[0], given[3], draw(n, 3), draw(n, 3))
 
 
 def splatting(draw: Draw) -> None:
@@ -132,33 +131,8 @@ def splatting(draw: Draw) -> None:
     made.backward(*results, mirrored, *by, *to)
 
 
-def shortest(draw: Draw) -> None:
-    n = draw.choice(MANY)
-    given = draw(n, 3), draw(n)
-    _native.shortest_sum(*given)
-    _native.shortest_gradient(*given, draw.choice((1.0, NAN)), draw(n, 3))
-
-
 def finite(draw: Draw) -> None:
     _native.first_not_finite(draw(*(draw.choice(SIZES) for _ in range(draw.randint(0, 3)))))
-
-
-def gbuffer(draw: Draw) -> None:
-    n, d = draw.choice(MANY), draw.randint(5, 12)
-    _native.gbuffer_split(draw(n, d), draw(n), draw(n, 3), draw.maybe(draw(n)))
-    given = [draw.maybe(draw(*shape)) for shape in ((n,), (n, d), (n, 3), (n,), (n,))]
-    _native.gbuffer_join(draw(n), *given[:4], draw(n, d), given[4])
-
-
-def polarization(draw: Draw) -> None:
-    n, k = draw.choice(MANY), draw.choice((0, 1, 2, 3, 4, 9))
-    normal, rays, specular, diffuse = (draw(n, 3) for _ in range(4))
-    metal, weight = draw.maybe(draw(n, 6)), draw.maybe(draw(n))
-    layers = specular, diffuse, metal, draw(k, n, 3), draw(k, 3), weight
-    numbers = draw.choice((0.1, 0.0, NAN, 3e38)), draw.choice((1.5, 1.5, 1.0, -1.0, 1e30, np.inf, NAN))
-    gradients = [draw(n, 3) for _ in range(3)]
-    to = draw.maybe(draw(n)), *gradients, draw.maybe(draw(n, 6))
-    _native.polarization(normal, rays, draw(3, 3), *layers, *numbers, *to)
 
 
 def metal(draw: Draw) -> None:
@@ -188,12 +162,6 @@ def mips(draw: Draw) -> None:
     _native.mips_backward(*given, draw(n, c), flat, draw(n, 3), draw(n))
 
 
-def direction(draw: Draw) -> None:
-    n = draw.choice(MANY)
-    given = draw(n, 3), draw(n, 3), draw.maybe(draw(n))
-    _native.direction(*given, draw.choice((0.1, 0.0, NAN)), draw.random() < 0.5, draw(n, 3))
-
-
 def consistency(draw: Draw) -> None:
     h, w = draw.choice((2, 3, 5, 16, 17, 70)), draw.choice((2, 3, 5, 16, 17, 70))
     n = h * w if draw.random() < 0.95 else draw.choice(SIZES)
@@ -201,10 +169,21 @@ def consistency(draw: Draw) -> None:
     _native.consistency(*given, draw.choice((0.1, NAN)), draw(n, 3), draw(h, w))
 
 
-KINDS = (
-    rasterizer, photometric, cubemap, reflect, harmonics, axes, finite, gbuffer, polarization, direction,
-    consistency, metal, mips, splatting, shortest,
-)  # fmt: skip
+KINDS = (rasterizer, reflect, splatting, finite, metal, mips, consistency)
+
+
+def _call(draw: Draw, name: str, *of_row: Any) -> None:
+    getattr(_native, name)(*draw.arguments(*of_row))
+
+
+def calls(draw: Draw) -> Iterator[tuple[str, Callable[[], object]]]:
+    """All calls of a round."""
+    yield from ((kind.__name__, functools.partial(kind, draw)) for kind in KINDS)
+    for functions, letters, words in ROWS:
+        sizes = {letter: draw.choice(given) for letter, given in letters.items()}
+        values = {word: draw.choice(given) for word, given in words.items()}
+        for name, text in functions.items():
+            yield name, functools.partial(_call, draw, name, text, sizes, values)
 
 
 def instruction_sets() -> list[str]:
@@ -229,13 +208,13 @@ def main() -> None:
     for number in range(asked.rounds):
         _native.select_simd(sets[number % len(sets)])
         _native.set_thread_count((1, 2, 3)[number // len(sets) % 3])
-        for kind in KINDS:
+        for name, call in calls(Draw(f"{asked.seed} {number}")):
             try:
-                kind(Draw(f"{asked.seed} {number} {kind.__name__}"))
-                ran[kind.__name__] += 1
+                call()
+                ran[name] += 1
             except (ValueError, TypeError):
-                refused[kind.__name__] += 1
-    idle = [kind.__name__ for kind in KINDS if not ran[kind.__name__]]
+                refused[name] += 1
+    idle = sorted(refused.keys() - ran.keys())
     assert not idle, f"never ran: {idle}"
     print(f"bindings: {ran.total()} calls ran, {refused.total()} were refused, with {', '.join(sets)}")
 

@@ -23,7 +23,6 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from case import Case
 
@@ -33,12 +32,13 @@ WALL_SECONDS = 120
 MOST_HANGS = 3
 """What makes so many cases hang makes all hang: the rest would take hours."""
 LARGEST_MIB = 2560
-PR_SET_CHILD_SUBREAPER = 36
 PRINTED = 1 << 20
 """Bytes of a child's output that are looked at."""
 TRACEBACK = 70
+PR_SET_CHILD_SUBREAPER = 36
 ERROR = re.compile(
-    r"^error: (?P<where>.+?): expected (?P<expected>.+), found (?P<found>.*?)\. .+\.$", re.MULTILINE | re.DOTALL
+    r"^error: (?P<where>.+?): expected (?P<expected>.+), found (?P<found>.*?)\. .+\.$",
+    re.MULTILINE | re.DOTALL,
 )
 USAGE = "─"  # the frame that the parser of the command line draws around what it does not understand
 
@@ -82,8 +82,6 @@ def start(act: Callable[[], int | None], said: Path) -> Child:
         faulthandler.register(signal.SIGUSR1, file=printed)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         status = act() or 0
-    except SystemExit as ended:  # of the parser of the command line
-        status = ended.code if isinstance(ended.code, int) else int(bool(ended.code))
     except BaseException:
         traceback.print_exc()
     finally:
@@ -108,16 +106,22 @@ def ended(child: Child, seconds: float = WALL_SECONDS) -> Ended | None:
         time.sleep(0.2)  # for the traceback
         os.killpg(child.pid, signal.SIGKILL)
     pid, status, usage = os.wait4(child.pid, os.WNOHANG)
+    if not pid and took > seconds + 30:
+        raise TimeoutError(f"process {child.pid} does not end though it was killed: {_tail(child.said)}")
     if not pid:
-        if took > seconds + 30:
-            raise TimeoutError(f"process {child.pid} does not end though it was killed: {_tail(child.said)}")
         return None
     with contextlib.suppress(OSError):
         os.killpg(child.pid, signal.SIGKILL)
-    code = os.waitstatus_to_exitcode(status)
-    return Ended(
-        code, _tail(child.said), child.late, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024
-    )
+    code, used = os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime
+    return Ended(code, _tail(child.said), child.late, used, usage.ru_maxrss / 1024)
+
+
+def run(act: Callable[[], int | None], said: Path, seconds: float = WALL_SECONDS) -> Ended:
+    """Do something in a child, and wait for it."""
+    child = start(act, said)
+    while (done := ended(child, seconds)) is None:
+        time.sleep(0.005)
+    return done
 
 
 def adopt() -> None:
@@ -126,23 +130,13 @@ def adopt() -> None:
         ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
-def end_orphans(running: Iterable[int]) -> None:
+def _end_orphans(running: Iterable[int]) -> None:
     """Kill what has been taken over."""
     with contextlib.suppress(OSError):
         children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
         for pid in set(map(int, children)) - set(running):
             os.kill(pid, signal.SIGKILL)
             os.waitpid(pid, 0)
-
-
-def run(act: Callable[[], int | None], said: Path, seconds: float = WALL_SECONDS) -> Ended:
-    """Do something in a child, and wait for it."""
-    child = start(act, said)
-    while True:
-        done = ended(child, seconds)
-        if done is not None:
-            return done
-        time.sleep(0.005)
 
 
 def _tail(path: Path) -> str:
@@ -158,17 +152,13 @@ def _tail(path: Path) -> str:
 class Outcome:
     """How a case ended.
 
-    Attributes:
-        kind: "error" (one line that names what is wrong and what to do), "warning", "accepted" (as listed), or a fault:
-            "silent", "traceback", "crash", "hang", "large", "outside", "unclear".
-        text: the last of what it printed. seconds, mebibytes: processor time and peak memory.
+    ``kind``: "error" (one line that names what is wrong and what to do), "warning", "accepted" (as listed), or a fault:
+    "silent", "traceback", "crash", "hang", "large", "outside", "unclear".
     """
 
     case: Case
     kind: str
-    text: str
-    seconds: float
-    mebibytes: float
+    done: Ended
 
     @property
     def is_fault(self) -> bool:
@@ -176,19 +166,17 @@ class Outcome:
         return self.kind not in ("error", "warning", "accepted")
 
     def __str__(self) -> str:
-        figures = f"{self.seconds:.1f} s {self.mebibytes:.0f} MiB"
-        return f"{self.kind}: {self.case.name} (seed {self.case.seed}) {figures}\n{self.text.strip()[-1500:]}"
+        figures = f"{self.done.seconds:.1f} s {self.done.mebibytes:.0f} MiB"
+        return f"{self.kind}: {self.case.name} (seed {self.case.seed}) {figures}\n{self.done.text.strip()[-1500:]}"
 
 
 def outcomes(cases: Iterable[Case], base: Path, work: Path, at_once: int = 2) -> Iterator[Outcome]:
     """Run cases, some at once; outcomes come in the order in which they end, and no more after ``MOST_HANGS``."""
     running: list[tuple[Case, Path, Child, str]] = []
-    waiting = enumerate(cases)
-    hangs = 0
+    waiting, hangs = enumerate(cases), 0
     while True:
         while len(running) < at_once and hangs < MOST_HANGS and (following := next(waiting, None)):
-            number, case = following
-            folder = work / f"{number}"
+            folder, case = work / f"{following[0]}", following[1]
             canary = _canary(folder)
             running.append((case, folder, start(_act(case, base, folder), folder / "said"), canary))
         if not running:
@@ -198,8 +186,8 @@ def outcomes(cases: Iterable[Case], base: Path, work: Path, at_once: int = 2) ->
             done = ended(child)
             if done is not None:
                 running.remove(entry)
-                end_orphans(child.pid for _, _, child, _ in running)
-                outcome = _outcome(case, done, _digest(folder) == canary)
+                _end_orphans(child.pid for _, _, child, _ in running)
+                outcome = Outcome(case, _kind(case, done, _digest(folder) == canary), done)
                 hangs += outcome.kind == "hang"
                 yield outcome
                 shutil.rmtree(folder, ignore_errors=True)
@@ -233,11 +221,10 @@ def _act(case: Case, base: Path, folder: Path) -> Callable[[], int]:
         case.change()
         resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS + 5))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        app: Any = importlib.import_module("polarguide.cli.app")
         try:
-            status = app.run(case.words)
-        except SystemExit as ended:
-            status = ended.code if isinstance(ended.code, int) else int(bool(ended.code))
+            status = importlib.import_module("polarguide.cli.app").run(case.words)
+        except SystemExit as ended:  # of the parser of the command line
+            status = ended.code if isinstance(ended.code, int) else bool(ended.code)
         if case.check is not None:
             case.check()
         return int(status)
@@ -245,33 +232,26 @@ def _act(case: Case, base: Path, folder: Path) -> Callable[[], int]:
     return act
 
 
-def _outcome(case: Case, done: Ended, inside: bool) -> Outcome:
+def _kind(case: Case, done: Ended, inside: bool) -> str:
+    """How a case ended; see ``Outcome``."""
     if not inside:
-        kind = "outside"
-    elif done.late or done.status in (-signal.SIGXCPU, -signal.SIGKILL):
-        kind = "hang"
-    elif done.status < 0:
-        kind = "crash"
-    elif done.status == TRACEBACK or "Traceback (most recent call last)" in done.text:
-        kind = "traceback"
-    elif done.mebibytes > LARGEST_MIB:
-        kind = "large"
-    elif done.status:
-        is_one = done.status == 2 and (ERROR.search(done.text) or USAGE in done.text)
-        kind = "error" if is_one else "unclear"
-    elif "warning: " in done.text:
-        kind = "warning"
-    else:
-        kind = "accepted" if case.passes else "silent"
-    if kind in ("error", "warning", "accepted") and not _as_told(case, done.text):
-        kind = "unclear"
-    return Outcome(case, kind, done.text, done.seconds, done.mebibytes)
-
-
-def _as_told(case: Case, text: str) -> bool:
-    """Whether the fields of the error, the warning, and all that was printed are those of the table."""
-    error = ERROR.search(text)
+        return "outside"
+    if done.late or done.status in (-signal.SIGXCPU, -signal.SIGKILL):
+        return "hang"
+    if done.status < 0:
+        return "crash"
+    if done.status == TRACEBACK or "Traceback (most recent call last)" in done.text:
+        return "traceback"
+    if done.mebibytes > LARGEST_MIB:
+        return "large"
+    error = ERROR.search(done.text)
     fields = error.groupdict() if error else {}
     patterns = [(getattr(case, name), fields.get(name, "")) for name in ("where", "expected", "found")]
-    patterns += [(case.warning and f"warning: .*{case.warning}", text), (case.prints, text)]
-    return all(re.search(pattern, given, re.DOTALL) for pattern, given in patterns)
+    patterns += [(case.warning and f"warning: .*{case.warning}", done.text), (case.prints, done.text)]
+    if done.status not in (0, 2) or not all(re.search(given, text, re.DOTALL) for given, text in patterns):
+        return "unclear"
+    if done.status == 2:
+        return "error" if error or USAGE in done.text else "unclear"
+    if "warning: " in done.text:
+        return "warning"
+    return "accepted" if case.passes else "silent"

@@ -8,6 +8,7 @@ right to mount: root, or namespaces of users.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import ctypes
 import hashlib
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from base import EVAL, INSPECT, MOSAICS, ONE, READ, export
+from changes import field
 from forked import ERROR, Ended, run
 from random_runs import ring
 from tiny_capture import NAMES
@@ -78,8 +80,14 @@ WRITERS = (
     Writer("inspect", INSPECT, (0.6,)),
     Writer("inspect --fix", _fix, (0.6,)),
     Writer("share", "share run --out new/page.html", (0.6,)),
-    *(Writer(f"export {kind}", export(kind), (0.6,)) for kind in ("ply", "spz", "sog", "environment", "cameras")),
-    *(Writer(f"export {kind}", SURFACE.format(kind), (0.6,) if kind == "mesh" else ()) for kind in ("mesh", "points")),
+    *(
+        Writer(f"export {kind}", export(kind), (0.6,))
+        for kind in ("ply", "spz", "sog", "environment", "cameras")
+    ),
+    *(
+        Writer(f"export {kind}", SURFACE.format(kind), (0.6,) if kind == "mesh" else ())
+        for kind in ("mesh", "points")
+    ),
     Writer("compare", f"compare scene --recipes 3dgs polarguide {STEPS} --out new"),
     Writer("synth", "synth proof --out new --size 16x16 --samples 1"),
     Writer("bench", "bench --out new", once=True),
@@ -103,7 +111,7 @@ def own_mounts() -> bool:
 
 def _make_round(base: Path) -> None:
     """A run with a surface: opaque Gaussians about the origin, in a scene whose cameras stand around it."""
-    safetensors = importlib.import_module("safetensors.torch")
+    files = importlib.import_module("safetensors.torch")
     rotation = importlib.import_module("scipy.spatial.transform").Rotation
     torch = importlib.import_module("torch")
     shutil.copytree(base / "scene", base / "circle")
@@ -114,14 +122,14 @@ def _make_round(base: Path) -> None:
         rows.append(f"{numbers} {name}.png\n\n")
     (base / "circle/sparse/0/images.txt").write_text("".join(rows))
     shutil.copytree(base / "run", base / "round")
-    record = json.loads((base / "round/run.json").read_text())
-    (base / "round/run.json").write_text(json.dumps({**record, "scene": str(base / "circle")}))
-    tensors = safetensors.load_file(base / "round/checkpoint.safetensors")
-    count = len(tensors["gaussians.means"])
-    tensors["gaussians.means"] = 0.4 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    os.chdir(base)
+    field("round/run.json", "scene", to=str(base / "circle"))()
+    tensors = files.load_file("round/checkpoint.safetensors")
+    generator = torch.Generator().manual_seed(0)
+    tensors["gaussians.means"] = 0.4 * torch.randn(tensors["gaussians.means"].shape, generator=generator)
     tensors["gaussians.log_scales"].fill_(-1.5)
     tensors["gaussians.opacity_logits"].fill_(6.0)
-    safetensors.save_file(tensors, base / "round/checkpoint.safetensors")
+    files.save_file(tensors, "round/checkpoint.safetensors")
 
 
 def _digests(folder: Path) -> dict[str, str]:
@@ -133,25 +141,20 @@ def _digests(folder: Path) -> dict[str, str]:
     }
 
 
+WHOLE: dict[str, Callable[[Path], object]] = {
+    ".json": lambda path: json.loads(path.read_text()) is not None,
+    ".safetensors": lambda path: importlib.import_module("safetensors.numpy").load_file(path),
+    ".npz": lambda path: zipfile.ZipFile(path).testzip() is None,
+    ".html": lambda path: path.read_text().rstrip().endswith("</html>"),
+    ".jsonl": lambda path: True,  # a line that is cut short is passed over
+}
+"""Whether a file that is neither as before nor as in the end can be read to its end."""
+
+
 def _is_whole(path: Path) -> bool:
-    """Whether a file that is neither as before nor as in the end can be read to its end."""
-    try:
-        if path.suffix == ".json":
-            json.loads(path.read_text())
-        elif path.suffix == ".safetensors":
-            importlib.import_module("safetensors.numpy").load_file(path)
-        elif path.suffix == ".npz":
-            with zipfile.ZipFile(path) as file:
-                return file.testzip() is None
-        elif path.suffix == ".html":
-            return path.read_text().rstrip().endswith("</html>")
-        elif path.suffix == ".jsonl":  # a line that is cut short is passed over
-            return True
-        else:
-            return path.name in VARYING and path.stat().st_size > 0
-    except Exception:
-        return False
-    return True
+    with contextlib.suppress(Exception):
+        return bool(WHOLE[path.suffix](path))
+    return path.suffix not in WHOLE and path.name in VARYING and path.stat().st_size > 0
 
 
 class Disk:
@@ -198,7 +201,7 @@ class Disk:
         return run(act, self.said, SECONDS)
 
 
-def full_disks(base: Path, place: Path, ci: bool, only: str = "") -> Iterator[tuple[str, list[str]]]:
+def full_disks(base: Path, place: Path, asked: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
     """Every command with every share of its room: the name of each, and what was wrong."""
     made = run(lambda: _make_round(base), base.parent / "said")
     assert made.status == 0, made.text
@@ -207,8 +210,8 @@ def full_disks(base: Path, place: Path, ci: bool, only: str = "") -> Iterator[tu
         return
     try:
         for writer in WRITERS:
-            shares = writer.ci if ci else (0.0,) if writer.once else SHARES
-            if not shares or only not in f"disk {writer.name}":
+            shares = writer.ci if asked.ci else (0.0,) if writer.once else SHARES
+            if not shares or asked.only not in f"disk {writer.name}":
                 continue
             before = disk.begin()
             room = disk.used()
@@ -233,7 +236,11 @@ def _faults(
     done = disk.run(writer)
     assert disk.mount(LARGE)
     found = []
-    if done.status not in (0, 2) or (done.status == 2 and not ERROR.search(done.text)) or "Traceback" in done.text:
+    if (
+        done.status not in (0, 2)
+        or (done.status == 2 and not ERROR.search(done.text))
+        or "Traceback" in done.text
+    ):
         found.append(f"status {done.status}{', too late' * done.late}: {done.text[-1500:]}")
     after = _digests(case)
     missing = sorted(expected.keys() - after.keys())
@@ -256,5 +263,3 @@ def _faults(
     if wrong:
         found.append(f"repeated: other bytes in {wrong[:6]}")
     return found
-
-

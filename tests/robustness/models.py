@@ -68,7 +68,6 @@ CASES += table(
     "cameras.txt", TRAIN,
     Case("empty", _cameras(), expected=r"a complete COLMAP cameras\.txt", found="an empty file", ci=True),
     Case("of one number twice", edit(CAMERAS, lambda line: line + line.replace("30 30", "90 90")), ci=True),
-    Case("of too few numbers", _cameras(" 30 12 10", ""), ci=True),
     Case("of an unknown model", _cameras("PINHOLE", "MAGIC"), ci=True),
     Case("of strong distortion", write(CAMERAS, f"1 SIMPLE_RADIAL {WIDTH} {HEIGHT} 30 12 10 0.7\n")),
     Case("of no pixels", _cameras("24 20", "0 0"), ci=True),
@@ -90,10 +89,10 @@ def _images(*changes: str) -> Change:
 
 CASES += table(
     "images.txt", TRAIN,
-    *(Case(f"of a camera at {x}", _images(" -0.4 ", f" {x} "), ci=x == "1e30") for x in ("1e30", "-1e300", "nan")),
+    *(Case(f"of a camera at {x}", _images(" -0.4 ", f" {x} "), ci=x == "1e30") for x in ("1e30", "nan")),
     Case("of a quaternion of 1e200", _images("1 1 0 0 0", "1 1e200 1e200 0 0"), ci=True,
          prints=r"\A(?!.*RuntimeWarning)"),
-    Case("of an image of camera 99", _images(" 1 v003.png", " 99 v003.png"), ci=True),
+    Case("that is a link to nothing", put(IMAGES, "dangling")),
     Case("of all cameras in one place", edit(IMAGES, _together), ci=True),
 )  # fmt: skip
 
@@ -116,7 +115,10 @@ def _model(cameras: Any = (CAMERA,), points: Any = PLACES, **of_second: Any) -> 
 
     def change() -> None:
         fields = ("number", "pose", "camera", "name", "points")
-        images = [[k + 1, (*POSE[:4], 0.1 * k - 0.4, 0.05 * (k % 3), 2.5), 1, b"v00%d.png" % k, []] for k in range(9)]
+        images = [
+            [k + 1, (*POSE[:4], 0.1 * k - 0.4, 0.05 * (k % 3), 2.5), 1, b"v00%d.png" % k, []]
+            for k in range(9)
+        ]
         for key, value in of_second.items():
             images[1][fields.index(key)] = value
         remove(CAMERAS, IMAGES, POINTS)()
@@ -139,15 +141,11 @@ def _rigs(frames: bytes, rig: bytes = RIG) -> Change:
 CASES += table(
     "model of", TRAIN,
     Case("a model 1000", _model([(1, 1000, *CAMERA[2:])]), ci=True),
-    Case("a rotation of length 0", _model(pose=(0.0, *POSE[1:])), ci=True),
-    Case("a negative focal length", _model([(*CAMERA[:4], [-30.0, 30, 12, 10])]), ci=True),
+    Case("a name that is no UTF-8", _model(name=b"\xff\xfe.png")),
+    Case("a name twice", _model(name=b"sub/v000.jpg")),
     Case("a name that leaves", _model(name=b"../../../outside/victim.png"), passes=UNSEEN, ci=True),
-    Case("a point twice", _model(points=[*PLACES, PLACES[0]]), passes=UNSEEN),
-    Case("a point that is no number", _model(points=[(7, (float("nan"), 0, 0), [])])),
     Case("one point", _model(points=PLACES[:1]), passes="one point is enough to begin with"),
     Case("a frame of no such image", _rigs(COUNT + FRAME[:-8] + struct.pack("<Q", 999)), ci=True),
-    Case("a frame twice", _rigs(struct.pack("<Q", 2) + FRAME + FRAME)),
-    Case("a rig without a sensor", _rigs(COUNT + FRAME, struct.pack("<QII", 1, 1, 0))),
 )  # fmt: skip
 
 

@@ -27,7 +27,9 @@ MASKED = f"{TRAIN} --background masked"
 ANIMATED = "an animated PNG file"
 
 for how in spoil.BYTES:
-    CASES.append(Case(f"{PICTURE} {how}", spoil.bytes_of(PICTURE, how), READ, passes=CHECKED, seeds=2, ci=True))
+    CASES.append(
+        Case(f"{PICTURE} {how}", spoil.bytes_of(PICTURE, how), READ, passes=CHECKED, seeds=2, ci=True)
+    )
     file = "scene/masks/v002.png" if how in ("cut", "fill") else "scene/invalid/v001.png"
     CASES.append(Case(f"{file} {how}", spoil.bytes_of(file, how), READ, passes=CHECKED, seeds=2))
 CASES += [Case(f"{PICTURE} is a {how}", put(PICTURE, how), READ, ci=True) for how in OF_FILES]
@@ -44,40 +46,22 @@ CASES += [
         for how in spoil.PICTURES)),
     *(Case(f"{file} {how}", spoil.picture(f"scene/{file}", how), READ, passes=of_masks.get(how, ""), ci=how == "wide")
       for file in ("masks/v002.png", "invalid/v001.png") for how in ("wide", "floats", "black")),
-    Case("picture fill, inspected", spoil.bytes_of("scene/polar/v004_090.png", "fill"), INSPECT, passes=CHECKED, seeds=4),
+    Case("picture fill, inspected", spoil.bytes_of(PICTURE, "fill"), INSPECT, passes=CHECKED, seeds=4),
 ]  # fmt: skip
 
 
-def _tags(*changed: made.Tag) -> Change:
-    """A gray TIFF file with other tags."""
-    table = {tag[0]: tag for tag in (*made.gray_tags(WIDTH, HEIGHT, 2 * WIDTH * HEIGHT), *changed)}
-    return instead(".tif", made.tiff, [table[key] for key in sorted(table)])
-
-
-def big_tiff(path: Path, side: int) -> None:
-    """A BigTIFF of a few bytes that says how large it is."""
-    tags = [(256, 4, side), (257, 4, side), (258, 3, 16), (259, 3, 1), (262, 3, 1), (273, 16, 16), (277, 3, 1),
-            (278, 4, side), (279, 16, 64)]  # fmt: skip
-    data = struct.pack("<2sHHHQQ", b"II", 43, 8, 0, 16, len(tags))
-    data += b"".join(struct.pack("<HHQQ", tag, kind, 1, value) for tag, kind, value in tags)
-    path.write_bytes(data + bytes(72))
-
-huge = 0xFFFFFFFF
 CASES += table(
     "picture TIFF", READ,
     Case("of signed sizes", instead(".tif", made.deflated_tiff, 30000, kind=9), ci=True),
     Case("of two sizes", instead(".tif", made.deflated_tiff, 30000, twice=WIDTH), ci=True),
-    Case("of 64-bit numbers", _tags((258, 3, 1, 64), (339, 3, 1, 3)), ci=True),
-    Case("of 4 billion strips", _tags((273, 4, huge, 8), (279, 4, huge, 8)), ci=True),
-    Case("as BigTIFF", instead(".tif", big_tiff, 12000), ci=True),
 )  # fmt: skip
 
 
 def _unfolds(data: bytes) -> bytes:
-    """With comments of a gigabyte, and a color profile of a quarter of one."""
+    """With comments and a color profile of 300 MB each."""
     packed = zlib.compressobj(9)
-    bomb = b"".join(packed.compress(bytes(10_000_000)) for _ in range(100)) + packed.flush()
-    profile = chunk(b"iCCP", b"x\0\0" + zlib.compress(bytes(1 << 28), 9))
+    bomb = b"".join(packed.compress(bytes(10_000_000)) for _ in range(30)) + packed.flush()
+    profile = chunk(b"iCCP", b"x\0\0" + bomb)
     return data[:33] + chunk(b"zTXt", b"Comment\0\0" + bomb) + profile + data[33:]
 
 
@@ -88,6 +72,7 @@ def animated(path: str) -> Change:
 
 def _png(width: int = WIDTH, height: int = HEIGHT, at: str = PICTURE, **how: object) -> Change:
     return lambda: made.png(Path(at), width, height, **how)  # type: ignore[arg-type]
+
 
 second = (b"tEXt", struct.pack(">II", WIDTH, HEIGHT) + b"\x10\0\0\0\0")
 CASES += table(
@@ -107,17 +92,15 @@ def _large(*paths: str) -> Change:
 def _all(folder: str, pixels: object, names: Sequence[str]) -> Change:
     return several(*(drawn(f"scene/{folder}/{name}.png", pixels) for name in names))
 
+
 twins = several(*(copy(f"scene/polar/v002_{angle}.png", f"scene/polar/v003_{angle}.png") for angle in ANGLES))
 CASES += table(
     "pictures", TRAIN,
-    Case("transparent everywhere", drawn(PICTURE, np.dstack([COLOR, 0 * COLOR[..., :1]])), READ, expected="opaque", ci=True),
-    Case("with a column less", drawn(PICTURE, COLOR[:, 1:]), READ, ci=True),
+    Case("transparent everywhere", drawn(PICTURE, np.dstack([COLOR, 0 * COLOR[..., 0]])), READ, expected="opaque",
+         ci=True),
     Case("of one view twice", twins, warning=".*have the same pictures", ci=True),
-    Case("of 12000 pixels a side", _large(*(f"scene/polar/{view}_{angle}.png" for view in NAMES for angle in ANGLES)), ci=True),
     Case("of which three angles have 12000 pixels a side", _large(*(
         f"scene/polar/{view}_{angle}.png" for view in NAMES for angle in ANGLES[1:])), ci=True),
-    Case("of which one is a BigTIFF", several(*(instead(".tif", big_tiff, 12000, at=f"scene/polar/v001_{angle}.png")
-                                                for angle in ANGLES)), ci=True),
 )  # fmt: skip
 
 
@@ -131,10 +114,10 @@ def _left() -> np.ndarray:
     left[:, WIDTH // 2 :] = 0
     return left
 
+
 training = [view for view in NAMES if view not in ("v000", "v004")]
 CASES += table(
     "masks", MASKED,
-    Case("of 12000 pixels a side", _large(*(f"scene/masks/{view}.png" for view in NAMES)), TRAIN, ci=True),
     Case("animated", animated(MASK), found=ANIMATED, ci=True),
     Case("in their transparency", _in_transparency(WHITE), prints="transparen", ci=True),
     Case("in their colors and their transparency", _in_transparency(_left()), passes=SAME, ci=True),

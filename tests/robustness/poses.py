@@ -12,7 +12,7 @@ import hostile_files as made
 import numpy as np
 from base import posed
 from case import Case, Change, table
-from changes import SAME, field, instead_bytes, several, write, write_json
+from changes import field, instead, several, write, write_json
 from dataset_files import WRITERS
 
 CASES: list[Case] = []
@@ -47,6 +47,7 @@ def _matrix(matrix: object) -> Change:
 CASES += table(
     "transforms.json", posed("poses.json"),
     Case("as a list", write("poses.json", "[1, 2, 3]"), ci=True),
+    Case("of no frames", _record(frames=[])),
     Case("of frames of other names", _record(frames=_frames(("a", "b", "c")))),
     Case("of one place", _record(frames=[{**row, "transform_matrix": TURNED} for row in _frames()])),
     Case("of a matrix of nothing", _matrix([[0] * 4] * 4)),
@@ -61,7 +62,8 @@ CASES += table(
     Case("of a negative angle", _record(camera_angle_x=-1.0, fl_x=None, fl_y=None)),
     Case("of a place at 1e300", _matrix([[1, 0, 0, 1e300], *TURNED[1:]]), ci=True),
     Case("of a matrix that mirrors", _matrix([[-1, 0, 0, 0], *TURNED[1:]]), ci=True),
-    Case("beside a TIFF cut short", several(instead_bytes(".tif", b"II*\0\xff\xff\xff\xff", at="mosaics/v000.png"),
+    Case("beside a TIFF cut short", several(instead(
+        ".tif", lambda path: path.write_bytes(b"II*\0" + 4 * b"\xff"), at="mosaics/v000.png"),
                                             _record()), ci=True),
 )  # fmt: skip
 
@@ -88,22 +90,20 @@ def _written(text: str, encoding: str = "utf-8") -> Change:
 external = '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
 CASES += table(
     "cameras.xml", posed("poses.xml"),
-    Case("with a mark of its bytes", _written('\ufeff<?xml version="1.0" encoding="UTF-8"?>\r\n' + _xml()), passes=SAME),
-    Case("that is none", _written("no such thing"), ci=True),
     Case("of laughs", _written(LAUGHS + _xml(lens="<k1>&i;</k1>")), ci=True),
-    Case("of a file outside in UTF-16", _written(external + _xml(lens="<k1>&a;</k1>"), "UTF-16")),
     Case("of a width of infinity", _written(_xml(w="inf")), ci=True),
     Case("of a width of words", _written(_xml(w="wide")), ci=True),
     Case("of a skew", _written(_xml(lens="<b2>10</b2>"))),
     Case("of a fisheye", _written(_xml(kind="fisheye"))),
-    Case("of two chunks", _written(_xml(chunks=2))),
     Case("of a camera twice", _written(_xml(cameras=2 * _camera('sensor_id="0" label="v001"'))), ci=True),
     Case("of a camera without a sensor", _written(_xml(cameras=_camera('sensor_id="9" label="v001"')))),
 )  # fmt: skip
 
 
 def _arrays(*names: str, **changed: Any) -> Change:
-    whole = {f"{kind}_{k}": v for k in names or "012" for kind, v in (("world_mat", GOOD), ("scale_mat", EYE))}
+    whole = {
+        f"{kind}_{k}": v for k in names or "012" for kind, v in (("world_mat", GOOD), ("scale_mat", EYE))
+    }
     return lambda: np.savez("poses.npz", **{**whole, **changed})
 
 
@@ -119,8 +119,8 @@ name = "world_mat_0.npy"
 CASES += table(
     "cameras.npz", posed("poses.npz"),
     Case("of two cameras for three views", _arrays("0", "1")),
-    Case("of a negative number", _arrays("0", "1", "-1")),
     Case("of zeros", _arrays(world_mat_0=np.zeros((4, 4))), ci=True),
+    Case("of a camera without a scale", _members((name, made.npy(GOOD)))),
     Case("of a wrong shape", _arrays(world_mat_0=np.zeros(16)), ci=True),
     Case("of a broken head", _members((name, made.header("{'descr': ("))), ci=True),
     Case("of a head with a dictionary as key", _members((name, made.header("{{}: 1}"))), ci=True),
@@ -154,12 +154,10 @@ def _other_digits() -> None:
 
 CASES += [
     _dataset("phygap", "a width that is no number", _npz("data/camera_params.npz", image_width=np.nan), ci=True),
-    _dataset("phygap", "EXR of a huge window", lambda: made.exr(_first("images_full/*.exr"), 40000)),
-    _dataset("neisf", "rows of NaN", _rows(np.nan), ci=True),
     _dataset("neisf", "rows of 1e300", _rows(1e300)),
+    _dataset("neisf", "no rows", lambda: np.save("data/poses_bounds.npy", np.zeros((0, 17)))),
     _dataset("nersp", "light of another size", lambda: np.save(_first("s1/*.npy"), np.ones((4, 4, 3)))),
     _dataset("pandora", "a view of other digits", _other_digits),
-    _dataset("pisr", "distortion of 1e300", _npz("data/intrinsics.npz", dist_coeffs=np.full((1, 5), 1e300))),
     _dataset("pisr", "a gamma of nan", lambda: _first("gamma*").rename("data/gammanan.txt")),
     _dataset("gnerp", "cameras of texts", field("data/cameras.json", "w2c_mat_0", to="x")),
 ]  # fmt: skip

@@ -2,9 +2,8 @@
 
 python tests/robustness/soak.py [--kills N] [--seed SEED] [--without TEXT]
 
-Trainings of every recipe, preparations, exports, pages and comparisons. The killed command runs in a fork of this
-process, so that the moments fall into its work and not into its start. What it ends with has to have the same bytes as
-that of a command which nobody disturbed, and nothing half-written may be left beside it.
+The killed command runs in a fork of this process, so that the moments fall into its work and not into its start. What
+it ends with has to have the same bytes as that of a command which nobody disturbed, and nothing half-written beside it.
 """
 
 from __future__ import annotations
@@ -27,12 +26,12 @@ from pathlib import Path
 from warm import warm_up  # it puts the helpers on the path
 
 from base import FLAGS, MOSAICS, ONE, export, into, make_base  # isort: skip
-from forked import Child, Ended, ended, run, start  # isort: skip
+from forked import Child, ended, run, start  # isort: skip
 
 RECIPES = ("polarguide-stokes", "polarguide", "polarguide-paper", "3dgs", "3dgs-dr", "ref-gs")
 STEPS = "--steps 12"
 LONGEST = 600
-"""Seconds for a command that nobody kills."""
+"""Seconds for a command."""
 REPEATED = 60
 """Times that a comparison is repeated while what it had started still holds the lock."""
 VARYING = {
@@ -44,11 +43,10 @@ VARYING = {
 
 def train(recipe: str) -> Callable[[str], str]:
     """A training, gone on with where it has begun."""
-    flags = f"{STEPS} --checkpoint-every 3 {FLAGS}"
 
     def command(out: str) -> str:
         more = " --resume" if Path(out, "run.json").exists() else ""
-        return f"train scene --out {out} --recipe {recipe} {flags}{more}"
+        return f"train scene --out {out} --recipe {recipe} {STEPS} --checkpoint-every 3 {FLAGS}{more}"
 
     return command
 
@@ -63,16 +61,17 @@ COMMANDS: dict[str, Callable[[str], str]] = {
 }  # fmt: skip
 
 
-def begin(command: str, said: Path) -> Child:
+def begin(command: str) -> Child:
     """Run a command line in a fork."""
     app = importlib.import_module("polarguide.cli.app")
-    return start(lambda: app.run(command.split()), said)
+    return start(lambda: app.run(command.split()), Path("../said"))
 
 
-def finished(command: str, said: Path) -> Ended:
-    """Run a command line in a fork, to its end."""
-    app = importlib.import_module("polarguide.cli.app")
-    return run(lambda: app.run(command.split()), said, LONGEST)
+def status_of(child: Child) -> int:
+    """Wait for a fork."""
+    while (done := ended(child, LONGEST)) is None:
+        time.sleep(0.005)
+    return done.status
 
 
 def digests(out: str) -> dict[str, str]:
@@ -84,51 +83,48 @@ def digests(out: str) -> dict[str, str]:
     }
 
 
-def killed(name: str, out: str, seconds: float, rng: random.Random, said: Path) -> int:
+def killed(name: str, out: str, seconds: float, rng: random.Random) -> int:
     """Kill a command a few times, at moments of so many seconds; how often it was before it had ended."""
-    for count in range(rng.randint(1, 3)):
-        child = begin(COMMANDS[name](out), said)
+    most = rng.randint(1, 3)
+    for count in range(most):
+        child = begin(COMMANDS[name](out))
         time.sleep(rng.uniform(0, 1.05 * seconds))
         with contextlib.suppress(ProcessLookupError):
             os.kill(child.pid, signal.SIGKILL)
-        while (done := ended(child, LONGEST)) is None:
-            time.sleep(0.005)
-        if done.status != -signal.SIGKILL:
+        if status_of(child) != -signal.SIGKILL:
             return count
-    return count + 1
+    return most
 
 
-def repeated(name: str, out: str, said: Path) -> Ended:
+def repeated(name: str, out: str) -> int:
     """Repeat a command until it ends: a comparison waits for what it had started, which holds the lock."""
     for _ in range(REPEATED):
-        done = finished(COMMANDS[name](out), said)
-        if done.status == 0 or name != "compare":
+        status = status_of(begin(COMMANDS[name](out)))
+        if status == 0 or name != "compare":
             break
         time.sleep(1)
-    return done
+    return status
 
 
-def soak(kills: int, seed: int, without: str, said: Path) -> Counter[str]:
+def soak(kills: int, seed: int, without: str) -> Counter[str]:
     """Kill; returns how many kills of each kind, and of faults."""
     rng = random.Random(seed)
     counts: Counter[str] = Counter()
     whole: dict[str, tuple[dict[str, str], float]] = {}
-    names = [name for name in COMMANDS if not without or without not in name]
-    for name in names:
+    for name in [name for name in COMMANDS if not without or without not in name]:
         out, began = f"whole/{name.replace(' ', '-')}", time.monotonic()
-        done = finished(COMMANDS[name](out), said)
+        status = status_of(begin(COMMANDS[name](out)))
+        assert status == 0, f"{name} ends with {status} though nobody disturbed it"
         whole[name] = digests(out), time.monotonic() - began
-        if done.status:
-            print(f"FAULT {name}: ends with {done.status} though nobody disturbed it: {done.text[-500:]}", flush=True)
-            counts["fault"] += 1
-            del whole[name]
-    while whole and counts.total() - counts["fault"] < kills:
+    while counts.total() - counts["fault"] < kills:
         name = rng.choice(sorted(whole))
         expected, seconds = whole[name]
         shutil.rmtree("killed", ignore_errors=True)
-        counts[name] += killed(name, "killed", seconds, rng, said)
-        is_done = name.startswith("train") and Path("killed/run.json").exists() and digests("killed") == expected
-        status = 0 if is_done else repeated(name, "killed", said).status
+        counts[name] += killed(name, "killed", seconds, rng)
+        is_done = (
+            name.startswith("train") and Path("killed/run.json").exists() and digests("killed") == expected
+        )
+        status = 0 if is_done else repeated(name, "killed")
         found = digests("killed")
         wrong = sorted(key for key in expected.keys() | found.keys() if expected.get(key) != found.get(key))
         if status or wrong:
@@ -143,16 +139,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--without", default="", help="leave out commands of this name; compare takes longest")
+    parser.add_argument(
+        "--without", default="", help="leave out commands of this name; compare takes longest"
+    )
     asked = parser.parse_args()
     warm_up()
     with tempfile.TemporaryDirectory() as folder:
-        said = Path(folder) / "said"
-        made = run(lambda: make_base(Path(folder) / "base"), said)
+        made = run(lambda: make_base(Path(folder) / "base"), Path(folder) / "said")
         assert made.status == 0, made.text
         os.chdir(Path(folder) / "base")
-        counts = soak(asked.kills, asked.seed, asked.without, said)
-    print(f"{counts.total() - counts['fault']} kills, {counts['fault']} faults: {dict(counts)}")
+        counts = soak(asked.kills, asked.seed, asked.without)
     return int(counts["fault"] > 0)
 
 

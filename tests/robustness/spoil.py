@@ -14,11 +14,23 @@ from typing import Any
 import cv2
 import numpy as np
 from base import CHECKPOINT
-from case import Change
+from changes import deferred
 
 BYTES = ("cut", "empty", "garbage", "flip", "fill", "insert", "append", "twice")
 FIELDS = ("value", "removed", "renamed", "near", "nested")
-PICTURES = ("black", "white", "gray", "small", "wide", "turned", "8 bits", "noise", "floats", "huge", "animated")
+PICTURES = (
+    "black",
+    "white",
+    "gray",
+    "small",
+    "wide",
+    "turned",
+    "8 bits",
+    "noise",
+    "floats",
+    "huge",
+    "animated",
+)
 ARRAYS = ("not finite", "other shape", "other type", "objects", "bomb", "header", "encrypted", "zeros")
 TENSORS = ("missing", "not finite", "shorter", "longer", "axis", "type", "huge", "stranger", "none")
 WORDS: list[Any] = [
@@ -52,19 +64,17 @@ def _bytes(data: bytearray, how: str) -> bytes:
     return bytes(data)
 
 
-def bytes_of(path: str, how: str) -> Change:
+@deferred
+def bytes_of(path: str, how: str) -> None:
     """Spoil a file's bytes."""
-    return lambda: Path(path).write_bytes(_bytes(bytearray(Path(path).read_bytes()), how))
+    Path(path).write_bytes(_bytes(bytearray(Path(path).read_bytes()), how))
 
 
-def json_of(path: str, how: str = "") -> Change:
+@deferred
+def json_of(path: str, how: str = "") -> None:
     """Spoil one value of a JSON file, in a way that is drawn where none is given."""
-
-    def change() -> None:
-        content = json.loads(Path(path).read_text())
-        Path(path).write_text(_spoiled(content, how or random.choice(FIELDS)))
-
-    return change
+    content = json.loads(Path(path).read_text())
+    Path(path).write_text(_spoiled(content, how or random.choice(FIELDS)))
 
 
 def _spoiled(content: Any, how: str) -> str:
@@ -114,50 +124,45 @@ CONTENT: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def picture(path: str, how: str) -> Change:
+@deferred
+def picture(path: str, how: str) -> None:
     """A whole picture with other content."""
-
-    def change() -> None:
-        if how == "animated":
-            Path(path).write_bytes(b"GIF89a" + random.randbytes(60))
-            return
-        pixels = cv2.imread(path, cv2.IMREAD_UNCHANGED)
-        if how == "floats":
-            cv2.imwrite(str(Path(path).with_suffix(".tif")), pixels.astype(np.float32))
-            Path(path).unlink()
-            return
-        written = np.ascontiguousarray(CONTENT[how](pixels))
-        assert cv2.imwrite(path, written, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-
-    return change
+    if how == "animated":
+        Path(path).write_bytes(b"GIF89a" + random.randbytes(60))
+        return
+    pixels = cv2.imread(path, cv2.IMREAD_UNCHANGED)
+    if how == "floats":
+        cv2.imwrite(str(Path(path).with_suffix(".tif")), pixels.astype(np.float32))
+        Path(path).unlink()
+        return
+    written = np.ascontiguousarray(CONTENT[how](pixels))
+    assert cv2.imwrite(path, written, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 
 
-def archive(path: str, how: str) -> Change:
+@deferred
+def archive(path: str, how: str) -> None:
     """Spoil an .npz file."""
-
-    def change() -> None:
-        if how in ("bomb", "header"):
-            _promise(path, (1 << 20, 300, 3) if how == "bomb" else (1 << 40, 1 << 20), 450 if how == "bomb" else 0)
-            return
-        arrays = dict(np.load(path))
-        name = random.choice(sorted(arrays))
-        value = arrays[name]
-        if how == "not finite":
-            value = value.astype(np.float32)
-            value.reshape(-1)[random.randrange(value.size)] = random.choice((math.nan, math.inf))
-        elif how == "other shape":
-            value = value[: random.randrange(len(value))]
-        elif how == "other type":
-            value = value.astype(random.choice(("complex64", "U3", "datetime64[s]")))
-        elif how == "objects":
-            value = np.array([{"a": 1}], dtype=object)
-        elif how == "zeros":
-            value = np.zeros_like(value)
-        np.savez_compressed(path, **{**arrays, name: value})
-        if how == "encrypted":
-            _encrypt(Path(path))
-
-    return change
+    if how in ("bomb", "header"):
+        shape, blocks = ((1 << 20, 300, 3), 450) if how == "bomb" else ((1 << 40, 1 << 20), 0)
+        _promise(path, shape, blocks)
+        return
+    arrays = dict(np.load(path))
+    name = random.choice(sorted(arrays))
+    value = arrays[name]
+    if how == "not finite":
+        value = value.astype(np.float32)
+        value.reshape(-1)[random.randrange(value.size)] = random.choice((math.nan, math.inf))
+    elif how == "other shape":
+        value = value[: random.randrange(len(value))]
+    elif how == "other type":
+        value = value.astype(random.choice(("complex64", "U3", "datetime64[s]")))
+    elif how == "objects":
+        value = np.array([{"a": 1}], dtype=object)
+    elif how == "zeros":
+        value = np.zeros_like(value)
+    np.savez_compressed(path, **{**arrays, name: value})
+    if how == "encrypted":
+        _encrypt(Path(path))
 
 
 def _promise(path: str, shape: tuple[int, ...], blocks: int) -> None:
@@ -183,38 +188,34 @@ def _encrypt(path: Path) -> None:
     path.write_bytes(bytes(data))
 
 
-def checkpoint(how: str, path: str = CHECKPOINT) -> Change:
+@deferred
+def checkpoint(how: str, path: str = CHECKPOINT) -> None:
     """Spoil one tensor of a checkpoint."""
-
-    def change() -> None:
-        torch, files = importlib.import_module("torch"), importlib.import_module("safetensors.torch")
-        whole = files.load_file(path)
-        name = random.choice(sorted(whole))
-        value = whole[name]
-        if how == "missing":
-            del whole[name]
-        elif how == "not finite":
-            name = random.choice(sorted(key for key, t in whole.items() if t.is_floating_point()))
-            whole[name].view(-1)[random.randrange(whole[name].numel())] = random.choice((math.nan, math.inf))
-        elif how == "shorter":
-            whole[name] = value.reshape(-1)[: max(0, value.numel() - random.randint(1, 5))].clone()
-        elif how == "longer":
-            whole[name] = torch.cat((value.reshape(-1), value.reshape(-1))).clone()
-        elif how == "axis":
-            whole[name] = value[None].clone()
-        elif how == "type":
-            whole[name] = value.to(random.choice((torch.float64, torch.float16, torch.int32, torch.uint8)))
-        elif how == "huge":
-            name = random.choice(sorted(key for key in whole if key.startswith("gaussians.")))
-            whole[name].view(-1)[random.randrange(whole[name].numel())] = random.choice((-1, 1)) * 3e38
-        elif how == "stranger":
-            whole["../" + name] = value.clone()
-        else:
-            assert how == "none", how
-            whole = without_gaussians(whole)
-        files.save_file(whole, path)
-
-    return change
+    torch, files = importlib.import_module("torch"), importlib.import_module("safetensors.torch")
+    whole = files.load_file(path)
+    kinds = {"not finite": [k for k, t in whole.items() if t.is_floating_point()],
+             "huge": [k for k in whole if k.startswith("gaussians.")]}  # fmt: skip
+    name = random.choice(sorted(kinds.get(how, whole)))
+    value = whole[name]
+    if how == "missing":
+        del whole[name]
+    elif how in ("not finite", "huge"):
+        numbers = (math.nan, math.inf) if how == "not finite" else (-3e38, 3e38)
+        value.view(-1)[random.randrange(value.numel())] = random.choice(numbers)
+    elif how == "shorter":
+        whole[name] = value.reshape(-1)[: max(0, value.numel() - random.randint(1, 5))].clone()
+    elif how == "longer":
+        whole[name] = torch.cat((value.reshape(-1), value.reshape(-1))).clone()
+    elif how == "axis":
+        whole[name] = value[None].clone()
+    elif how == "type":
+        whole[name] = value.to(random.choice((torch.float64, torch.float16, torch.int32, torch.uint8)))
+    elif how == "stranger":
+        whole["../" + name] = value.clone()
+    else:
+        assert how == "none", how
+        whole = without_gaussians(whole)
+    files.save_file(whole, path)
 
 
 def without_gaussians(whole: dict[str, Any]) -> dict[str, Any]:

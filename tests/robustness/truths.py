@@ -30,7 +30,7 @@ CASES += table(
       for how in spoil.BYTES),
     *(Case(f"is a {how}", put(TRUTH, how)) for how in OF_FILES),
     *(Case(how, spoil.archive(TRUTH, how), passes="unknown values are zeros" if how == "zeros" else "", seeds=2,
-           where=r"scene/gt/v000\.npz" if how in named else "", ci=True) for how in spoil.ARRAYS),
+           where=r"scene/gt/v000\.npz" if how in named else "", ci=how != "bomb") for how in spoil.ARRAYS),
 )  # fmt: skip
 
 
@@ -48,6 +48,7 @@ def _more_members() -> None:
     with zipfile.ZipFile(TRUTH, "a") as archive:
         archive.writestr("more/normal.npy", array.getvalue())
         archive.writestr("../../outside/evil.npy", array.getvalue())
+
 
 [(f"{number}", b"") for number in range(60000)]
 CASES += table(
@@ -69,6 +70,7 @@ CASES += table(
 
 def _alone(**arrays: Any) -> Change:
     return lambda: np.savez(TRUTH, **arrays)
+
 
 CASES += table(
     "gt has", EVAL,

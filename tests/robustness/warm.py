@@ -45,7 +45,9 @@ def warm_up() -> None:
     _shrink(importlib.import_module("polarguide.recipes.registry"))
     tasks = Path("/proc/self/task")
     threads = [(task / "comm").read_text().strip() for task in tasks.iterdir()] if tasks.exists() else []
-    assert len(threads) <= 1, f"threads would be lost in a fork, and with them the locks that they hold: {threads}"
+    assert len(threads) <= 1, (
+        f"threads would be lost in a fork, and with them the locks that they hold: {threads}"
+    )
     gc.collect()
     gc.freeze()
 
