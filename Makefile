@@ -3,7 +3,7 @@
 #                 check the files of those that are finished, and print a SHA-256 of each
 # make test    linter, formatter, types and tests, on the package as it is installed;
 #                 its last lines say what was skipped, and how to change that
-# make fuzz N=20    the corpus of tests/robustness with N further seeds of each mutation; prints what failed, and how to repeat it
+# make fuzz N=20    all tables of tests/robustness, random cases with N seeds; prints what failed, and how to repeat it
 # make soak N=300    kill commands N times at random moments, go on, and compare the files
 # make sanitize    the kernels' tests with AddressSanitizer and UndefinedBehaviorSanitizer, the thread pool with ThreadSanitizer
 # make speed   where the time of a training step goes, for 1, 2, 4 ... threads; SCENE=a scene or a run, in place of the demo

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import shutil
-import sys
-import traceback
 from pathlib import Path
 
 import numpy as np
@@ -15,64 +14,69 @@ from damage import colmap_binary
 from tiny_capture import NAMES, TinyCapture, ideal_intensities, write_picture
 
 HEIGHT, WIDTH = 20, 24
-STEPS, LOGGED_STEPS = 2, 10  # the log has a line for every tenth
-FLAGS = ["--threads", "1", "--device", "cpu"]
-TRAINING = ["--steps", str(LOGGED_STEPS), *FLAGS]
-TRAIN = ["train", "scene", "--out", "new", "--steps", str(STEPS), *FLAGS]
-READ = [
-    "priors",
-    "scene",
-    "--out",
-    "new",
-    "--views",
-    "v001",
-    "--threads",
-    "1",
-]  # a command that reads a scene, and little more
-RESUME = ["train", "scene", "--out", "run", "--resume", *TRAINING]
-MOSAICS = ["prepare", "mosaics", "--out", "new", "--sensor", "IMX250MYR", "--bits", "16", "--poses", "none"]
-EVAL = ["eval", "run", "--no-speed", "--device", "cpu", "--threads", "1"]
-SHOTS = ["prepare", "shots", "--out", "new", "--poses", "none", "--no-align"]
+ONE = "--threads 1"
+FLAGS = f"{ONE} --device cpu"
+SENSOR = "--sensor IMX250MYR --bits 16"
+TRAIN = f"train scene --out new --steps 2 {FLAGS}"
+READ = f"priors scene --out new --views v001 {ONE}"
+"""A command that reads a scene, and little more."""
+TRAINED = f"--steps 10 {FLAGS}"
+"""The log has a line for every tenth step."""
+RESUME = f"train scene --out run --resume {TRAINED}"
+EVAL = f"eval run --no-speed {FLAGS}"
+SHARE = f"share run --out new.html {ONE}"
+RENDER = f"render run --out new --layers final {ONE}"
+INSPECT = f"inspect scene --normals points --out new {ONE}"
+COMPARE = f"compare scene --out new --recipes 3dgs --steps 2 --jobs 1 --report-views 0 {FLAGS}"
+MOSAICS = f"prepare mosaics --out new {SENSOR} --poses none"
+SHOTS = "prepare shots --out new --poses none --no-align"
+MAPS = f"priors mosaics --out new {SENSOR} --formats npy"
+MEASURE = f"measure mosaics --out new {SENSOR} {ONE}"
+WATCH = f"measure --watch mosaics --out new {SENSOR} {ONE} --settle 0.05 --idle 0.6"
+CALIBRATE = f"calibrate polarizer --out new.safetensors --sensor IMX250MZR {ONE}"
+SYNTH = f"synth spec.json --out new --size 16x16 --samples 1 {ONE}"
+PICTURE, TRUTH, MOSAIC = "scene/polar/v001_045.png", "scene/gt/v000.npz", "mosaics/v001.png"
+MASK, CHECKPOINT = "scene/masks/v001.png", "run/checkpoint.safetensors"
+
+
+def export(kind: str) -> str:
+    """An export of the run."""
+    return f"export run --format {kind} --out new {ONE}"
+
+
+def into(out: str, command: str) -> str:
+    """A command that writes elsewhere."""
+    return command.replace(" --out new", f" --out {out}")
+
+
+def of(source: str, command: str) -> str:
+    """A command that reads something else."""
+    verb, _, *more = command.split()
+    return " ".join([verb, source, *more])
+
+
+def posed(poses: str, command: str = MOSAICS) -> str:
+    """A preparation with poses."""
+    return command.replace("--poses none", f"--poses {poses}")
 
 
 def make_base(folder: Path) -> None:
-    """Write the base; in a child, so that the caller computes nothing itself."""
-    pid = os.fork()
-    if not pid:
-        status = 1
-        try:
-            _make(folder)
-            status = 0
-        except BaseException:
-            traceback.print_exc()
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(status)
-    if os.waitpid(pid, 0)[1]:
-        raise RuntimeError("the base could not be made")
-
-
-def _make(folder: Path) -> None:
-    from polarguide.cli.app import run
-
+    """Write the base; in a fork, so that the caller computes nothing itself."""
+    run = importlib.import_module("polarguide.cli.app").run
     folder.mkdir(parents=True)
     os.chdir(folder)
     _write_scene(TinyCapture(folder / "scene"))
     for recipe, name in (("polarguide-stokes", "run"), ("ref-gs", "run-ref")):
-        assert run(["train", "scene", "--out", name, "--recipe", recipe, *TRAINING]) == 0
-    assert run(["eval", "run", "--no-speed", "--device", "cpu", "--threads", "1"]) == 0
+        assert run(f"train scene --out {name} --recipe {recipe} {TRAINED}".split()) == 0
+    assert run(EVAL.split()) == 0
     write_mosaics(folder / "mosaics", 3)
     for view in ("v000", "v001"):
         write_shots(folder / "shots", view, behind(smooth_light()))
-    model = colmap_binary(folder / "model" / "sparse" / "0")
-    assert model.is_dir()
-    assert run([*MOSAICS[:3], "prepared", *MOSAICS[4:]]) == 0
+    assert colmap_binary(folder / "model" / "sparse" / "0").is_dir()
+    assert run(into("prepared", MOSAICS).split()) == 0
     shutil.copytree("prepared", "unfinished")
-    (folder / "unfinished" / "scene.json").rename(folder / "unfinished" / "prepare.json")
-    path = {"frames_per_second": 30, "cameras": []}
-    (folder / "empty_path.json").write_text(json.dumps(path))
-    (folder / "calibration.json").write_text(json.dumps({"gains": [1.0, 1.0, 1.0, 1.0], "zero": 0.0}))
+    Path("unfinished/scene.json").rename("unfinished/prepare.json")
+    Path("calibration.json").write_text(json.dumps({"gains": [1.0, 1.0, 1.0, 1.0], "zero": 0.0}))
 
 
 def _write_scene(tiny: TinyCapture) -> None:

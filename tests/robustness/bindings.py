@@ -1,265 +1,189 @@
-# ruff: noqa: E501
 """Random input for every binding of the native module: right shapes and wrong ones, huge and not finite numbers.
 
-Wrong input has to raise ``ValueError`` or ``TypeError``; the rest has to run. Under sanitizers a fault ends the program.
+Wrong input has to raise ``ValueError`` or ``TypeError``, the rest has to run; sanitizers end the program at a fault.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import random
 from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from polarguide import _native
 
 SIZES = (0, 1, 2, 7, 16, 17, 65)
+MANY = (*SIZES, 5000)
 VALUES = (0.0, -0.0, 1.0, -1.0, 1e-30, 1e30, -1e30, 3e38, np.inf, -np.inf, np.nan)
+LARGEST, NAN = 2**31 - 1, np.nan
 
 
-def array(rng: random.Random, *shape: int) -> np.ndarray:
-    """Random float32 values, some of them extreme; sometimes of another shape or type."""
-    if rng.random() < 0.04:
-        shape = tuple(rng.choice(SIZES) for _ in range(rng.randint(0, 4)))
-    made = np.random.default_rng(rng.randrange(2**31)).normal(size=shape).astype(np.float32)
-    if made.size and rng.random() < 0.3:
-        for _ in range(rng.randint(1, 4)):
-            made.reshape(-1)[rng.randrange(made.size)] = rng.choice(VALUES)
-    if rng.random() < 0.02:
-        made = made.astype(np.float64)
-    return made
+class Draw(random.Random):
+    """Random arrays."""
+
+    def __call__(self, *shape: int) -> np.ndarray:
+        """Float32 values, some of them extreme; sometimes of another shape or type."""
+        if self.random() < 0.04:
+            shape = tuple(self.choice(SIZES) for _ in range(self.randint(0, 4)))
+        made = self.numbers().normal(size=shape).astype(np.float32)
+        if made.size and self.random() < 0.3:
+            for _ in range(self.randint(1, 4)):
+                made.reshape(-1)[self.randrange(made.size)] = self.choice(VALUES)
+        return made.astype(np.float64) if self.random() < 0.02 else made
+
+    def numbers(self) -> np.random.Generator:
+        """Further random numbers."""
+        return np.random.default_rng(self.randrange(2**31))
+
+    def maybe(self, given: Any) -> Any:
+        """What is given, or nothing."""
+        return None if self.random() < 0.3 else given
+
+    def arguments(self, text: str, sizes: Mapping[str, int], values: Mapping[str, Any]) -> list[Any]:
+        """What a text lists: values by name, and arrays by their sides; ``?`` before those that may be missing."""
+        known = {**sizes, "q": 15, "3": 3, "4": 4, "6": 6}
+        made = []
+        for word in text.split():
+            given = values[word] if word in values else self(*(known[side] for side in word.strip("?")))
+            made.append(self.maybe(given) if "?" in word else given)
+        return made
 
 
-def maybe(rng: random.Random, given: np.ndarray) -> np.ndarray | None:
-    return None if rng.random() < 0.3 else given
+# A row: the functions of a binding, each with its arguments; what the letters in them may be. "q" is 15.
+ROWS: tuple[tuple[dict[str, str], dict[str, Sequence[int]], dict[str, Sequence[Any]]], ...] = (
+    ({"photometric": "hw3 hw3 ?hw COUNT WEIGHT ?hw3"}, {"h": SIZES, "w": SIZES},
+     {"COUNT": (0.0, 1.0, 17.0, 1105.0), "WEIGHT": (0.2,)}),
+    ({"cubemap_forward": "6ssc n3 nc", "cubemap_backward": "6ssc n3 nc ?6ssc ?n3"},
+     {"s": (0, 1, 2, 8, 33), "c": (0, 1, 3, 16), "n": MANY}, {}),
+    ({"harmonics_forward": "DEGREE n3 3 n3 nq3 n3", "harmonics_backward": "DEGREE n3 3 n3 nq3 n3 ?n3 n3 ?nq3"},
+     {"n": MANY}, {"DEGREE": range(-1, 5)}),
+    ({"axes_forward": "n3 n4 n3 3 ?n3 GRAZING n3", "axes_backward": "n3 n4 n3 3 ?n3 GRAZING n3 n4",
+      "mirrored_forward": "n3 3 n3 n3"}, {"n": MANY}, {"GRAZING": (0.0, 0.3, NAN)}),
+    ({"shortest_sum": "n3 n", "shortest_gradient": "n3 n SCALE n3"}, {"n": MANY}, {"SCALE": (1.0, NAN)}),
+    ({"gbuffer_split": "nd n n3 ?n", "gbuffer_join": "n ?n ?nd ?n3 ?n nd ?n"}, {"n": MANY, "d": range(5, 13)}, {}),
+    ({"polarization": "n3 n3 33 n3 n3 ?n6 kn3 k3 ?n NOISE INDEX ?n n3 n3 n3 ?n6"},
+     {"n": MANY, "k": (0, 1, 2, 3, 4, 9)},
+     {"NOISE": (0.1, 0.0, NAN, 3e38), "INDEX": (1.5, 1.5, 1.0, -1.0, 1e30, np.inf, NAN)}),
+    ({"direction": "n3 n3 ?n NOISE FLAG n3"}, {"n": MANY}, {"NOISE": (0.1, 0.0, NAN), "FLAG": (True, False)}),
+)  # fmt: skip
 
 
-def rasterizer(rng: random.Random) -> None:
-    n, d, height, width = rng.choice(SIZES), rng.randint(1, 12), rng.choice(SIZES), rng.choice(SIZES)
-    permutation = list(range(d))
-    rng.shuffle(permutation)
-    if rng.random() < 0.1:
-        permutation[rng.randrange(d)] = rng.choice((-1, d, 2**31 - 1, 0))
-    numbers = [
-        rng.choice((rng.gauss(0, 1), rng.choice(VALUES))) if rng.random() < 0.2 else rng.gauss(0, 1)
-        for _ in range(3)
-    ]
-    turn = np.linalg.qr(np.random.default_rng(rng.randrange(2**31)).normal(size=(3, 3)))[0]
-    made = _native.Rasterizer(
-        turn.flatten().tolist(),
-        numbers,
-        [30.0, 30.0, width / 2, height / 2],
-        width,
-        height,
-        0.01,
-        permutation,
-        rng.randint(-1, d + 1),
-    )
-    inputs = [
-        array(rng, n, 3),
-        array(rng, n, 4),
-        np.abs(array(rng, n, 3)),
-        np.clip(np.abs(array(rng, n)), 0, 1),
-        array(rng, n, d),
-    ]
-    out, alpha, radius = array(rng, height, width, d), array(rng, height, width), array(rng, n)
-    if rng.random() < 0.9:
+def rasterizer(draw: Draw) -> None:
+    n, d, h, w = draw.choice(SIZES), draw.randint(1, 12), draw.choice(SIZES), draw.choice(SIZES)
+    order = list(range(d))
+    draw.shuffle(order)
+    if draw.random() < 0.1:
+        order[draw.randrange(d)] = draw.choice((-1, d, LARGEST, 0))
+    place = [draw.choice(VALUES) if draw.random() < 0.1 else draw.gauss(0, 1) for _ in range(3)]
+    turn = np.linalg.qr(draw.numbers().normal(size=(3, 3)))[0].flatten().tolist()
+    lens = [30.0, 30.0, w / 2, h / 2]
+    made = _native.Rasterizer(turn, place, lens, w, h, 0.01, order, draw.randint(-1, d + 1))
+    scales, opacities = np.abs(draw(n, 3)), np.clip(np.abs(draw(n)), 0, 1)
+    inputs = [draw(n, 3), draw(n, 4), scales, opacities, draw(n, d)]
+    out, alpha, radius = draw(h, w, d), draw(h, w), draw(n)
+    if draw.random() < 0.9:
         with contextlib.suppress(ValueError, TypeError):
-            made.forward(*inputs, out, alpha, radius, rng.random() < 0.5, rng.random() < 0.8)
-    m = n if rng.random() < 0.9 else rng.choice(SIZES)
-    e = d if rng.random() < 0.9 else rng.randint(1, 12)
+            made.forward(*inputs, out, alpha, radius, draw.random() < 0.5, draw.random() < 0.8)
+    m = n if draw.random() < 0.9 else draw.choice(SIZES)
+    e = d if draw.random() < 0.9 else draw.randint(1, 12)
     if m != n:
-        inputs = [array(rng, m, 3), array(rng, m, 4), array(rng, m, 3), array(rng, m), array(rng, m, d)]
-    gradients = [array(rng, m, 3), array(rng, m, 4), array(rng, m, 3), array(rng, m), array(rng, m, e)]
-    made.backward(
-        *inputs,
-        out,
-        array(rng, height, width, d),
-        array(rng, height, width),
-        *gradients,
-        maybe(rng, array(rng, m, 2)),
-    )
+        inputs = [draw(m, 3), draw(m, 4), draw(m, 3), draw(m), draw(m, d)]
+    gradients = [draw(m, 3), draw(m, 4), draw(m, 3), draw(m), draw(m, e)]
+    made.backward(*inputs, out, draw(h, w, d), draw(h, w), *gradients, draw.maybe(draw(m, 2)))
 
 
-def photometric(rng: random.Random) -> None:
-    h, w = rng.choice(SIZES), rng.choice(SIZES)
-    given = array(rng, h, w, 3), array(rng, h, w, 3), maybe(rng, array(rng, h, w))
-    _native.photometric(*given, rng.choice((0.0, 1.0, h * w)), 0.2, maybe(rng, array(rng, h, w, 3)))
-
-
-def cubemap(rng: random.Random) -> None:
-    side, channels, count = (
-        rng.choice((0, 1, 2, 8, 33)),
-        rng.choice((0, 1, 3, 16)),
-        rng.choice((*SIZES, 5000)),
-    )
-    texture, directions = array(rng, 6, side, side, channels), array(rng, count, 3)
-    _native.cubemap_forward(texture, directions, array(rng, count, channels))
-    grads = maybe(rng, array(rng, 6, side, side, channels)), maybe(rng, array(rng, count, 3))
-    _native.cubemap_backward(texture, directions, array(rng, count, channels), *grads)
-
-
-def reflect(rng: random.Random) -> None:
-    n, d, local = rng.choice((*SIZES, 5000)), rng.randint(5, 12), rng.random() < 0.5
-    features, rays, three = array(rng, n, d), array(rng, n, 3), [array(rng, n, 3) for _ in range(7)]
-    _native.turn(rays, [rng.uniform(-1, 1) for _ in range(rng.choice((9, 9, 9, 8)))], three[0])
-    model = (
-        rng.random() < 0.5,
-        local,
-        rng.choice((1.5, 0.0, np.nan)),
-        rng.choice((-1, -1, 0, d - 1, d, 2**31 - 1)),
-    )
-    side = rng.choice((1, 2, 5))
-    texels = array(rng, 6, side, side, rng.choice((3, 3, 3, 4)))
-    looked_up = maybe(rng, three[0]), maybe(rng, three[5])
+def reflect(draw: Draw) -> None:
+    n, d, local = draw.choice(MANY), draw.randint(5, 12), draw.random() < 0.5
+    features, rays, three = draw(n, d), draw(n, 3), [draw(n, 3) for _ in range(7)]
+    _native.turn(rays, [draw.uniform(-1, 1) for _ in range(draw.choice((9, 9, 9, 8)))], three[0])
+    index, further = draw.choice((1.5, 0.0, NAN)), draw.choice((-1, -1, 0, d - 1, d, LARGEST))
+    model = draw.random() < 0.5, local, index, further
+    side = draw.choice((1, 2, 5))
+    texels = draw(6, side, side, draw.choice((3, 3, 3, 4)))
+    looked_up = draw.maybe(three[0]), draw.maybe(three[5])
     _native.reflect_forward(features, rays, texels, *model, *looked_up, *three[1:5])
-    layers = [maybe(rng, values) for values in (*three[1:5], *three[1:3])]
-    by_look_up = three[5], maybe(rng, three[6])
-    _native.reflect_backward_layers(features, rays, three[0], *model, *layers, *by_look_up, array(rng, n, d))
-    _native.reflect_backward_directions(features, rays, three[0], array(rng, n, d))
+    layers = [draw.maybe(values) for values in (*three[1:5], *three[1:3])]
+    by_look_up = three[5], draw.maybe(three[6])
+    _native.reflect_backward_layers(features, rays, three[0], *model, *layers, *by_look_up, draw(n, d))
+    _native.reflect_backward_directions(features, rays, three[0], draw(n, d))
 
 
-def harmonics(rng: random.Random) -> None:
-    n, degree = rng.choice((*SIZES, 3000)), rng.randint(-1, 4)
-    given = array(rng, n, 3), array(rng, 3), array(rng, n, 3), array(rng, n, 15, 3)
-    _native.harmonics_forward(degree, *given, array(rng, n, 3))
-    gradients = (
-        array(rng, n, 3),
-        maybe(rng, array(rng, n, 3)),
-        array(rng, n, 3),
-        maybe(rng, array(rng, n, 15, 3)),
-    )
-    _native.harmonics_backward(degree, *given, *gradients)
-
-
-def axes(rng: random.Random) -> None:
-    n = rng.choice((*SIZES, 3000))
-    given = array(rng, n, 3), array(rng, n, 4), array(rng, n, 3), array(rng, 3), maybe(rng, array(rng, n, 3))
-    grazing = rng.choice((0.0, 0.3, np.nan))
-    _native.axes_forward(*given, grazing, array(rng, n, 3))
-    _native.axes_backward(*given, grazing, array(rng, n, 3), array(rng, n, 4))
-    _native.mirrored_forward(given[0], given[3], array(rng, n, 3), array(rng, n, 3))
-
-
-def splatting(rng: random.Random) -> None:
-    n, degree, k = rng.choice((*SIZES, 3000)), rng.randint(-1, 4), rng.choice((0, 1, 5, 6, 30))
-    core = [array(rng, n, *shape) for shape in ((3,), (4,), (3,), (), (3,), (15, 3))]
-    light = rng.random() < 0.5
-    others = [
-        maybe(rng, array(rng, n, 3)),
-        maybe(rng, array(rng, n)),
-        array(rng, n, 3) if light else None,
-        array(rng, n, 15, 3) if light else None,
-        maybe(rng, array(rng, n)),
-        maybe(rng, array(rng, n, k)),
-    ]
-    normals = light or rng.random() < 0.5
-    made = _native.Splatting(
-        *core, degree, array(rng, 3), maybe(rng, array(rng, 3)), normals, rng.choice((0.3, np.nan)), *others
-    )
+def splatting(draw: Draw) -> None:
+    n, degree, k = draw.choice(MANY), draw.randint(-1, 4), draw.choice((0, 1, 5, 6, 30))
+    core = [draw(n, *shape) for shape in ((3,), (4,), (3,), (), (3,), (15, 3))]
+    light = draw.random() < 0.5
+    lit = [draw(n, 3), draw(n, 15, 3)] if light else [None, None]
+    others = [draw.maybe(draw(n, 3)), draw.maybe(draw(n)), *lit, draw.maybe(draw(n)), draw.maybe(draw(n, k))]
+    normals, grazing = light or draw.random() < 0.5, draw.choice((0.3, NAN))
+    made = _native.Splatting(*core, degree, draw(3), draw.maybe(draw(3)), normals, grazing, *others)
     d = made.channels
-    results = array(rng, n, 3), array(rng, n), array(rng, n, d)
-    mirrored = array(rng, n, 3) if light else None
+    results, mirrored = (draw(n, 3), draw(n), draw(n, d)), draw(n, 3) if light else None
     with contextlib.suppress(ValueError, TypeError):
-        made.forward(*results, maybe(rng, mirrored) if light else None)
-    by = [array(rng, n, *shape) for shape in ((3,), (4,), (3,), (), (d,))]
+        made.forward(*results, draw.maybe(mirrored) if light else None)
+    by = [draw(n, *shape) for shape in ((3,), (4,), (3,), (), (d,))]
     learned = (others[1], others[2], others[3], others[5])
     to = [None if given is None else np.zeros_like(given) for given in (*core, *learned)]
     made.backward(*results, mirrored, *by, *to)
 
 
-def shortest(rng: random.Random) -> None:
-    n = rng.choice((*SIZES, 9000))
-    given = array(rng, n, 3), array(rng, n)
-    _native.shortest_sum(*given)
-    _native.shortest_gradient(*given, rng.choice((1.0, np.nan)), array(rng, n, 3))
+def finite(draw: Draw) -> None:
+    _native.first_not_finite(draw(*(draw.choice(SIZES) for _ in range(draw.randint(0, 3)))))
 
 
-def finite(rng: random.Random) -> None:
-    _native.first_not_finite(array(rng, *(rng.choice(SIZES) for _ in range(rng.randint(0, 3)))))
+def metal(draw: Draw) -> None:
+    n, d = draw.choice(MANY), draw.randint(10, 18)
+    first = draw.choice((7, 7, 10, 12, 3, d, LARGEST))
+    local = draw.choice((-1, -1, 7, 0, d - 2, LARGEST, -(2**31)))
+    pixels = np.flatnonzero(draw.numbers().random(n) < 0.4)
+    if len(pixels) and draw.random() < 0.1:
+        pixels[draw.randrange(len(pixels))] = draw.choice((-1, n, 2**62))
+    k, blur = len(pixels), draw.choice((4.0, 4.0, 0.0, NAN, 3e38))
+    given = draw(n, d), draw(n, 3), pixels, first, local, draw.choice((0.01, 0.01, 0.0)), blur
+    rows, looked_up = [draw(k, 3) for _ in range(3)], draw(k, 3)
+    _native.metal_directions(*given, rows[0], draw(k))
+    _native.metal_layers(*given, looked_up, draw(k), *rows[1:], draw(n, 3), draw(n, 3))
+    layers = [draw.maybe(draw(n, 3)) for _ in range(3)]
+    by = [draw.maybe(draw(k, 3)) for _ in range(2)]
+    _native.metal_backward_layers(*given, looked_up, *layers, *by, draw(k, 3), draw(n, d))
+    _native.metal_backward_directions(*given, draw(k, 3), draw(k), draw(n, d))
 
 
-def gbuffer(rng: random.Random) -> None:
-    n, d = rng.choice((*SIZES, 5000)), rng.randint(5, 12)
-    _native.gbuffer_split(array(rng, n, d), array(rng, n), array(rng, n, 3), maybe(rng, array(rng, n)))
-    given = [maybe(rng, array(rng, *shape)) for shape in ((n,), (n, d), (n, 3), (n,), (n,))]
-    _native.gbuffer_join(array(rng, n), *given[:4], array(rng, n, d), given[4])
+def mips(draw: Draw) -> None:
+    n, c = draw.choice(MANY), draw.choice((1, 3, 3, 5, 64, 65, 0))
+    sides = [draw.choice((1, 2, 5, 16)) for _ in range(draw.choice((1, 2, 5, 16, 17, 0)))]
+    given = [draw(6, side, side, c) for side in sides], draw(n, 3), 3 * draw(n)
+    _native.mips_forward(*given, draw(n, c))
+    flat = draw.maybe(draw(sum(6 * side * side * c for side in sides)))
+    _native.mips_backward(*given, draw(n, c), flat, draw(n, 3), draw(n))
 
 
-def polarization(rng: random.Random) -> None:
-    n, k = rng.choice((*SIZES, 5000)), rng.choice((0, 1, 2, 3, 4, 9))
-    normal, rays, specular, diffuse = (array(rng, n, 3) for _ in range(4))
-    measured, analyzers, weight = array(rng, k, n, 3), array(rng, k, 3), maybe(rng, array(rng, n))
-    numbers = rng.choice((0.1, 0.0, np.nan, 3e38)), rng.choice((1.5, 1.5, 1.0, -1.0, 1e30, np.inf, np.nan))
-    gradients = [array(rng, n, 3) for _ in range(3)]
-    metal = maybe(rng, array(rng, n, 6))
-    layers = specular, diffuse, metal, measured, analyzers, weight
-    _native.polarization(
-        normal,
-        rays,
-        array(rng, 3, 3),
-        *layers,
-        *numbers,
-        maybe(rng, array(rng, n)),
-        *gradients,
-        maybe(rng, array(rng, n, 6)),
-    )
+def consistency(draw: Draw) -> None:
+    h, w = draw.choice((2, 3, 5, 16, 17, 70)), draw.choice((2, 3, 5, 16, 17, 70))
+    n = h * w if draw.random() < 0.95 else draw.choice(SIZES)
+    given = draw(n, 3), draw(n, 3), draw(3, 3), draw(h, w), draw(h, w), draw.maybe(draw(n))
+    _native.consistency(*given, draw.choice((0.1, NAN)), draw(n, 3), draw(h, w))
 
 
-def metal(rng: random.Random) -> None:
-    n, d = rng.choice((*SIZES, 5000)), rng.randint(10, 18)
-    first, local = (
-        rng.choice((7, 7, 10, 12, 3, d, 2**31 - 1)),
-        rng.choice((-1, -1, 7, 0, d - 2, 2**31 - 1, -(2**31))),
-    )
-    pixels = np.flatnonzero(np.random.default_rng(rng.randrange(2**31)).random(n) < 0.4)
-    if len(pixels) and rng.random() < 0.1:
-        pixels[rng.randrange(len(pixels))] = rng.choice((-1, n, 2**62))
-    k, blur = len(pixels), rng.choice((4.0, 4.0, 0.0, np.nan, 3e38))
-    given = array(rng, n, d), array(rng, n, 3), pixels, first, local, rng.choice((0.01, 0.01, 0.0)), blur
-    rows, seen = [array(rng, k, 3) for _ in range(3)], array(rng, k, 3)
-    _native.metal_directions(*given, rows[0], array(rng, k))
-    _native.metal_layers(*given, seen, array(rng, k), *rows[1:], array(rng, n, 3), array(rng, n, 3))
-    layers = [maybe(rng, array(rng, n, 3)) for _ in range(3)]
-    by = [maybe(rng, array(rng, k, 3)) for _ in range(2)]
-    _native.metal_backward_layers(*given, seen, *layers, *by, array(rng, k, 3), array(rng, n, d))
-    _native.metal_backward_directions(*given, array(rng, k, 3), array(rng, k), array(rng, n, d))
+KINDS = (rasterizer, reflect, splatting, finite, metal, mips, consistency)
 
 
-def mips(rng: random.Random) -> None:
-    n, c = rng.choice((*SIZES, 5000)), rng.choice((1, 3, 3, 5, 64, 65, 0))
-    sides = [rng.choice((1, 2, 5, 16)) for _ in range(rng.choice((1, 2, 5, 16, 17, 0)))]
-    textures = [array(rng, 6, side, side, c) for side in sides]
-    directions, level = array(rng, n, 3), 3 * array(rng, n)
-    _native.mips_forward(textures, directions, level, array(rng, n, c))
-    flat = maybe(rng, array(rng, sum(6 * side * side * c for side in sides)))
-    _native.mips_backward(
-        textures, directions, level, array(rng, n, c), flat, array(rng, n, 3), array(rng, n)
-    )
+def _call(draw: Draw, name: str, *of_row: Any) -> None:
+    getattr(_native, name)(*draw.arguments(*of_row))
 
 
-def direction(rng: random.Random) -> None:
-    n = rng.choice((*SIZES, 5000))
-    given = array(rng, n, 3), array(rng, n, 3), maybe(rng, array(rng, n))
-    _native.direction(*given, rng.choice((0.1, 0.0, np.nan)), rng.random() < 0.5, array(rng, n, 3))
-
-
-def consistency(rng: random.Random) -> None:
-    h, w = rng.choice((2, 3, 5, 16, 17, 70)), rng.choice((2, 3, 5, 16, 17, 70))
-    n = h * w if rng.random() < 0.95 else rng.choice(SIZES)
-    normal, rays, turn = array(rng, n, 3), array(rng, n, 3), array(rng, 3, 3)
-    given = array(rng, h, w), array(rng, h, w), maybe(rng, array(rng, n))
-    _native.consistency(
-        normal, rays, turn, *given, rng.choice((0.1, np.nan)), array(rng, n, 3), array(rng, h, w)
-    )
-
-
-KINDS = (
-    rasterizer, photometric, cubemap, reflect, harmonics, axes, finite, gbuffer, polarization, direction,
-    consistency, metal, mips, splatting, shortest,
-)  # fmt: skip
+def calls(draw: Draw) -> Iterator[tuple[str, Callable[[], object]]]:
+    """All calls of a round."""
+    yield from ((kind.__name__, functools.partial(kind, draw)) for kind in KINDS)
+    for functions, letters, words in ROWS:
+        sizes = {letter: draw.choice(given) for letter, given in letters.items()}
+        values = {word: draw.choice(given) for word, given in words.items()}
+        for name, text in functions.items():
+            yield name, functools.partial(_call, draw, name, text, sizes, values)
 
 
 def instruction_sets() -> list[str]:
@@ -284,13 +208,13 @@ def main() -> None:
     for number in range(asked.rounds):
         _native.select_simd(sets[number % len(sets)])
         _native.set_thread_count((1, 2, 3)[number // len(sets) % 3])
-        for kind in KINDS:
+        for name, call in calls(Draw(f"{asked.seed} {number}")):
             try:
-                kind(random.Random(f"{asked.seed} {number} {kind.__name__}"))
-                ran[kind.__name__] += 1
+                call()
+                ran[name] += 1
             except (ValueError, TypeError):
-                refused[kind.__name__] += 1
-    idle = [kind.__name__ for kind in KINDS if not ran[kind.__name__]]
+                refused[name] += 1
+    idle = sorted(refused.keys() - ran.keys())
     assert not idle, f"never ran: {idle}"
     print(f"bindings: {ran.total()} calls ran, {refused.total()} were refused, with {', '.join(sets)}")
 

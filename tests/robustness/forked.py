@@ -1,12 +1,16 @@
 """Runs command lines in forked children of this process, and says how each ended.
 
 A fresh start of the program takes seconds, most of them for its imports; a fork has them already. The parent itself
-computes nothing, so that no thread of it is lost in a fork.
+computes nothing, so that no thread of it is lost in a fork. Nothing waits without a limit.
 """
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import faulthandler
 import hashlib
+import importlib
 import os
 import random
 import re
@@ -20,84 +24,172 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from case import Case
+
 CPU_SECONDS = 25
-WALL_SECONDS = 240  # of a child that waits; a busy machine is no fault of it
+WALL_SECONDS = 120
+"""Of a child that waits; a busy machine is no fault of it."""
+MOST_HANGS = 3
+"""What makes so many cases hang makes all hang: the rest would take hours."""
 LARGEST_MIB = 2560
+PRINTED = 1 << 20
+"""Bytes of a child's output that are looked at."""
 TRACEBACK = 70
-ERROR = re.compile(r"^error: (?P<where>.+?): expected .+, found .*\. .+\.$", re.MULTILINE | re.DOTALL)
+PR_SET_CHILD_SUBREAPER = 36
+ERROR = re.compile(
+    r"^error: (?P<where>.+?): expected (?P<expected>.+), found (?P<found>.*?)\. .+\.$",
+    re.MULTILINE | re.DOTALL,
+)
 USAGE = "─"  # the frame that the parser of the command line draws around what it does not understand
 
-Make = Callable[[Path, random.Random], list[str]]
-"""Spoils copies of the base in a new folder; returns the command line."""
+
+@dataclass
+class Child:
+    """A fork, which leads a process group of its own."""
+
+    pid: int
+    said: Path
+    began: float
+    late: bool = False
 
 
 @dataclass(frozen=True)
-class Case:
-    """One mutation.
+class Ended:
+    """How a child ended: exit status (of a signal: negative), the last that it printed, what it used."""
 
-    Attributes:
-        name: what is spoiled, and how. seed: of its random choices.
-        make: see ``Make``.
-        accepted: why it may pass without a word; empty: it may not.
-        says: a regular expression of what it has to print; empty: anything.
-        check: raises where what was written is not as it should be; called with the folder, after the command.
+    status: int
+    text: str
+    late: bool = False
+    seconds: float = 0.0
+    mebibytes: float = 0.0
+
+
+def start(act: Callable[[], int | None], said: Path) -> Child:
+    """Do something in a child, whose output goes to the file ``said``; its exit status is what ``act`` returns."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    pid = os.fork()
+    if pid:
+        with contextlib.suppress(OSError):  # the child has done it, or has ended
+            os.setpgid(pid, pid)
+        return Child(pid, said, time.monotonic())
+    status = TRACEBACK
+    try:
+        os.setpgid(0, 0)
+        printed = os.open(said, os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
+        os.dup2(printed, 1)
+        os.dup2(printed, 2)
+        faulthandler.register(signal.SIGUSR1, file=printed)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        status = act() or 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        with contextlib.suppress(OSError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(status)
+
+
+def ended(child: Child, seconds: float = WALL_SECONDS) -> Ended | None:
+    """How a child ended; None while it runs.
+
+    After ``seconds`` it prints where it is, and is killed. What it has started is killed when it has ended.
+
+    Raises:
+        TimeoutError: it cannot be killed.
     """
+    took = time.monotonic() - child.began
+    if took > seconds and not child.late:
+        child.late = True
+        os.kill(child.pid, signal.SIGUSR1)
+        time.sleep(0.2)  # for the traceback
+        os.killpg(child.pid, signal.SIGKILL)
+    pid, status, usage = os.wait4(child.pid, os.WNOHANG)
+    if not pid and took > seconds + 30:
+        raise TimeoutError(f"process {child.pid} does not end though it was killed: {_tail(child.said)}")
+    if not pid:
+        return None
+    with contextlib.suppress(OSError):
+        os.killpg(child.pid, signal.SIGKILL)
+    code, used = os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime
+    return Ended(code, _tail(child.said), child.late, used, usage.ru_maxrss / 1024)
 
-    name: str
-    seed: int
-    make: Make
-    accepted: str = ""
-    check: Callable[[Path], None] | None = None
-    says: str = ""
+
+def run(act: Callable[[], int | None], said: Path, seconds: float = WALL_SECONDS) -> Ended:
+    """Do something in a child, and wait for it."""
+    child = start(act, said)
+    while (done := ended(child, seconds)) is None:
+        time.sleep(0.005)
+    return done
+
+
+def adopt() -> None:
+    """Take over the orphans of children, on Linux: programs that a killed command has started, which work on."""
+    with contextlib.suppress(AttributeError):
+        ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def _end_orphans(running: Iterable[int]) -> None:
+    """Kill what has been taken over."""
+    with contextlib.suppress(OSError):
+        children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+        for pid in set(map(int, children)) - set(running):
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+
+
+def _tail(path: Path) -> str:
+    try:
+        with open(path, "rb") as file:
+            file.seek(max(0, path.stat().st_size - PRINTED))
+            return file.read().decode(errors="replace")
+    except OSError as error:
+        return str(error)
 
 
 @dataclass(frozen=True)
 class Outcome:
     """How a case ended.
 
-    Attributes:
-        kind: "error" (one line that names what is wrong and what to do), "warning", "accepted" (as listed), or a fault:
-            "silent", "traceback", "crash", "hang", "large", "outside", "unclear".
-        said: the last of what it printed. seconds, mebibytes: processor time and peak memory.
+    ``kind``: "error" (one line that names what is wrong and what to do), "warning", "accepted" (as listed), or a fault:
+    "silent", "traceback", "crash", "hang", "large", "outside", "unclear".
     """
 
     case: Case
     kind: str
-    said: str
-    seconds: float
-    mebibytes: float
+    done: Ended
 
     @property
     def is_fault(self) -> bool:
         """Whether it should not have ended so."""
         return self.kind not in ("error", "warning", "accepted")
 
+    def __str__(self) -> str:
+        figures = f"{self.done.seconds:.1f} s {self.done.mebibytes:.0f} MiB"
+        return f"{self.kind}: {self.case.name} (seed {self.case.seed}) {figures}\n{self.done.text.strip()[-1500:]}"
+
 
 def outcomes(cases: Iterable[Case], base: Path, work: Path, at_once: int = 2) -> Iterator[Outcome]:
-    """Run cases, some at once; outcomes come in the order in which they end."""
-    running: dict[int, tuple[Case, Path, float, str]] = {}
-    waiting = iter(cases)
-    number, exhausted = 0, False
-    while running or not exhausted:
-        while len(running) < at_once and not exhausted:
-            case = next(waiting, None)
-            if case is None:
-                exhausted = True
-                break
-            number += 1
-            folder = work / f"{number}"
+    """Run cases, some at once; outcomes come in the order in which they end, and no more after ``MOST_HANGS``."""
+    running: list[tuple[Case, Path, Child, str]] = []
+    waiting, hangs = enumerate(cases), 0
+    while True:
+        while len(running) < at_once and hangs < MOST_HANGS and (following := next(waiting, None)):
+            folder, case = work / f"{following[0]}", following[1]
             canary = _canary(folder)
-            running[_fork(case, base, folder)] = (case, folder, time.monotonic(), canary)
-        for pid in list(running):
-            case, folder, began, canary = running[pid]
-            ended, status, usage = os.wait4(pid, os.WNOHANG)
-            late = not ended and time.monotonic() - began > WALL_SECONDS
-            if late:
-                os.kill(pid, signal.SIGKILL)
-                ended, status, usage = os.wait4(pid, 0)
-            if ended:
-                del running[pid]
-                yield _outcome(case, folder, status, usage, canary, late)
+            running.append((case, folder, start(_act(case, base, folder), folder / "said"), canary))
+        if not running:
+            return
+        for entry in list(running):
+            case, folder, child, canary = entry
+            done = ended(child)
+            if done is not None:
+                running.remove(entry)
+                _end_orphans(child.pid for _, _, child, _ in running)
+                outcome = Outcome(case, _kind(case, done, _digest(folder) == canary), done)
+                hangs += outcome.kind == "hang"
+                yield outcome
                 shutil.rmtree(folder, ignore_errors=True)
         time.sleep(0.005)
 
@@ -111,78 +203,55 @@ def _canary(folder: Path) -> str:
 
 def _digest(folder: Path) -> str:
     found = hashlib.sha256()
-    for path in sorted(folder.rglob("*")):
-        if "case" not in path.relative_to(folder).parts[:1] and path.name != "said":
-            found.update(str(path.relative_to(folder)).encode())
+    for place in sorted(set(folder.iterdir()) - {folder / "case", folder / "said"}):
+        for path in (place, *sorted(place.rglob("*"))):
+            found.update(str(path.relative_to(folder)).encode(errors="surrogateescape"))
             found.update(path.read_bytes() if path.is_file() else b"")
     return found.hexdigest()
 
 
-def _fork(case: Case, base: Path, folder: Path) -> int:
-    sys.stdout.flush()
-    sys.stderr.flush()
-    pid = os.fork()
-    if pid:
-        return pid
-    status = TRACEBACK
-    try:
-        status = _child(case, base, folder)
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
+def _act(case: Case, base: Path, folder: Path) -> Callable[[], int]:
+    def act() -> int:
+        place = folder / "case"
+        shutil.copytree(base, place, symlinks=True)
+        for record in place.glob("*/run.json"):  # else the base's own scene would be read, which is whole
+            record.write_text(record.read_text().replace(f'"{base}/', f'"{place}/'))
+        os.chdir(place)
+        random.seed(f"{case.name} {case.seed}")
+        case.change()
+        resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS + 5))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        try:
+            status = importlib.import_module("polarguide.cli.app").run(case.words)
+        except SystemExit as ended:  # of the parser of the command line
+            status = ended.code if isinstance(ended.code, int) else bool(ended.code)
+        if case.check is not None:
+            case.check()
+        return int(status)
+
+    return act
 
 
-def _child(case: Case, base: Path, folder: Path) -> int:
-    from polarguide.cli.app import run
-
-    said = os.open(folder / "said", os.O_CREAT | os.O_WRONLY)
-    os.dup2(said, 1)
-    os.dup2(said, 2)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    shutil.copytree(base, folder / "case", symlinks=True)
-    for record in (folder / "case").glob(
-        "*/run.json"
-    ):  # else the base's own scene would be read, which is whole
-        record.write_text(record.read_text().replace(f'"{base}/', f'"{folder / "case"}/'))
-    os.chdir(folder / "case")
-    arguments = case.make(folder / "case", random.Random(f"{case.name} {case.seed}"))
-    resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS + 5))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    try:
-        status = run(arguments)
-    except SystemExit as ended:  # of the parser of the command line
-        status = ended.code if isinstance(ended.code, int) else int(bool(ended.code))
-    if case.check is not None:
-        case.check(folder / "case")
-    return status
-
-
-def _outcome(case: Case, folder: Path, status: int, usage: object, canary: str, late: bool) -> Outcome:
-    said = (folder / "said").read_text(errors="replace") if (folder / "said").exists() else ""
-    code = os.waitstatus_to_exitcode(status)
-    mebibytes = usage.ru_maxrss / 1024  # type: ignore[attr-defined]
-    seconds = usage.ru_utime + usage.ru_stime  # type: ignore[attr-defined]
-    if _digest(folder) != canary:
-        kind = "outside"
-    elif late or code in (-signal.SIGXCPU, -signal.SIGKILL):
-        kind = "hang"
-    elif code < 0:
-        kind = "crash"
-    elif code == TRACEBACK or "Traceback (most recent call last)" in said:
-        kind = "traceback"
-    elif mebibytes > LARGEST_MIB:
-        kind = "large"
-    elif code == 2:
-        kind = "error" if ERROR.search(said) or USAGE in said else "unclear"
-    elif code:
-        kind = "unclear"
-    elif "warning: " in said:
-        kind = "warning"
-    else:
-        kind = "accepted" if case.accepted else "silent"
-    if kind in ("error", "warning", "accepted") and not re.search(case.says, said, re.DOTALL):
-        kind = "unclear"
-    return Outcome(case, kind, said[-1500:], seconds, mebibytes)
+def _kind(case: Case, done: Ended, inside: bool) -> str:
+    """How a case ended; see ``Outcome``."""
+    if not inside:
+        return "outside"
+    if done.late or done.status in (-signal.SIGXCPU, -signal.SIGKILL):
+        return "hang"
+    if done.status < 0:
+        return "crash"
+    if done.status == TRACEBACK or "Traceback (most recent call last)" in done.text:
+        return "traceback"
+    if done.mebibytes > LARGEST_MIB:
+        return "large"
+    error = ERROR.search(done.text)
+    fields = error.groupdict() if error else {}
+    patterns = [(getattr(case, name), fields.get(name, "")) for name in ("where", "expected", "found")]
+    patterns += [(case.warning and f"warning: .*{case.warning}", done.text), (case.prints, done.text)]
+    if done.status not in (0, 2) or not all(re.search(given, text, re.DOTALL) for given, text in patterns):
+        return "unclear"
+    if done.status == 2:
+        return "error" if error or USAGE in done.text else "unclear"
+    if "warning: " in done.text:
+        return "warning"
+    return "accepted" if case.passes else "silent"

@@ -1,236 +1,224 @@
-# ruff: noqa: E501
-"""Ways to spoil files: bytes, numbers in JSON, pictures, arrays and tensors, chosen by a seed."""
+"""Random ways to spoil files: bytes, numbers in JSON, pictures, arrays, tensors. ``random`` is seeded with the case."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
-import os
 import random
-import struct
 import zipfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from base import CHECKPOINT
+from changes import deferred
 
+BYTES = ("cut", "empty", "garbage", "flip", "fill", "insert", "append", "twice")
+FIELDS = ("value", "removed", "renamed", "near", "nested")
+PICTURES = (
+    "black",
+    "white",
+    "gray",
+    "small",
+    "wide",
+    "turned",
+    "8 bits",
+    "noise",
+    "floats",
+    "huge",
+    "animated",
+)
+ARRAYS = ("not finite", "other shape", "other type", "objects", "bomb", "header", "encrypted", "zeros")
+TENSORS = ("missing", "not finite", "shorter", "longer", "axis", "type", "huge", "stranger", "none")
 WORDS: list[Any] = [
-    None, True, False, -1, 0, 1, 3, 1e308, -1e30, 1e30, 1e-300, math.nan, math.inf, -math.inf, 2**31, 2**63, 2**70, "", "x" * 5000,
-    "../../outside/victim.txt", "/dev/zero", "[bold]x[/bold]", "[/]", "=1+1", "\u202e\x00\x1b[31m", "nan", "1.5", [], {}, [[]], [None],
-    [1e30, math.nan], {"": ""},
+    None, True, False, -1, 0, 1, 3, 1e308, -1e30, 1e30, 1e-300, math.nan, math.inf, -math.inf, 2**31, 2**63, 2**70, "",
+    "x" * 5000, "../../outside/victim.txt", "/dev/zero", "[bold]x[/bold]", "[/]", "=1+1", "\u202e\x00\x1b[31m", "nan",
+    "1.5", [], {}, [[]], [None], [1e30, math.nan], {"": ""},
 ]  # fmt: skip
 
 
-def bytes_of(path: Path, rng: random.Random, how: str) -> None:
-    """Spoil a file's bytes."""
-    data = bytearray(path.read_bytes())
+def _bytes(data: bytearray, how: str) -> bytes:
     size = max(1, len(data))
+    at = random.randrange(size)
     if how == "cut":
-        data = data[: rng.randrange(size)]
-    elif how == "empty":
-        data = bytearray()
-    elif how == "garbage":
-        data = bytearray(rng.randbytes(rng.randint(1, 400)))
-    elif how == "flip":
-        for _ in range(rng.randint(1, 8)):
-            data[rng.randrange(size)] ^= 1 << rng.randrange(8)
+        return data[:at]
+    if how == "empty":
+        return b""
+    if how == "garbage":
+        return random.randbytes(random.randint(1, 400))
+    if how == "flip":
+        for _ in range(random.randint(1, 8)):
+            data[random.randrange(size)] ^= 1 << random.randrange(8)
     elif how == "fill":
-        at = rng.randrange(size)
-        data[at : at + rng.choice((4, 8, 16))] = rng.choice((b"\xff", b"\x00", b"\x7f")) * 8
+        data[at : at + random.choice((4, 8, 16))] = random.choice((b"\xff", b"\x00", b"\x7f")) * 8
     elif how == "insert":
-        at = rng.randrange(size)
-        data[at:at] = rng.randbytes(rng.randint(1, 40))
+        data[at:at] = random.randbytes(random.randint(1, 40))
     elif how == "append":
-        data += rng.randbytes(rng.randint(1, 40))
-    elif how == "twice":
-        data = data + data
-    path.write_bytes(bytes(data))
-
-
-def place(path: Path, how: str) -> None:
-    """Put something else in a file's place."""
-    path.unlink()
-    if how == "folder":
-        path.mkdir()
-    elif how == "pipe":
-        os.mkfifo(path)
-    elif how == "device":
-        path.symlink_to("/dev/zero")
-    elif how == "loop":
-        path.symlink_to(path.name)
-    elif how == "dangling":
-        path.symlink_to("nowhere")
-    elif how == "outside":
-        path.symlink_to(Path("../../outside/victim.txt"))
-
-
-def json_of(path: Path, rng: random.Random, how: str) -> None:
-    """Spoil one value of a JSON file."""
-    content = json.loads(path.read_text())
-    if how == "nested":
-        depth = rng.choice((60, 900, 3000, 100_000))
-        inner = "[" * depth + "]" * depth
-        key = json.dumps(rng.choice(list(content)) if isinstance(content, dict) else "x")
-        path.write_text(f"{{{key}: {inner}}}")
-        return
-    places = list(_places(content, ()))
-    keys = rng.choice(places)
-    owner = content
-    for key in keys[:-1]:
-        owner = owner[key]
-    if how == "removed":
-        del owner[keys[-1]]
-    elif how == "renamed" and isinstance(owner, dict):
-        owner[str(keys[-1]) + "_"] = owner.pop(keys[-1])
-    elif how == "near":
-        old = owner[keys[-1]]
-        number = isinstance(old, int | float) and not isinstance(old, bool)
-        owner[keys[-1]] = rng.choice((-old, old * 1e9, old + 0.5, str(old))) if number else [old]
+        data += random.randbytes(random.randint(1, 40))
     else:
-        owner[keys[-1]] = rng.choice(WORDS)
-    path.write_text(json.dumps(content))
+        assert how == "twice", how
+        return bytes(data) * 2
+    return bytes(data)
 
 
-def _places(value: Any, before: tuple[Any, ...]) -> Any:
+@deferred
+def bytes_of(path: str, how: str) -> None:
+    """Spoil a file's bytes."""
+    Path(path).write_bytes(_bytes(bytearray(Path(path).read_bytes()), how))
+
+
+@deferred
+def json_of(path: str, how: str = "") -> None:
+    """Spoil one value of a JSON file, in a way that is drawn where none is given."""
+    content = json.loads(Path(path).read_text())
+    Path(path).write_text(_spoiled(content, how or random.choice(FIELDS)))
+
+
+def _spoiled(content: Any, how: str) -> str:
+    if how == "nested":
+        depth = random.choice((60, 900, 3000, 100_000))
+        key = random.choice(list(content)) if isinstance(content, dict) else "x"
+        return f"{{{json.dumps(key)}: {'[' * depth + ']' * depth}}}"
+    *above, key = random.choice(list(_places(content, ())))
+    owner = content
+    for step in above:
+        owner = owner[step]
+    old = owner[key]
+    if how == "removed":
+        del owner[key]
+    elif how == "renamed" and isinstance(owner, dict):
+        owner[f"{key}_"] = owner.pop(key)
+    elif how == "near":
+        number = isinstance(old, int | float) and not isinstance(old, bool)
+        owner[key] = random.choice((-old, old * 1e9, old + 0.5, str(old))) if number else [old]
+    else:
+        owner[key] = random.choice(WORDS)
+    return json.dumps(content)
+
+
+def _places(value: Any, before: tuple[Any, ...]) -> Iterator[tuple[Any, ...]]:
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, inner in items:
         yield (*before, key)
         yield from _places(inner, (*before, key))
 
 
-def json_field(path: Path, keys: tuple[Any, ...], value: Any) -> None:
-    """Set one value of a JSON file."""
-    content = json.loads(path.read_text())
-    owner = content
-    for key in keys[:-1]:
-        owner = owner[key]
-    owner[keys[-1]] = value
-    path.write_text(json.dumps(content))
+def _noise(pixels: np.ndarray) -> np.ndarray:
+    draw = np.random.default_rng(random.randrange(2**31))
+    return draw.integers(0, np.iinfo(pixels.dtype).max, pixels.shape, dtype=pixels.dtype)
 
 
-def picture(path: Path, rng: random.Random, how: str) -> None:
+CONTENT: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "black": np.zeros_like,
+    "white": lambda pixels: np.full_like(pixels, np.iinfo(pixels.dtype).max),
+    "gray": lambda pixels: pixels if pixels.ndim == 2 else pixels[..., 1],
+    "small": lambda pixels: pixels[: random.randint(1, len(pixels) - 1)],
+    "wide": lambda pixels: np.concatenate((pixels, pixels), axis=1),
+    "turned": np.rot90,
+    "8 bits": lambda pixels: (pixels // 257 if pixels.dtype == np.uint16 else pixels).astype(np.uint8),
+    "noise": _noise,
+    "huge": lambda pixels: np.zeros((12000, 12000), np.uint8),
+}
+
+
+@deferred
+def picture(path: str, how: str) -> None:
     """A whole picture with other content."""
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if how == "black":
-        pixels = np.zeros_like(pixels)
-    elif how == "white":
-        pixels = np.full_like(pixels, np.iinfo(pixels.dtype).max)
-    elif how == "gray":
-        pixels = pixels if pixels.ndim == 2 else pixels[..., 1]
-    elif how == "small":
-        pixels = pixels[: rng.randint(1, len(pixels) - 1)]
-    elif how == "wide":
-        pixels = np.concatenate((pixels, pixels), axis=1)
-    elif how == "turned":
-        pixels = np.rot90(pixels)
-    elif how == "8 bits":
-        pixels = (pixels // 257 if pixels.dtype == np.uint16 else pixels).astype(np.uint8)
-        pixels = pixels[..., :2] if rng.random() < 0 else pixels
-    elif how == "noise":
-        pixels = np.random.default_rng(rng.randrange(2**31)).integers(
-            0, np.iinfo(pixels.dtype).max, pixels.shape, dtype=pixels.dtype
-        )
-    elif how == "floats":
-        cv2.imwrite(str(path.with_suffix(".tif")), pixels.astype(np.float32))
-        path.unlink()
+    if how == "animated":
+        Path(path).write_bytes(b"GIF89a" + random.randbytes(60))
         return
-    elif how == "huge":
-        assert cv2.imwrite(str(path), np.zeros((12000, 12000), np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    pixels = cv2.imread(path, cv2.IMREAD_UNCHANGED)
+    if how == "floats":
+        cv2.imwrite(str(Path(path).with_suffix(".tif")), pixels.astype(np.float32))
+        Path(path).unlink()
         return
-    elif how == "animated":
-        path.write_bytes(b"GIF89a" + rng.randbytes(60))
-        return
-    else:
-        raise ValueError(how)
-    assert cv2.imwrite(str(path), np.ascontiguousarray(pixels))
+    written = np.ascontiguousarray(CONTENT[how](pixels))
+    assert cv2.imwrite(path, written, [cv2.IMWRITE_PNG_COMPRESSION, 1])
 
 
-def big_tiff(path: Path, width: int, height: int) -> None:
-    """A BigTIFF of a few bytes that says how large it is."""
-    tags = [(256, 4, width), (257, 4, height), (258, 3, 16), (259, 3, 1), (262, 3, 1), (273, 16, 16), (277, 3, 1), (278, 4, height),
-            (279, 16, 64)]  # fmt: skip
-    data = struct.pack("<2sHHHQ", b"II", 43, 8, 0, 16) + struct.pack("<Q", len(tags))
-    for tag, kind, value in tags:
-        data += struct.pack("<HHQQ", tag, kind, 1, value)
-    path.write_bytes(data + bytes(72))
-
-
-def archive(path: Path, rng: random.Random, how: str) -> None:
+@deferred
+def archive(path: str, how: str) -> None:
     """Spoil an .npz file."""
+    if how in ("bomb", "header"):
+        shape, blocks = ((1 << 20, 300, 3), 450) if how == "bomb" else ((1 << 40, 1 << 20), 0)
+        _promise(path, shape, blocks)
+        return
     arrays = dict(np.load(path))
-    name = rng.choice(sorted(arrays))
+    name = random.choice(sorted(arrays))
     value = arrays[name]
     if how == "not finite":
         value = value.astype(np.float32)
-        value.reshape(-1)[rng.randrange(value.size)] = rng.choice((math.nan, math.inf))
+        value.reshape(-1)[random.randrange(value.size)] = random.choice((math.nan, math.inf))
     elif how == "other shape":
-        value = value[: rng.randrange(len(value))]
+        value = value[: random.randrange(len(value))]
     elif how == "other type":
-        value = value.astype(rng.choice(("complex64", "U3", "datetime64[s]")))
+        value = value.astype(random.choice(("complex64", "U3", "datetime64[s]")))
     elif how == "objects":
         value = np.array([{"a": 1}], dtype=object)
-    elif how == "bomb":
-        with (
-            zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file,
-            file.open("normal.npy", "w", force_zip64=True) as member,
-        ):
-            np.lib.format.write_array_header_1_0(
-                member, {"descr": "<f4", "fortran_order": False, "shape": (1 << 20, 300, 3)}
-            )  # type: ignore
-            for _ in range(450):
-                member.write(bytes(1 << 23))
-        return
-    elif how == "header":
-        with zipfile.ZipFile(path, "w") as file, file.open("normal.npy", "w") as member:
-            np.lib.format.write_array_header_1_0(
-                member, {"descr": "<f4", "fortran_order": False, "shape": (1 << 40, 1 << 20)}
-            )  # type: ignore
-        return
-    elif how == "encrypted":
-        np.savez(path, **arrays)
-        data = bytearray(path.read_bytes())
-        for mark, at in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
-            found = data.find(mark)
-            while found >= 0:
-                data[found + at] |= 1
-                found = data.find(mark, found + 4)
-        path.write_bytes(bytes(data))
-        return
     elif how == "zeros":
         value = np.zeros_like(value)
     np.savez_compressed(path, **{**arrays, name: value})
+    if how == "encrypted":
+        _encrypt(Path(path))
 
 
-def tensors(path: Path, rng: random.Random, how: str) -> None:
+def _promise(path: str, shape: tuple[int, ...], blocks: int) -> None:
+    """An array of a shape, and so many blocks of 8 MiB of it."""
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file,
+        file.open("normal.npy", "w", force_zip64=True) as member,
+    ):
+        head = {"descr": "<f4", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(member, head)  # type: ignore[arg-type]
+        for _ in range(blocks):
+            member.write(bytes(1 << 23))
+
+
+def _encrypt(path: Path) -> None:
+    """Say of every member of a zip file that it is encrypted."""
+    data = bytearray(path.read_bytes())
+    for mark, at in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        found = data.find(mark)
+        while found >= 0:
+            data[found + at] |= 1
+            found = data.find(mark, found + 4)
+    path.write_bytes(bytes(data))
+
+
+@deferred
+def checkpoint(how: str, path: str = CHECKPOINT) -> None:
     """Spoil one tensor of a checkpoint."""
-    import torch
-    from safetensors.torch import load_file, save_file
-
-    whole = load_file(path)
-    name = rng.choice(sorted(whole))
+    torch, files = importlib.import_module("torch"), importlib.import_module("safetensors.torch")
+    whole = files.load_file(path)
+    kinds = {"not finite": [k for k, t in whole.items() if t.is_floating_point()],
+             "huge": [k for k in whole if k.startswith("gaussians.")]}  # fmt: skip
+    name = random.choice(sorted(kinds.get(how, whole)))
     value = whole[name]
     if how == "missing":
         del whole[name]
-    elif how == "not finite":
-        name = rng.choice(sorted(key for key, t in whole.items() if t.is_floating_point()))
-        whole[name].view(-1)[rng.randrange(whole[name].numel())] = rng.choice((math.nan, math.inf))
+    elif how in ("not finite", "huge"):
+        numbers = (math.nan, math.inf) if how == "not finite" else (-3e38, 3e38)
+        value.view(-1)[random.randrange(value.numel())] = random.choice(numbers)
     elif how == "shorter":
-        whole[name] = value.reshape(-1)[: max(0, value.numel() - rng.randint(1, 5))].clone()
+        whole[name] = value.reshape(-1)[: max(0, value.numel() - random.randint(1, 5))].clone()
     elif how == "longer":
         whole[name] = torch.cat((value.reshape(-1), value.reshape(-1))).clone()
     elif how == "axis":
         whole[name] = value[None].clone()
     elif how == "type":
-        whole[name] = value.to(rng.choice((torch.float64, torch.float16, torch.int32, torch.uint8)))
-    elif how == "huge":
-        name = rng.choice(sorted(key for key in whole if key.startswith("gaussians.")))
-        whole[name].view(-1)[rng.randrange(whole[name].numel())] = rng.choice((-1, 1)) * 3e38
+        whole[name] = value.to(random.choice((torch.float64, torch.float16, torch.int32, torch.uint8)))
     elif how == "stranger":
         whole["../" + name] = value.clone()
-    elif how == "none":
-        whole = {
-            key: (t[:0].clone() if t.ndim and t.shape[:1] == whole["gaussians.means"].shape[:1] else t)
-            for key, t in whole.items()
-        }
-    save_file(whole, path)
+    else:
+        assert how == "none", how
+        whole = without_gaussians(whole)
+    files.save_file(whole, path)
+
+
+def without_gaussians(whole: dict[str, Any]) -> dict[str, Any]:
+    """The tensors of a checkpoint, without a row for any Gaussian."""
+    count = whole["gaussians.means"].shape[:1]
+    return {key: t[:0].clone() if t.ndim and t.shape[:1] == count else t for key, t in whole.items()}

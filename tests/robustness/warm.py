@@ -29,7 +29,7 @@ IMPORTED = (
 )
 
 
-def warm_up(few_gaussians: bool = True) -> None:
+def warm_up() -> None:
     """Import what the verbs import, and compute what they keep; starts no thread, which a fork would lose."""
     for name in IMPORTED:
         importlib.import_module(name)
@@ -40,10 +40,12 @@ def warm_up(few_gaussians: bool = True) -> None:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
             app.run([verb, "--help"])
     importlib.import_module("polarguide.results.evaluation.sources").code_digest()
-    if few_gaussians:
-        _shrink(importlib.import_module("polarguide.recipes.registry"))
+    _shrink(importlib.import_module("polarguide.recipes.registry"))
     tasks = Path("/proc/self/task")
-    assert not tasks.exists() or len(list(tasks.iterdir())) == 1, "a thread would be lost in a fork"
+    threads = [(task / "comm").read_text().strip() for task in tasks.iterdir()] if tasks.exists() else []
+    assert len(threads) <= 1, (
+        f"threads would be lost in a fork, and with them the locks that they hold: {threads}"
+    )
     gc.collect()
     gc.freeze()
 
@@ -51,7 +53,6 @@ def warm_up(few_gaussians: bool = True) -> None:
 def _shrink(registry: object) -> None:
     for recipes in (registry.RECIPES, registry._BUILT_IN):  # type: ignore[attr-defined]
         for name, recipe in recipes.items():
-            if not hasattr(recipe, "initialization"):  # it has no Gaussians
-                continue
-            start = dataclasses.replace(recipe.initialization, shell=SHELL)
-            recipes[name] = dataclasses.replace(recipe, initialization=start)
+            if hasattr(recipe, "initialization"):  # others have no Gaussians
+                start = dataclasses.replace(recipe.initialization, shell=SHELL)
+                recipes[name] = dataclasses.replace(recipe, initialization=start)

@@ -103,6 +103,13 @@ class ResolvedSettings(TrainSettings):
 
     _LEAST_GAUSSIANS: ClassVar[int] = 0
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("steps", "refractive_index"):  # a record without them gets the None of the class above
+            if getattr(self, name) is None:
+                remedy = "Restore the file, or train again into a new folder."
+                raise PolarguideError(name, expected="a number", found="nothing", remedy=remedy)
+
     def fit(self, asked: TrainSettings) -> bool:
         """Whether they are as was asked, whatever was left open."""
         return asked.specified().items() <= vars(self).items()

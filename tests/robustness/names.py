@@ -1,0 +1,109 @@
+"""Names that a console takes for markup, that it cannot write, or that are no text, and pages that are called so."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from base import (
+    EVAL,
+    INSPECT,
+    MAPS,
+    MEASURE,
+    MOSAIC,
+    MOSAICS,
+    ONE,
+    PICTURE,
+    READ,
+    RENDER,
+    SHARE,
+    SYNTH,
+    TRAIN,
+    WATCH,
+)
+from case import Case, nothing, table
+from changes import A_NAME, copy, edit, no_control, no_script, rename, several, write, write_json
+from synthesis import ball
+
+CASES: list[Case] = []
+NO_TEXT = os.fsdecode(b"new\xff\xfe")
+CONTROL = "\x1b[2J\x1b]0;mine\x07\u202e"
+ESCAPED = "it is escaped"
+HOSTILE = "x<img src=x onerror=alert(1)>"
+
+
+def _named(command: str, out: str = "", source: str = "") -> list[str]:
+    """A command whose source, or what it writes, is called otherwise."""
+    words = command.split()
+    if source:
+        words[1] = source
+    if out:
+        words[words.index("--out") + 1] = out
+    return words
+
+
+for kind, name in (
+    ("markup", "new[/red]"),
+    ("escapes", "new\x1b[2J\u202e"),
+    ("bytes that are no text", NO_TEXT),
+):
+    moved, shot = rename("run", name), f"mosaics/{name}.png"
+    CASES += table(
+        f"name of {kind}:", "",
+        *(Case(verb, change, words, ci=kind == "escapes" and verb in ("train", "measure")) for verb, change, words in (
+            ("train", nothing, _named(TRAIN, name)),
+            ("eval", moved, _named(EVAL, source=name)),
+            ("render", moved, _named(RENDER, source=name)),
+            ("export", moved, ["export", name, "--format", "ply"]),
+            ("prepare", nothing, _named(MOSAICS, name)),
+            ("priors", nothing, _named(MAPS, name)),
+            ("measure", nothing, _named(MEASURE, name)),
+            ("a watched shot", several(copy(MOSAIC, shot), write(shot, "none")), WATCH),
+            ("synth", write_json("spec.json", ball()), _named(SYNTH, name)),
+        )),
+        passes=A_NAME, check=no_control,
+    )  # fmt: skip
+
+# What was trained in a folder whose name is no UTF-8 can be read again.
+name = os.fsdecode(b"run\xff")
+film = f"render run --path orbit --frames 2 --layers final {ONE} --video"
+CASES += table(
+    "run in a folder whose name is no UTF-8:", "",
+    Case("eval", command=_named(EVAL, source=name), ci=True),
+    *(Case(f"export {kind}", command=["export", name, "--format", kind, *ONE.split()], ci=kind == "environment")
+      for kind in ("ply", "sog", "environment", "cameras")),
+    Case("share", command=["share", name, *ONE.split()]),
+    Case("maps", command=_named(MAPS.replace("npy", "exr"), name), ci=True),
+    Case("a film", command=[*_named(film, source=name), f"{name}/a.mp4"]),
+    change=rename("run", name), passes=A_NAME, prints=r"\A(?!.*error: )",
+)  # fmt: skip
+
+
+def _ascii() -> None:
+    """A console that knows ASCII alone."""
+    sys.stdout.reconfigure(encoding="ascii", errors="strict")  # type: ignore[union-attr]
+
+
+def _view_of_control() -> None:
+    for path in list(Path("scene/polar").glob("v001_*")):
+        path.rename(path.with_name(path.name.replace("v001", CONTROL)))
+    edit("scene/sparse/0/images.txt", lambda given: given.replace("v001.png", f"{CONTROL}.png"))()
+
+
+script = "</title><script>alert(1)</script><img src=x onerror=alert(1)><!--"
+CASES += table(
+    "control characters of", TRAIN,
+    Case("a view without a pose", _view_of_control, READ, ci=True),
+    Case("a picture of no view", copy(PICTURE, f"scene/polar/{CONTROL}.png"), READ),
+    Case("a scene", rename("scene", CONTROL), ["priors", CONTROL, *READ.split()[2:]], passes="they are not shown"),
+    Case("an option", more=["--recipe", CONTROL], ci=True),
+    check=no_control,
+)  # fmt: skip
+CASES += [
+    Case("page of a hostile title", nothing, SHARE, ["--title", script, "--caption", script], passes=ESCAPED,
+         check=no_script, ci=True),
+    Case("inspection of a hostile name", rename("scene", HOSTILE), _named(INSPECT, source=HOSTILE), passes=ESCAPED,
+         check=no_script),
+    Case("console of ASCII: priors", _ascii, _named(MAPS, "n\u2603"), passes=A_NAME, ci=True),
+]  # fmt: skip

@@ -1,0 +1,9 @@
+"""Spoiled runs and records, and odd names end as their tables say."""
+
+import pytest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("table", ["runs", "records", "names"])
+def test_every_case_ends_as_its_table_says(table, run_table):
+    assert run_table(table) == []
