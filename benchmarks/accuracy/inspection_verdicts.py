@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from polarguide.capture import checks
 from polarguide.capture.calibration import Calibration, oriented
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.inspection.angles import ORDERS, combine_evidence, order_check, zero_check
 from polarguide.inspection.capture import Capture, measure_view, read_capture
 from polarguide.inspection.evidence import point_evidence
 from polarguide.inspection.picture_checks import find_pairing, picture_checks
 from polarguide.optics.color import srgb_encode_array
-from polarguide.optics.polarizer import ANGLES
 
 Change = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 

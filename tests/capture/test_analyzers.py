@@ -15,7 +15,7 @@ from polarguide.capture.sensor.analyzer_file import read_analyzers, write_analyz
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration, correction_matrices, spread_to_cells
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.core.errors import PolarguideError
-from polarguide.optics.polarizer import ANGLES
+from polarguide.geometry.polarizer import ANGLES
 
 SENSORS = ("IMX250MZR", "IMX250MYR")
 LIGHT = np.array([0.8, 0.05, -0.06])

@@ -17,8 +17,8 @@ from polarguide.capture import load_scene
 from polarguide.capture.calibration import Calibration, combined, oriented
 from polarguide.capture.exposures import FOUR, Exposure, read_table, table_text
 from polarguide.capture.filter.shots import find_single_shots
+from polarguide.geometry.polarizer import ANGLES, malus, stokes_of_four
 from polarguide.inspection.capture import read_capture
-from polarguide.optics.polarizer import ANGLES, malus, stokes_of_four
 from polarguide.preparation.exposure_table import exposures_of_points, reconciled
 from tests.helpers.tiny_capture import NAMES, TinyCapture, write_picture, write_tiny_capture
 

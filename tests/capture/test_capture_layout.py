@@ -13,7 +13,7 @@ from tiny_capture import NAMES, TinyCapture, encode_srgb, fails, write_picture
 from polarguide.capture import checks, load_scene
 from polarguide.capture.layout import refuse_scene
 from polarguide.core.errors import PolarguideError
-from polarguide.optics.polarizer import ANGLES
+from polarguide.geometry.polarizer import ANGLES
 
 
 @pytest.mark.parametrize(

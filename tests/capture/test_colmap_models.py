@@ -20,7 +20,7 @@ from polarguide.capture.colmap.model import unseen_points
 from polarguide.capture.colmap.sfm import NotConnectedError, connected_views, log_false_alarms, reconstruct
 from polarguide.core.progress import SILENT
 from polarguide.geometry.camera import Camera
-from polarguide.optics.polarizer import ANGLES
+from polarguide.geometry.polarizer import ANGLES
 
 
 def model_folder(capture: TinyCapture) -> Path:

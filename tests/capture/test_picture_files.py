@@ -24,8 +24,8 @@ from polarguide.capture.formats.pictures import decode_picture, linear_codes
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.write import intensity_codes, rounding_of, write_png
 from polarguide.core.errors import PolarguideError
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.optics.color import srgb_decode_array
-from polarguide.optics.polarizer import ANGLES
 
 tifffile = pytest.importorskip("tifffile", reason="tifffile writes the unusual TIFF files")
 

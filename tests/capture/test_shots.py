@@ -26,7 +26,7 @@ from polarguide.capture.filter.exif import apply_orientation, orientation_calibr
 from polarguide.capture.filter.ring_scale import BAND, place, ring_scale
 from polarguide.capture.filter.shots import split_name
 from polarguide.core.errors import PolarguideError
-from polarguide.optics.polarizer import malus
+from polarguide.geometry.polarizer import malus
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.synth.sensor import FilterShot, Sensor, behind_filter, exif_tags, filter_jpeg

@@ -155,7 +155,9 @@ def test_a_missing_library_is_named(
     kind: str, module: str, refused, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def missing(name: str) -> object:
-        raise ImportError(name)
+        if name == module:
+            raise ImportError(name)
+        return importlib.import_module(name)
 
     monkeypatch.setattr(errors, "importlib", SimpleNamespace(import_module=missing, util=importlib.util))
     line = refused("export", trained, "--format", kind, "--out", tmp_path)

@@ -12,7 +12,7 @@ import pytest
 from camera_files import write_mosaics
 
 from polarguide.cli.app import run
-from polarguide.optics.polarizer import ANGLES
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.shots.measurement.pictures import diverging
 from tests.shots.test_read import write_four
 

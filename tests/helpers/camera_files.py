@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from tiny_capture import encode_srgb, write_picture, write_text_model
 
-from polarguide.optics.polarizer import ANGLES, malus
+from polarguide.geometry.polarizer import ANGLES, malus
 
 COLOR = ("R90 R45 G90 G45", "R135 R0 G135 G0", "G90 G45 B90 B45", "G135 G0 B135 B0")
 MONO = ("90 45", "135 0")

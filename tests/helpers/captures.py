@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.inspection.capture import Capture, read_capture
-from polarguide.optics.polarizer import ANGLES
 
 
 def soft_intensities(seed: int, size: tuple[int, int] = (60, 80)) -> np.ndarray:

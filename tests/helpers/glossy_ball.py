@@ -14,9 +14,9 @@ from polarguide import optics
 from polarguide.capture import ColmapModel, checks
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.geometry.camera import Camera
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.inspection.capture import InspectedView
 from polarguide.inspection.evidence import Surface
-from polarguide.optics.polarizer import ANGLES
 
 WIDTH, HEIGHT, INDEX = 72, 64, 1.5
 

@@ -12,9 +12,9 @@ from polarguide import optics
 from polarguide.capture import GroundTruth, Scene, View
 from polarguide.fields.field import MARGIN
 from polarguide.geometry.camera import Camera, look_at
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.geometry.vectors import unit
 from polarguide.optics.color import srgb_decode
-from polarguide.optics.polarizer import ANGLES
 
 DISTANCE = 4.0
 OFFSET = (0.3, -0.2, 0.25)

@@ -14,7 +14,7 @@ import pytest
 
 from polarguide.capture import load_scene
 from polarguide.core.errors import PolarguideError
-from polarguide.optics.polarizer import ANGLES
+from polarguide.geometry.polarizer import ANGLES
 
 HEIGHT, WIDTH = 10, 12
 NAMES = tuple(f"v{index:03d}" for index in range(9))

@@ -13,10 +13,10 @@ from captures import soft_intensities, write_scene
 
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.core.errors import PolarguideError
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.inspection import corrections as fixing
 from polarguide.inspection.angles import ORDERS, PAIRINGS, AngleFindings, OrderPosterior
 from polarguide.inspection.capture import read_capture
-from polarguide.optics.polarizer import ANGLES
 
 
 def decided(

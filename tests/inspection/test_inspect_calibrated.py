@@ -15,9 +15,9 @@ from made_sensor import made_sensor, true_calibration, write_codes
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.sensor.analyzer_file import write_analyzers
 from polarguide.core.errors import PolarguideError
+from polarguide.geometry.polarizer import ANGLES, stokes_of_four
 from polarguide.inspection.capture import read_capture
 from polarguide.inspection.corrections import analyzer_check, corrected
-from polarguide.optics.polarizer import ANGLES, stokes_of_four
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 

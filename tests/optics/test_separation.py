@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from polarguide import optics
-from polarguide.optics.polarizer import ANGLES, malus
+from polarguide.geometry.polarizer import ANGLES, malus
 
 F64 = torch.float64
 

@@ -27,7 +27,7 @@ from relief import write_relief
 
 import polarguide
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
-from polarguide.optics.polarizer import ANGLES
+from polarguide.geometry.polarizer import ANGLES
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs" / "get-started").glob("*.md")))

@@ -17,7 +17,7 @@ from dataset_files import write_gnerp, write_neisf, write_nersp, write_pandora, 
 from refused_preparations import refused as refused_preparation
 
 from polarguide.core import files
-from polarguide.optics.polarizer import ANGLES
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 

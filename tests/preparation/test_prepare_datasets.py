@@ -33,7 +33,7 @@ from polarguide.capture import load_scene
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.formats.pictures import decode_mask
 from polarguide.core.errors import PolarguideError
-from polarguide.optics.polarizer import ANGLES
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 

@@ -26,7 +26,7 @@ from made_sensor import MadeSensor, made_sensor, true_calibration, write_codes
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.sensor.analyzer_file import write_analyzers
 from polarguide.core.errors import PolarguideError
-from polarguide.optics.polarizer import stokes_of_four
+from polarguide.geometry.polarizer import stokes_of_four
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 

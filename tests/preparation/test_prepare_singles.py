@@ -25,7 +25,7 @@ from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.filter.exif import TURNS, apply_orientation
 from polarguide.core.errors import PolarguideError
-from polarguide.optics.polarizer import malus
+from polarguide.geometry.polarizer import malus
 from polarguide.preparation import prepare as prepare_module
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings

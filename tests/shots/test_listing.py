@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from polarguide.core.errors import PolarguideError
-from polarguide.optics.polarizer import ANGLES
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import read_shot

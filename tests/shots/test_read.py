@@ -14,7 +14,7 @@ from polarguide import optics
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.capture.write import write_view
 from polarguide.core.errors import PolarguideError
-from polarguide.optics.polarizer import ANGLES, malus
+from polarguide.geometry.polarizer import ANGLES, malus
 from polarguide.shots.exposures import find_shots
 from polarguide.shots.maps import Reason, ShotMaps
 from polarguide.shots.options import ShotOptions

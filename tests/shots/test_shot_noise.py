@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
-from polarguide.optics.polarizer import malus
+from polarguide.geometry.polarizer import malus
 from polarguide.shots.maps import Reason, interpolation_factors
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import read_shot

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options, read_record
-from polarguide.optics.polarizer import ANGLES, four_intensities, stokes_of_four
+from polarguide.geometry.polarizer import ANGLES, four_intensities, stokes_of_four
 
 Gain = Annotated[float, msgspec.Meta(ge=0.5, le=2.0)]
 Gains = tuple[Gain, Gain, Gain, Gain]

@@ -20,8 +20,8 @@ from polarguide.core.files import read_file
 from polarguide.core.records import shortened
 from polarguide.core.spreadsheet import csv_lines
 from polarguide.core.text import number_or_nan
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.optics import Mount
-from polarguide.optics.polarizer import ANGLES
 
 Angle = float | Literal["unknown", "none"]
 """Degrees counter-clockwise from the picture's horizontal, modulo 180; or a word."""

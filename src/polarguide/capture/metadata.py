@@ -12,8 +12,8 @@ from polarguide.capture.formats.pictures import MOST_MATERIAL
 from polarguide.capture.view import unknown_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import decode
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.optics import Mount
-from polarguide.optics.polarizer import ANGLES
 
 LEAST_INDEX, LARGEST_INDEX = 1.0, 4.0
 # Of the numbers in materials/, the first that the table of scene.json explains.

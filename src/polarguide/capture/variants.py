@@ -21,7 +21,7 @@ from polarguide.capture.view import FULL_CODE, Latest, Loader, Scene, View
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import EXPOSURES, Exposures, check_choice
 from polarguide.geometry.camera import seen_at
-from polarguide.optics.polarizer import ANGLES
+from polarguide.geometry.polarizer import ANGLES
 
 BLACK = 0.005
 """Linear S0/2 up to which a pixel is black: a little over one step of 8 bits, which is what noise and rounding leave of

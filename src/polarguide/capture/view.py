@@ -23,8 +23,8 @@ from polarguide.capture.exposures import (
 from polarguide.capture.ground_truth import GroundTruth, SceneObject
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.camera import Camera
+from polarguide.geometry.polarizer import ANGLES as ANGLES
 from polarguide.optics import Mount
-from polarguide.optics.polarizer import ANGLES as ANGLES
 
 T = TypeVar("T")
 

@@ -1,1 +1,1 @@
-"""Cameras, vectors and frames."""
+"""Cameras, vectors and frames, and the angles of polarizers."""

@@ -4,6 +4,7 @@ They are differentiable, and value and gradient stay finite at every degenerate 
 polarization, normal and grazing incidence).
 """
 
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.optics.frames import azimuth, lens_frame, normal_from_angles, zenith
 from polarguide.optics.fresnel import (
     brewster,
@@ -34,7 +35,6 @@ from polarguide.optics.normals import (
     physical_candidates,
     polarization_mask,
 )
-from polarguide.optics.polarizer import ANGLES
 from polarguide.optics.separation import (
     Separation,
     exact_separation,

@@ -21,7 +21,7 @@ from polarguide.capture.memory import require_memory_of_each
 from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import Advance
-from polarguide.optics.polarizer import ANGLES, four_intensities
+from polarguide.geometry.polarizer import ANGLES, four_intensities
 from polarguide.preparation.settings import PrepareSettings
 
 

@@ -18,8 +18,8 @@ from polarguide.capture.write import picture_name
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import holds_files, make_folder, read_file, write_whole
 from polarguide.core.records import read_record, shortened
+from polarguide.geometry.polarizer import ANGLES, malus
 from polarguide.optics.color import srgb_encode_array
-from polarguide.optics.polarizer import ANGLES, malus
 from polarguide.synth.mesh import Array
 from polarguide.synth.schema import SceneSpec, with_current_keys
 from polarguide.synth.settings import SynthSettings, Variant

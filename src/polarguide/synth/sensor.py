@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
+from polarguide.geometry.polarizer import malus
 from polarguide.optics.color import srgb_encode_array
-from polarguide.optics.polarizer import malus
 from polarguide.synth.mesh import Array
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from polarguide.core.progress import Reporter
-from polarguide.optics.polarizer import ANGLES
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.shots.measurement.line import measure_shots
 from polarguide.shots.measurement.options import MeasureOptions, WatchOptions
 from polarguide.shots.measurement.table import CSV, LINES

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.sensor.pattern import Pattern, sensor_pattern
 from polarguide.core.errors import PolarguideError
-from polarguide.optics.polarizer import ANGLES
+from polarguide.geometry.polarizer import ANGLES
 
 Array = NDArray[np.float32]
 

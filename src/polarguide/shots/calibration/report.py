@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration
 from polarguide.capture.sensor.pattern import Pattern
-from polarguide.optics.polarizer import ANGLES, stokes_of_four
+from polarguide.geometry.polarizer import ANGLES, stokes_of_four
 from polarguide.shots.calibration.solve import ShotFit
 from polarguide.visualization.figures import FONT, INK, Picture, contact_sheet, scalar_to_rgb, scale_bar
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from polarguide.core.errors import PolarguideError
-from polarguide.optics.polarizer import malus
+from polarguide.geometry.polarizer import malus
 from polarguide.shots.calibration.shots import FEWEST
 
 MISFIT = 0.02

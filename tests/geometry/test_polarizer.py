@@ -10,7 +10,7 @@ import torch
 
 from polarguide import optics
 from polarguide.capture import view
-from polarguide.optics.polarizer import ANGLES, four_intensities, malus, stokes_of_four
+from polarguide.geometry.polarizer import ANGLES, four_intensities, malus, stokes_of_four
 
 LIGHT = np.random.default_rng(0).uniform(0.1, 1.0, (3, 4, 5))
 
