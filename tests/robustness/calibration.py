@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
-import os
 import shutil
 import struct
 from collections.abc import Callable
@@ -89,18 +88,12 @@ def _smaller(paths: list[str]) -> None:
     cv2.imwrite(paths[0], cv2.imread(paths[0], cv2.IMREAD_UNCHANGED)[:-2])
 
 
-def _numbered(paths: list[str]) -> None:
-    for number, path in enumerate(paths):
-        os.rename(path, f"polarizer/{number}_x.png")
-
-
 CASES += table(
     "polarizer shots", CALIBRATE,
     Case("that are all alike", _polarizer(lambda paths: copy(paths[0], *paths[1:])()), ci=True),
     Case("of two sizes", _polarizer(_smaller), ci=True),
     Case("of four", _polarizer(count=4)),
     Case("of a color sensor", _polarizer(), CALIBRATE.replace("MZR", "MYR")),
-    Case("at the angles of no names", _polarizer(_numbered), more="--angles names"),
     *(Case(name, _polarizer(), more=more, ci=ci) for name, more, ci in (
         ("at angles that are no numbers", "--angles 0,30,60,90,nan,150", True),
         ("at too few angles", "--angles 0,30", False),

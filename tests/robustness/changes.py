@@ -187,10 +187,10 @@ def nobody(*closed: str, mode: int = 0) -> None:
 
 @deferred
 def beside(act: Change, when: str) -> None:
-    """Do something from another process, once the command has written a file; it ends with the command."""
+    """Do something from another process, once the command has written to a place; it ends with the command."""
     if not os.fork():
         try:
-            while not Path(when).exists():
+            while not (os.path.exists(when) and os.path.getsize(when)):
                 time.sleep(0.001)
             act()
         finally:

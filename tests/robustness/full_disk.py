@@ -23,10 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from base import EVAL, INSPECT, MOSAICS, ONE, READ, export
-from changes import field
 from forked import ERROR, Ended, run
-from random_runs import ring
-from tiny_capture import NAMES
 
 CLONE_NEWNS, CLONE_NEWUSER = 0x00020000, 0x10000000
 MS_REMOUNT, MS_REC, MS_PRIVATE = 32, 1 << 14, 1 << 18
@@ -67,7 +64,6 @@ def _fix() -> str:
 
 
 PICTURES = f"render run --out new {ONE}"
-SURFACE = "export round --format {} --out new --resolution 24"
 WRITERS = (
     Writer("train", _train, (0.0, 0.6)),
     Writer("eval", EVAL, (0.6,)),
@@ -80,19 +76,11 @@ WRITERS = (
     Writer("inspect", INSPECT, (0.6,)),
     Writer("inspect --fix", _fix, (0.6,)),
     Writer("share", "share run --out new/page.html", (0.6,)),
-    *(
-        Writer(f"export {kind}", export(kind), (0.6,))
-        for kind in ("ply", "spz", "sog", "environment", "cameras")
-    ),
-    *(
-        Writer(f"export {kind}", SURFACE.format(kind), (0.6,) if kind == "mesh" else ())
-        for kind in ("mesh", "points")
-    ),
+    *(Writer(f"export {kind}", export(kind), (0.6,)) for kind in ("ply", "spz", "sog", "environment", "cameras")),
     Writer("compare", f"compare scene --recipes 3dgs polarguide {STEPS} --out new"),
     Writer("synth", "synth proof --out new --size 16x16 --samples 1"),
     Writer("bench", "bench --out new", once=True),
-)
-"""The surfaces are those of the run ``round``: so short a training has none."""
+)  # fmt: skip
 
 
 def own_mounts() -> bool:
@@ -107,29 +95,6 @@ def own_mounts() -> bool:
             Path("/proc/self/gid_map").write_text(f"0 {group} 1")
         return not libc.mount(b"none", b"/", None, MS_REC | MS_PRIVATE, None)
     return False
-
-
-def _make_round(base: Path) -> None:
-    """A run with a surface: opaque Gaussians about the origin, in a scene whose cameras stand around it."""
-    files = importlib.import_module("safetensors.torch")
-    rotation = importlib.import_module("scipy.spatial.transform").Rotation
-    torch = importlib.import_module("torch")
-    shutil.copytree(base / "scene", base / "circle")
-    rows = []
-    for number, (name, camera) in enumerate(zip(NAMES, ring(len(NAMES)).values(), strict=True), 1):
-        x, y, z, w = rotation.from_matrix(camera.rotation.numpy()).as_quat()
-        numbers = " ".join(map(str, (number, w, x, y, z, *camera.translation.tolist(), 1)))
-        rows.append(f"{numbers} {name}.png\n\n")
-    (base / "circle/sparse/0/images.txt").write_text("".join(rows))
-    shutil.copytree(base / "run", base / "round")
-    os.chdir(base)
-    field("round/run.json", "scene", to=str(base / "circle"))()
-    tensors = files.load_file("round/checkpoint.safetensors")
-    generator = torch.Generator().manual_seed(0)
-    tensors["gaussians.means"] = 0.4 * torch.randn(tensors["gaussians.means"].shape, generator=generator)
-    tensors["gaussians.log_scales"].fill_(-1.5)
-    tensors["gaussians.opacity_logits"].fill_(6.0)
-    files.save_file(tensors, "round/checkpoint.safetensors")
 
 
 def _digests(folder: Path) -> dict[str, str]:
@@ -203,8 +168,6 @@ class Disk:
 
 def full_disks(base: Path, place: Path, asked: argparse.Namespace) -> Iterator[tuple[str, list[str]]]:
     """Every command with every share of its room: the name of each, and what was wrong."""
-    made = run(lambda: _make_round(base), base.parent / "said")
-    assert made.status == 0, made.text
     disk = Disk(base, place)
     if not disk.mounted:
         return

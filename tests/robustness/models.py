@@ -78,11 +78,6 @@ CASES += table(
 )  # fmt: skip
 
 
-def _together(given: str) -> str:
-    rows = [line.split() for line in given.splitlines() if line]
-    return "".join(f"{row[0]} 1 0 0 0 0 0 4 {' '.join(row[8:])}\n\n" for row in rows)
-
-
 def _images(*changes: str) -> Change:
     return edit(IMAGES, lambda given: given.replace(*changes))
 
@@ -93,7 +88,6 @@ CASES += table(
     Case("of a quaternion of 1e200", _images("1 1 0 0 0", "1 1e200 1e200 0 0"), ci=True,
          prints=r"\A(?!.*RuntimeWarning)"),
     Case("that is a link to nothing", put(IMAGES, "dangling")),
-    Case("of all cameras in one place", edit(IMAGES, _together), ci=True),
 )  # fmt: skip
 
 

@@ -104,15 +104,12 @@ CASES += table(
 )  # fmt: skip
 
 
+LEFT = np.where(np.arange(WIDTH) < WIDTH // 2, WHITE, DARK)
+
+
 def _in_transparency(colors: np.ndarray) -> Change:
     """A mask whose transparency says that the left half is the object."""
-    return drawn(MASK, np.dstack((colors, colors, colors, _left())))
-
-
-def _left() -> np.ndarray:
-    left = WHITE.copy()
-    left[:, WIDTH // 2 :] = 0
-    return left
+    return drawn(MASK, np.dstack((colors, colors, colors, LEFT)))
 
 
 training = [view for view in NAMES if view not in ("v000", "v004")]
@@ -120,7 +117,7 @@ CASES += table(
     "masks", MASKED,
     Case("animated", animated(MASK), found=ANIMATED, ci=True),
     Case("in their transparency", _in_transparency(WHITE), prints="transparen", ci=True),
-    Case("in their colors and their transparency", _in_transparency(_left()), passes=SAME, ci=True),
+    Case("in their colors and their transparency", _in_transparency(LEFT), passes=SAME, ci=True),
     Case("that hide everything", _all("masks", DARK, NAMES), ci=True),
     Case("of another scene", lambda: [os.rename(f"scene/masks/{name}.png", f"scene/masks/x{name}.png")
                                       for name in NAMES], ci=True),

@@ -106,18 +106,19 @@ DATABASE = "unfinished/.sfm/database.db"
 # Links in folders of strangers that lead what is written elsewhere.
 CASES += table(
     "link for the", RESUME,
-    Case("log of a run", link("run/log.jsonl", OUTSIDE), ci=True),
-    Case("scores of a run", link("run/metrics.json", OUTSIDE), EVAL),
-    Case("page of a run", link("run/share.html", OUTSIDE), f"share run {ONE}", ci=True),
     Case("pictures of a run", link("run/render"), f"render run {FLAGS}", ci=True),
     Case("film of a run", link("run/render"), FILM, ci=True),
     Case("exports of a run", link("run/export"), "export run --format ply", ci=True),
-    Case("folder of cameras in exports", link("new/sparse"), export("cameras")),
-    Case("lock of a new run", link("new/.lock", OUTSIDE), TRAIN),
     Case("maps of shots", link("new/v000", AWAY), MAPS, ci=True),
     Case("maps of shots, over another link", several(link("new/other"), link("new/v000", "other")), MAPS, ci=True),
     Case("maps of a scene", link("new/v001", AWAY), f"{READ} --formats npy", ci=True),
-    Case("lock of a comparison", link("new/.lock", OUTSIDE), COMPARE.replace("--steps 2", "--steps 0")),
+) + table(
+    "link for the", RESUME,
+    Case("log of a run", link("run/log.jsonl", OUTSIDE), ci=True),
+    Case("scores of a run", link("run/metrics.json", OUTSIDE), EVAL),
+    Case("page of a run", link("run/share.html", OUTSIDE), f"share run {ONE}", ci=True),
+    Case("folder of cameras in exports", link("new/sparse"), export("cameras")),
+    Case("lock of a new run", link("new/.lock", OUTSIDE), TRAIN),
     Case("pictures of an unfinished scene", link("unfinished/polar"), UNFINISHED, ci=True),
     Case("database of an unfinished scene", link(DATABASE, f"{AWAY}/made.db"), posed("sfm", UNFINISHED)),
     Case("temporary file of a record", _guessed("run/run.json"), ci=True),
@@ -125,8 +126,3 @@ CASES += table(
     Case("temporary file of a page", _guessed("run/share.html"), f"share run {ONE}"),
     passes=REPLACED,
 )  # fmt: skip
-CASES += [
-    Case("odd temporary name", write("run/.run.json.\u00b2.tmp", ""), RESUME, passes="it is nobody's"),
-    Case("temporary folder of this process", lambda: os.makedirs(f"new/.sparse.{os.getpid()}.tmp"), export("cameras"),
-         passes="what an earlier process of this number left is removed"),
-]  # fmt: skip

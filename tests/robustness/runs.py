@@ -107,15 +107,6 @@ def _empty(whole: dict[str, Any]) -> None:
     whole.update({name: values[..., :0] for name, values in whole.items() if name.startswith("statistics")})
 
 
-def _one(whole: dict[str, Any]) -> None:
-    count = whole["gaussians.means"].shape[:1]
-    whole.update({name: values[:1] for name, values in whole.items() if values.shape[:1] == count})
-
-
-def _scalars(*values: int) -> Change:
-    return tensors(lambda whole: whole.update(scalars=importlib.import_module("torch").tensor(values)))
-
-
 PICKLE = b"\x80\x04cos\nsystem\n(S'touch ../outside/made'\ntR."
 CASES += table(
     "checkpoint", EVAL,
@@ -123,8 +114,6 @@ CASES += table(
     Case("of a head of brackets", write(CHECKPOINT, struct.pack("<Q", 15_000) + b'{"a":' * 3000), RENDER, ci=True),
     Case("as a pickle", write(CHECKPOINT, PICKLE), ci=True),
     Case("of no Gaussian, resumed", tensors(_empty), RESUME, ci=True),
-    Case("of one Gaussian, as sog", tensors(_one), export("sog"), passes="one is a scene"),
-    Case("of a step of 2^50", _scalars(1 << 50, 0), RESUME),
 )  # fmt: skip
 
 
@@ -170,7 +159,6 @@ CASES += table(
         ("of sides that differ", [{}, {"width": 20}], 30, "", True),
         ("of a mirror", [{"rotation": [-1, 0, 0, 0, 1, 0, 0, 0, 1]}] * 2, 30, "", False),
         ("of a slow rate", [{}, {}], 1e-300, "any rate will do", False),
-        ("of 1 pixel", [{"width": 1, "height": 1}] * 2, 30, "any size will do", False),
       ) for kind, command in (("", ALONG), (", as a film", FILM))),
     Case("of a focal length of nearly nothing", _path({"fx": 1e-30}), expected="positive focal lengths", ci=True),
     Case("of a principal point beyond all", _path({"cx": 1e300}), expected="principal point", ci=True),

@@ -11,7 +11,7 @@ import spoil
 from base import EVAL, INSPECT, PICTURE, READ, TRAIN, of
 from case import Case, Change, table
 from changes import (
-    A_NAME, OF_FILES, PLAUSIBLE, UNUSED, copy, deferred, field, put, rename, several, sparse, truth, write,
+    A_NAME, OF_FILES, PLAUSIBLE, UNUSED, copy, deferred, field, put, several, sparse, truth, write,
     write_json,
 )  # fmt: skip
 
@@ -41,8 +41,6 @@ CASES += table(
     Case("with a key twice", write(SCENE, '{"refractive_index": 1.5, "refractive_index": 1.9}'),
          found="stands there twice", ci=True),
     Case("with a polarizer of brackets", write_json(SCENE, {"polarizer": {"a": [1]}})),
-    Case("with a study of brackets", write_json(SCENE, {"study": {"name": ["x"], "value": {"y": 1}}, "format": "999"}),
-         passes=UNUSED),
     Case("of a prepared scene, with gains of words", field("prepared/scene.json", "gains", to={"0": 0, "45": "x"}),
          f"{of('prepared', INSPECT)} --fix fixed", passes=UNUSED),
 )  # fmt: skip
@@ -103,12 +101,9 @@ CASES += table(
     "scene", TRAIN,
     *(Case(f"of {count} views", _fewer(count), ci=True) for count in (0, 2)),
     Case("with a name that is no UTF-8", lambda: os.rename(PICTURE, b"scene/polar/v\xff\xfe_045.png"), ci=True),
-    Case("called by a tag", rename("scene", "[bold red]x"), ["train", "[bold red]x", *TRAIN.split()[2:]],
-         passes="a folder may be called so; the name is shown as it is"),
     Case("with two suffixes of one picture", copy(PICTURE, "scene/polar/v001_045.PNG"), READ),
     Case("whose four angles are one file", copy("scene/polar/v001_000.png", *(
         f"scene/polar/v001_{angle}.png" for angle in ("045", "090", "135"))), ci=True),
-    Case("with an angle too many", copy(PICTURE, "scene/polar/v001_060.png"), READ),
 )  # fmt: skip
 
 none = "a folder may hold none of what is looked for"

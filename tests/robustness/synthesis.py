@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from base import SYNTH
-from case import Case, nothing, table
+from case import Case, table
 from changes import deferred, put, several, text_forms, write, write_json
 
 CASES: list[Case] = []
@@ -66,7 +66,6 @@ CASES += table(
         write_json(SPEC, ball(environment={"type": "image", "file": "pipe.hdr"})), put("pipe.hdr", "pipe")), ci=True),
     Case("a name that leaves", write_json(SPEC, ball(name="../../outside/x")), SYNTH, ci=True,
          passes="the folder is that of --out"),
-    Case("a folder", nothing, SYNTH.replace(SPEC, "scene")),
 ) + [
     Case(f"scene file {name}", change, SYNTH, passes=reason, ci="mark" in name)
     for name, change, reason in text_forms(SPEC, ball(), "depth") if "Windows" not in name

@@ -1,9 +1,0 @@
-"""Spoiled shots of an inspection line end as their tables say."""
-
-import pytest
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("table", ["measurement", "calibration"])
-def test_every_case_ends_as_its_table_says(table, run_table):
-    assert run_table(table) == []
