@@ -24,7 +24,6 @@ CASES += table(
     "process with", MOSAICS,
     Case("32 files open at most, training", limit(resource.RLIMIT_NOFILE, 32), TRAIN, passes=WORKS),
     Case("8 files open at most", limit(resource.RLIMIT_NOFILE, 8), passes=WORKS, ci=True),
-    Case("no more memory, preparing", memory(1), passes=WORKS),
     Case("no more memory, sharing", memory(1), SHARE, ci=True),
     Case("no more memory and a large measured mosaic", LARGE, MEASURE, ci=True),
     Case("no more processes", limit(resource.RLIMIT_NPROC, 0), EVAL, passes=WORKS),
