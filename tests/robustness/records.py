@@ -12,7 +12,7 @@ from case import Case, Change, table
 from changes import (
     A_NAME, OUTSIDE, deferred, link, no_formula, no_script, put, several, text_forms, write, write_json,
 )  # fmt: skip
-from comparison_records import results, run
+from comparison_records import content, run
 
 CASES: list[Case] = []
 
@@ -68,7 +68,7 @@ CASES += table(
 @deferred
 def _record(edit: Callable[[Any], object] = lambda record: None) -> None:
     """Records of a comparison in the folders a and b; that in a is edited, in place or by what ``edit`` returns."""
-    whole = json.dumps(results([run("s", name, 0, psnr=20.0 + k) for k, name in enumerate("ab")]))
+    whole = json.dumps(content([run("s", name, 0, psnr=20.0 + k) for k, name in enumerate("ab")]))
     edited = json.loads(whole)
     returned = edit(edited)
     for name, content in (("a", json.dumps(returned or edited)), ("b", whole)):
