@@ -71,9 +71,9 @@ def _record(edit: Callable[[Any], object] = lambda record: None) -> None:
     whole = json.dumps(content([run("s", name, 0, psnr=20.0 + k) for k, name in enumerate("ab")]))
     edited = json.loads(whole)
     returned = edit(edited)
-    for name, content in (("a", json.dumps(returned or edited)), ("b", whole)):
+    for name, text in (("a", json.dumps(returned or edited)), ("b", whole)):
         Path(name).mkdir(exist_ok=True)
-        Path(name, "results.json").write_text(content)
+        Path(name, "results.json").write_text(text)
 
 
 def _run(**fields: Any) -> Change:
