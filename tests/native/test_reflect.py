@@ -7,9 +7,9 @@ from torch.testing import assert_close
 
 from polarguide import _native
 from polarguide.geometry.camera import Camera
-from polarguide.shading.deferred import DeferredShading, reflect_reference
+from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.model import GBuffer, ShadingModel
-from polarguide.shading.native import reflect_native, world_rays_native
+from polarguide.shading.native import reflect_native, reflect_reference, world_rays_native
 from polarguide.shading.result import Layout
 
 HEIGHT, WIDTH, RESOLUTION = 20, 24, 8

@@ -14,9 +14,10 @@ from polarguide.gaussians.harmonics import SH_C0, sh_basis
 from polarguide.geometry.camera import Camera
 from polarguide.raster import Rasterize, ScreenStatistic, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.shading.deferred import DeferredShading, local_light, reflect_reference
+from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.shading.model import MAXIMUM_LOG_LIGHT, PLAIN, base_colors, mirrored
+from polarguide.shading.model import MAXIMUM_LOG_LIGHT, PLAIN, base_colors, local_light, mirrored
+from polarguide.shading.native import reflect_reference
 from polarguide.shading.result import COLOR_CHANNELS
 
 COUNT, RESOLUTION = 30, 8

@@ -1,7 +1,7 @@
-"""Captures with other pictures than four angles a view: what they are, and whether they agree with what is said.
+"""Captures of single shots: what their pictures are, and whether they agree with the angles that the capture states.
 
-A short training that is told no angle finds that of every picture in closed form (``angles.polarizers``). What it
-finds is compared with what the capture says.
+A short training that is told no angle finds the angle of every picture in closed form (``training.angles.polarizers``),
+and each is compared with the stated one.
 """
 
 from __future__ import annotations

@@ -125,7 +125,7 @@ def _name(names: dict[str, list[str]], judgment: Judgment) -> str:
 
 
 class AnyTrainer(Protocol):
-    """What the loop of a training asks for; see ``angles.trainer.AngleTrainer``."""
+    """What the loop of a training asks for; see ``training.angles.trainer.AngleTrainer``."""
 
     scene: Scene
     settings: ResolvedSettings

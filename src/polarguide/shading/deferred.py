@@ -14,9 +14,7 @@ from polarguide import optics
 from polarguide.core.native import fits
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import mirrored_directions
-from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.geometry.camera import Camera
-from polarguide.geometry.vectors import dot, unit
 from polarguide.optics import reflectances_from_cosine
 from polarguide.shading.cubemap import cubemap_lookup, mip_lookup
 from polarguide.shading.metal import (
@@ -51,9 +49,10 @@ from polarguide.shading.model import (
     base_colors,
     harmonic_colors,
     harmonic_values,
+    local_light,
     mirrored,
 )
-from polarguide.shading.native import MetalArguments, reflect_native, world_rays_native
+from polarguide.shading.native import MetalArguments, reflect_native, reflect_reference, world_rays_native
 from polarguide.shading.result import LAYERS, DetachedLayers, MetalPixels
 
 Blend = Literal["lerp", "fresnel"]
@@ -63,8 +62,6 @@ LOCAL_NOTE = (
     "Turning the environment turns what is reflected from afar. What stands near is reflected by the Gaussians "
     "themselves, which stay as they are."
 )
-
-
 INDEX_NOTE = "Surfaces of several refractive indices are drawn with one that reflects as much at 45 degrees."
 
 
@@ -446,50 +443,3 @@ class DeferredShading(ShadingModel):
         """Twice the reflectance there."""
         s, p = reflectances_from_cosine(torch.tensor(math.sqrt(0.5)), index)
         return s + p
-
-
-def local_light(gaussians: Parameters, directions: Tensor, sh_degree: int) -> Tensor:
-    """Light [N, 3] that each Gaussian adds from a mirrored direction; can be negative.
-
-    Args:
-        gaussians: with ``local_dc`` and ``local_rest``, harmonics of the mirrored direction.
-        directions: [N, 3] unit, of the mirrored rays. sh_degree: as for the base color.
-
-    Returns:
-        [N, 3], differentiable in the harmonics alone.
-    """
-    directions = directions.detach()
-    origin = directions.new_zeros(3)
-    return evaluate_sh(directions, origin, gaussians["local_dc"], gaussians["local_rest"], sh_degree)
-
-
-def reflect_reference(
-    base: Tensor,
-    normal: Tensor,
-    strength: Tensor,
-    environment: Tensor,
-    camera: Camera,
-    shading: DeferredShading,
-    local: Tensor | None = None,
-    index: Tensor | None = None,
-) -> dict[str, Tensor]:
-    """Deferred reflection per pixel: the reference implementation of ``reflect_native``, any dtype and device.
-
-    Args:
-        base: [H, W, 3]. normal: [H, W, 3] world, any length. strength: [H, W]. environment: [6, R, R, 3] raw texels.
-        local: [H, W, 3] blended light of the Gaussians' own, added to the environment's.
-        index: [H, W] refractive index; None: the run's.
-
-    Returns:
-        ``final``, ``specular``, ``diffuse`` and ``reflection``, each [H, W, 3].
-    """
-    rays = camera.world_rays(dtype=base.dtype, device=base.device)
-    facing = unit(normal, 1e-3)
-    directions = mirrored(rays, facing)
-    light = shading.radiance(cubemap_lookup(environment, directions.reshape(-1, 3)).reshape(base.shape))
-    if local is not None:
-        light = (light + local).clamp(min=0)
-    cosine = -dot(rays, facing)[..., None].clamp(-1, 0)
-    indices = None if index is None else index[..., None]
-    specular, diffuse = shading.contributions(base, strength[..., None], light, cosine, indices)
-    return {"final": specular + diffuse, "specular": specular, "diffuse": diffuse, "reflection": light}

@@ -395,6 +395,21 @@ def harmonic_colors(gaussians: Parameters, rays: Tensor) -> Tensor:
     return (evaluate_sh(rays, origin, gaussians["sh_dc"], gaussians["sh_rest"], 3) + 0.5).clamp(min=0)
 
 
+def local_light(gaussians: Parameters, directions: Tensor, sh_degree: int) -> Tensor:
+    """Light [N, 3] that each Gaussian adds from a mirrored direction; can be negative.
+
+    Args:
+        gaussians: with ``local_dc`` and ``local_rest``, harmonics of the mirrored direction.
+        directions: [N, 3] unit, of the mirrored rays. sh_degree: as for the base color.
+
+    Returns:
+        [N, 3], differentiable in the harmonics alone.
+    """
+    directions = directions.detach()
+    origin = directions.new_zeros(3)
+    return evaluate_sh(directions, origin, gaussians["local_dc"], gaussians["local_rest"], sh_degree)
+
+
 def harmonic_values(gaussians: Parameters) -> dict[str, Tensor]:
     """The base color's harmonics as values of a page."""
     return {"color": gaussians["sh_dc"], "harmonics": gaussians["sh_rest"]}

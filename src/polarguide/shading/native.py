@@ -1,13 +1,13 @@
 """Native passes over the G-buffer on the CPU.
 
-The reference implementation of ``reflect_native`` is ``deferred.reflect_reference``, of metals ``metal.metal_pixels``;
+The reference implementation of ``reflect_native`` is ``reflect_reference``, of metals ``metal.metal_pixels``;
 that of ``split_native`` is ``gbuffer.split_reference``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -16,7 +16,9 @@ from torch.autograd.function import once_differentiable
 from polarguide import _native
 from polarguide.core.native import applied
 from polarguide.geometry.camera import Camera
-from polarguide.shading.cubemap import mips_backward
+from polarguide.geometry.vectors import dot, unit
+from polarguide.shading.cubemap import cubemap_lookup, mips_backward
+from polarguide.shading.model import mirrored
 
 
 class MetalArguments(NamedTuple):
@@ -209,3 +211,47 @@ def split_native(features: Tensor, alpha: Tensor, *, depth: bool) -> tuple[Tenso
     """
     rest, normal, deep = _Split.apply(features, alpha, depth)
     return rest, normal, deep
+
+
+class Reflecting(Protocol):
+    """What deferred reflection asks its shading model for; see ``DeferredShading``."""
+
+    def radiance(self, texels: Tensor, /) -> Tensor:
+        """Linear radiance of raw texels."""
+
+    def contributions(
+        self, base: Tensor, strength: Tensor, light: Tensor, cosine: Tensor, index: Tensor | None, /
+    ) -> tuple[Tensor, Tensor]:
+        """Specular and diffuse contributions [..., 3]."""
+
+
+def reflect_reference(
+    base: Tensor,
+    normal: Tensor,
+    strength: Tensor,
+    environment: Tensor,
+    camera: Camera,
+    shading: Reflecting,
+    local: Tensor | None = None,
+    index: Tensor | None = None,
+) -> dict[str, Tensor]:
+    """Deferred reflection per pixel: the reference implementation of ``reflect_native``, any dtype and device.
+
+    Args:
+        base: [H, W, 3]. normal: [H, W, 3] world, any length. strength: [H, W]. environment: [6, R, R, 3] raw texels.
+        local: [H, W, 3] blended light of the Gaussians' own, added to the environment's.
+        index: [H, W] refractive index; None: the run's.
+
+    Returns:
+        ``final``, ``specular``, ``diffuse`` and ``reflection``, each [H, W, 3].
+    """
+    rays = camera.world_rays(dtype=base.dtype, device=base.device)
+    facing = unit(normal, 1e-3)
+    directions = mirrored(rays, facing)
+    light = shading.radiance(cubemap_lookup(environment, directions.reshape(-1, 3)).reshape(base.shape))
+    if local is not None:
+        light = (light + local).clamp(min=0)
+    cosine = -dot(rays, facing)[..., None].clamp(-1, 0)
+    indices = None if index is None else index[..., None]
+    specular, diffuse = shading.contributions(base, strength[..., None], light, cosine, indices)
+    return {"final": specular + diffuse, "specular": specular, "diffuse": diffuse, "reflection": light}

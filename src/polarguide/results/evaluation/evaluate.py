@@ -41,7 +41,7 @@ def cross_fitted(view: View, final: Tensor, stokes: Tensor | None) -> Tensor:
     """The picture that a model predicts of ``view.photograph()``, behind an analyzer that is fitted on the other half.
 
     Gain, angle and strength of the analyzer are fitted on the left half of the picture for the right one, and on the
-    right one for the left (``angles.fit``), so that no pixel takes part in the fit that it is scored by.
+    right one for the left (``training.angles.fit``), so that no pixel takes part in the fit that it is scored by.
 
     Args:
         view: whose pictures do not measure S0.

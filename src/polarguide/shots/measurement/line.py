@@ -220,7 +220,7 @@ def measure_shots(
     """Measure shots into the table of a folder; those that are in it already are not measured again.
 
     Args:
-        paths: files and folders, as ``shots.find_shots`` takes them.
+        paths: files and folders, as ``shots.exposures.find_shots`` takes them.
         out: folder of ``table.csv``, ``table.jsonl`` and pictures.
         options: what is measured. reading: how shots are read.
         heard: is called with each shot when its line is on disk.

@@ -125,7 +125,7 @@ def watch_folder(
     with what is not in it.
 
     Args:
-        folder: of mosaics, or of shots of four files, as ``shots.find_shots`` takes it.
+        folder: of mosaics, or of shots of four files, as ``shots.exposures.find_shots`` takes it.
         out: folder of the table.
         options, reading, watching: what is measured, how shots are read, how long is waited.
         should_stop: is asked between two shots and several times a second.
