@@ -40,7 +40,11 @@ try:
     from polarguide.runs.defaults import resolve
 except ImportError:
     resolve = lambda settings, *of: settings
-from polarguide.training.trainer import Trainer, TrainSettings
+try:
+    from polarguide.training.settings import TrainSettings
+except ImportError:
+    from polarguide.training.trainer import TrainSettings
+from polarguide.training.trainer import Trainer
 
 scene, downscale, recipe, gaussians, threads = sys.argv[1:]
 keep_freed_memory()
