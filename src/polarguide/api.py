@@ -169,15 +169,15 @@ def priors(
     """
     _require_options_of_maps(shots, maps=bool(formats))
     refuse_scene(Path(out))
-    found = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
-    index = index_of(refractive_index, found.refractive_index)
-    chosen = select_views(found, views)
+    loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
+    index = index_of(refractive_index, loaded.refractive_index)
+    chosen = select_views(loaded, views)
     if formats:
         check_formats(formats)
         for view in chosen:
             require_four_pictures(view)
     sheet = write_priors(
-        found, out, run=run, views=views, refractive_index=index, threshold=threshold, reporter=reporter
+        loaded, out, run=run, views=views, refractive_index=index, threshold=threshold, reporter=reporter
     )
     if formats:
         write_view_maps(chosen, out, shots, formats=formats, refractive_index=index, reporter=reporter)
@@ -226,11 +226,11 @@ def _index_from_scene_json(paths: Sequence[PathLike]) -> float | None:
 
 def _require_options_of_maps(shots: ShotOptions, *, maps: bool) -> None:
     """Refuse options of shots that mean nothing for views of a scene; ``maps``: maps are written."""
-    given = [name for name in shots.changed() if not (maps and name in _OF_MAPS)]
-    if given:
-        more = " With --formats it applies to the maps." if given[0] in _OF_MAPS else ""
+    changed = [name for name in shots.changed() if not (maps and name in _OF_MAPS)]
+    if changed:
+        more = " With --formats it applies to the maps." if changed[0] in _OF_MAPS else ""
         raise PolarguideError(
-            shots.called(given[0]),
+            shots.called(changed[0]),
             expected="shots",
             found="a scene with poses",
             remedy=f"Leave it out: the scene has developed pictures and cameras.{more}",
@@ -259,9 +259,9 @@ def inspect(
     """
     folder = inspection_folder(Path(scene), None if out is None else Path(out))
     backend = choose_backend(device, say=reporter.say)
-    found = inspect_scene(Path(scene), folder, settings, backend, reporter)
-    write_inspection(found, folder, reporter)
-    return found
+    inspection = inspect_scene(Path(scene), folder, settings, backend, reporter)
+    write_inspection(inspection, folder, reporter)
+    return inspection
 
 
 def demo_scene() -> Path:

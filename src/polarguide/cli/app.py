@@ -60,10 +60,10 @@ def function_of(verb: str) -> Callable[..., Any]:
 
 def options_of(function: Callable[..., Any]) -> dict[str, Any]:
     """Types of all parameters by name, those in dataclasses included."""
-    found: dict[str, Any] = {}
+    types: dict[str, Any] = {}
     for name, kind in get_type_hints(function).items():
-        found |= get_type_hints(kind) if dataclasses.is_dataclass(kind) else {name: kind}
-    return found
+        types |= get_type_hints(kind) if dataclasses.is_dataclass(kind) else {name: kind}
+    return types
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -127,7 +127,7 @@ def _failed(text: str) -> int:
 
 def _system_error_message(error: Exception) -> str:
     """The message where memory or threads have run out, or a package cannot be loaded; empty for other errors."""
-    if isinstance(error, MemoryError) or any(words in str(error) for words in _RUN_OUT):
+    if isinstance(error, MemoryError) or any(phrase in str(error) for phrase in _RUN_OUT):
         reason = (str(error).splitlines() or ["none is left"])[0]
         return f"memory: expected enough of it, and of threads, found {reason[:200]}. {_MORE_ROOM}"
     if isinstance(error, ModuleNotFoundError):
@@ -161,9 +161,9 @@ def _call(verb: str | None, arguments: Sequence[str]) -> int:
         _require_place()
         check_variables()
         _refuse_paths(verb, arguments[1:])
-        words = _sizes_as_numbers(arguments[1:])
-        found = tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=words)
-        return found if isinstance(found, int) else 0
+        line = _sizes_as_numbers(arguments[1:])
+        parsed = tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=line)
+        return parsed if isinstance(parsed, int) else 0
     if arguments and not arguments[0].startswith("-"):
         raise PolarguideError(
             arguments[0],
@@ -191,7 +191,7 @@ def _require_place() -> None:
         ) from None
 
 
-def _refuse_paths(verb: str, words: Sequence[str]) -> None:
+def _refuse_paths(verb: str, line: Sequence[str]) -> None:
     """Refuse what names no file or folder: null bytes, and empty texts, as unset variables of a shell leave them, which
     would mean this folder.
 
@@ -201,7 +201,7 @@ def _refuse_paths(verb: str, words: Sequence[str]) -> None:
     paths = {
         _flag(name) for name, kind in options_of(function_of(verb)).items() if Path in (kind, *get_args(kind))
     }
-    for place, value in _named_values(words):
+    for place, value in _named_values(line):
         if (not value or "\0" in value) and (place in paths or not place.startswith("--")):
             raise PolarguideError(
                 place or "the command line",
@@ -211,24 +211,24 @@ def _refuse_paths(verb: str, words: Sequence[str]) -> None:
             )
 
 
-def _sizes_as_numbers(words: Sequence[str]) -> list[str]:
+def _sizes_as_numbers(line: Sequence[str]) -> list[str]:
     """The words with what --memory is given as a number of GiB: 4GB as 3.7252902984619140."""
-    found = list(words)
-    for place, word in enumerate(words):
+    converted = list(line)
+    for place, word in enumerate(line):
         option, equals, value = word.partition("=")
         if option == "--memory" and equals:
             size = gibibytes(value)
-            found[place] = word if size is None else f"--memory={size!r}"
-        elif place and words[place - 1] == "--memory":
+            converted[place] = word if size is None else f"--memory={size!r}"
+        elif place and line[place - 1] == "--memory":
             size = gibibytes(word)
-            found[place] = word if size is None else repr(size)
-    return found
+            converted[place] = word if size is None else repr(size)
+    return converted
 
 
-def _named_values(words: Sequence[str]) -> Iterator[tuple[str, str]]:
+def _named_values(line: Sequence[str]) -> Iterator[tuple[str, str]]:
     """The option that each word is a value of, or an empty text, and the value."""
     before = ""
-    for word in words:
+    for word in line:
         name, equals, value = word.partition("=")
         if equals and name.startswith("--"):
             yield name, value

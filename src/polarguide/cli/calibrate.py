@@ -33,7 +33,7 @@ def calibrate(
     """
     use_threads(compute.threads)
     calibration = importlib.import_module("polarguide.shots.calibration.calibrate")
-    done = calibration.calibrate_sensor(shots, out, settings, ConsoleReporter())
-    say(f"calibration: {done.path}   picture: {done.picture}")
-    option = f"--sensor {settings.sensor} --calibration {shlex.quote(str(done.path))}"
+    outcome = calibration.calibrate_sensor(shots, out, settings, ConsoleReporter())
+    say(f"calibration: {outcome.path}   picture: {outcome.picture}")
+    option = f"--sensor {settings.sensor} --calibration {shlex.quote(str(outcome.path))}"
     say(f"next: polarguide prepare RAW --out SCENE {option}")

@@ -69,7 +69,7 @@ def compare(
     print_results(results, out)
 
 
-def chosen_steps(words: tuple[str, ...]) -> tuple[int | None, dict[str, int]]:
+def chosen_steps(values: tuple[str, ...]) -> tuple[int | None, dict[str, int]]:
     """The number of steps that all take, None where it is not given, and those of recipes by name.
 
     Raises:
@@ -77,13 +77,13 @@ def chosen_steps(words: tuple[str, ...]) -> tuple[int | None, dict[str, int]]:
     """
     common: list[int] = []
     own: dict[str, int] = {}
-    for word in words:
+    for word in values:
         name, _, number = word.rpartition("=")
         if not number.isdecimal() or name in own or (not name and common):
             raise PolarguideError(
                 "--steps",
                 expected="a number of steps, and RECIPE=STEPS for a recipe of its own, each once",
-                found=" ".join(words),
+                found=" ".join(values),
                 remedy="For example --steps 5000 gnerp=10000.",
             )
         if name:

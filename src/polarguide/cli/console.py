@@ -177,18 +177,18 @@ class ConsoleReporter(Reporter):
 @contextlib.contextmanager
 def lines(label: str, total: int | None) -> Iterator[Advance]:
     """Progress as lines; the last one is printed where the work had a note."""
-    told = Lines(label, total)
+    printer = Lines(label, total)
     noted = False
 
     def advance(done: int, *, total: int | None = None, note: str = "") -> None:
         nonlocal noted
         noted = bool(note)
-        told(done, total=total, note=note)
+        printer(done, total=total, note=note)
 
     try:
         yield advance
     finally:
-        told.close(last=noted)
+        printer.close(last=noted)
 
 
 # Trainings log every tenth step and recipes differ in speed: a long memory keeps the time left from jumping.

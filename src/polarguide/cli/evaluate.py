@@ -35,11 +35,11 @@ def evaluate(
         f"{trained.configuration.recipe} on {trained.scene.name}: mean of {len(record['views'])} test views"
     )
     print_scores(record, title)
-    found = trained.health
-    for warning in () if found is None else found.warnings:
+    health = trained.health
+    for warning in () if health is None else health.warnings:
         warn(warning)
     say(f"polarization: {trained.polarization}")
-    say("health: not recorded, the training was not checked" if found is None else found.summary)
+    say("health: not recorded, the training was not checked" if health is None else health.summary)
     sheet = importlib.import_module("polarguide.results.evaluation.error_sheet").ERRORS_FILE
     say(f"metrics: {run / 'metrics.json'}")
     say(f"where the errors are: {run / sheet}")

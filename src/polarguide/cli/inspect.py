@@ -47,35 +47,35 @@ def inspect(
     inspection = importlib.import_module("polarguide.inspection.inspect")
     folder = inspection.inspection_folder(scene, out)
     backend = importlib.import_module("polarguide.raster").choose_backend(compute.device, say=reporter.say)
-    found = inspection.inspect_scene(scene, folder, settings, backend, reporter)
+    inspected = inspection.inspect_scene(scene, folder, settings, backend, reporter)
     page, record = importlib.import_module("polarguide.inspection.record").write_inspection(
-        found, folder, reporter
+        inspected, folder, reporter
     )
-    _print_checks(found.checks)
-    if found.capture.four:
-        _print_angles(found.angles)
-    _print_verdict(found)
+    _print_checks(inspected.checks)
+    if inspected.capture.four:
+        _print_angles(inspected.angles)
+    _print_verdict(inspected)
     say(f"page: {page}   figures: {record}")
     if fix is not None:
-        _fix(found, fix, reporter)
+        _fix(inspected, fix, reporter)
 
 
-def _fix(found: Any, out: Path, reporter: ConsoleReporter) -> None:
+def _fix(inspected: Any, out: Path, reporter: ConsoleReporter) -> None:
     """Write the corrected copy, or say that there is nothing to correct."""
     fixing = importlib.import_module("polarguide.inspection.corrections")
-    if not found.capture.four:
+    if not inspected.capture.four:
         raise PolarguideError(
             "--fix",
             expected="a scene with four pictures of each view",
             found="one with other pictures, whose angles are given in a table",
             remedy="Correct SCENE/angles.csv as the report says, or repeat prepare.",
         )
-    change = fixing.correction(found.capture, found.angles)
+    change = fixing.correction(inspected.capture, inspected.angles)
     if change is None:
         say("fix: order, sense and zero are right; nothing was written.")
         return
-    done = fixing.fix_scene(found.capture, change, out, reporter)
-    say(f"fixed: {out}: {done}. {found.capture.root} is as it was.")
+    copy = fixing.fix_scene(inspected.capture, change, out, reporter)
+    say(f"fixed: {out}: {copy}. {inspected.capture.root} is as it was.")
 
 
 def _print_checks(checks: Any) -> None:
@@ -88,12 +88,12 @@ def _print_checks(checks: Any) -> None:
             say(f"{'':14}{check.remedy}")
 
 
-def _print_verdict(found: Any) -> None:
+def _print_verdict(inspected: Any) -> None:
     """The worst of all checks, and what nobody has verified."""
-    open_ = [check.title.lower() for check in found.checks if check.verdict == "not verified"]
-    beside = f"; not verified: {', '.join(open_)}" if open_ and found.verdict != "not verified" else ""
-    beside = f": {', '.join(open_)}" if found.verdict == "not verified" else beside
-    console.print(f"verdict: [{COLORS[found.verdict]}]{found.verdict}[/]{beside}")
+    open_ = [check.title.lower() for check in inspected.checks if check.verdict == "not verified"]
+    beside = f"; not verified: {', '.join(open_)}" if open_ and inspected.verdict != "not verified" else ""
+    beside = f": {', '.join(open_)}" if inspected.verdict == "not verified" else beside
+    console.print(f"verdict: [{COLORS[inspected.verdict]}]{inspected.verdict}[/]{beside}")
 
 
 def _print_angles(angles: Any) -> None:

@@ -73,9 +73,9 @@ def measure(
         print_error(outcome.trouble)
     if outcome.waiting:
         names = ", ".join(outcome.waiting[:4]) + (", ..." if len(outcome.waiting) > 4 else "")
-        found = f"{len(outcome.waiting)} that are not, and were not measured ({names})"
+        unmeasured = f"{len(outcome.waiting)} that are not, and were not measured ({names})"
         remedy = "Complete, rename or remove their files; the same command goes on."
-        error = PolarguideError(watching.watch, expected="complete shots", found=found, remedy=remedy)
+        error = PolarguideError(watching.watch, expected="complete shots", found=unmeasured, remedy=remedy)
         print_error(str(error))
     status: int = outcome.exit_status
     return status

@@ -33,15 +33,15 @@ def prepare(
     """
     use_threads(compute.threads)
     preparation = importlib.import_module("polarguide.preparation.prepare")
-    asked = replace(settings, calibration=angles.read(), analyzers=angles.analyzers())
-    done = preparation.prepare_scene(source, out, asked, ConsoleReporter())
-    without = f", {len(done.left_out)} left out" if done.left_out else ""
-    say(f"scene: {done.folder} ({len(done.views)} views{without})")
-    if done.posed:
-        say(f"next: polarguide inspect {done.folder}")
-        say(f"then: polarguide train {done.folder} --out runs/{done.folder.name}")
+    with_angles = replace(settings, calibration=angles.read(), analyzers=angles.analyzers())
+    prepared = preparation.prepare_scene(source, out, with_angles, ConsoleReporter())
+    without = f", {len(prepared.left_out)} left out" if prepared.left_out else ""
+    say(f"scene: {prepared.folder} ({len(prepared.views)} views{without})")
+    if prepared.posed:
+        say(f"next: polarguide inspect {prepared.folder}")
+        say(f"then: polarguide train {prepared.folder} --out runs/{prepared.folder.name}")
     else:
         say("it has no poses: repeat the command with --poses sfm or --poses PATH")
         say(
-            f"each view alone: polarguide priors {done.folder} --out {done.folder.name}-priors",
+            f"each view alone: polarguide priors {prepared.folder} --out {prepared.folder.name}-priors",
         )

@@ -51,7 +51,7 @@ def present(
     """
     use_threads(compute.threads)
     presenting = importlib.import_module("polarguide.results.rendering.present")
-    shown = presenting.present(
+    presented = presenting.present(
         folder,
         white_balance=white_balance or None,
         up_axis=up_axis or None,
@@ -66,5 +66,5 @@ def present(
         device=compute.device,
         reporter=ConsoleReporter(),
     )
-    for line in presenting.described(shown):
+    for line in presenting.described(presented):
         say(line)

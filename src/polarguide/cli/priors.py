@@ -92,7 +92,7 @@ def priors(
         raise PolarguideError(
             "downscale", expected="1 for shots", found=str(downscale), remedy="Use --demosaic quarter."
         )
-    found = polarguide.shot_priors(
+    outcome = polarguide.shot_priors(
         paths,
         out,
         shots=options,
@@ -101,17 +101,17 @@ def priors(
         refractive_index=refractive_index,
         reporter=reporter,
     )
-    for name, folder in list(found.folders.items())[:4]:
+    for name, folder in list(outcome.folders.items())[:4]:
         page = folder / "shot.html"
         say(f"{name}: {page if page.exists() else folder}")
-    if len(found.folders) > 4:
-        say(f"... and {len(found.folders) - 4} more in {out}")
-    if found.faults:
-        total = len(found.faults) + len(found.folders)
+    if len(outcome.folders) > 4:
+        say(f"... and {len(outcome.folders) - 4} more in {out}")
+    if outcome.faults:
+        total = len(outcome.faults) + len(outcome.folders)
         raise PolarguideError(
             out,
             expected=f"{total} shots",
-            found=f"{len(found.faults)} that failed ({', '.join(list(found.faults)[:4])})",
+            found=f"{len(outcome.faults)} that failed ({', '.join(list(outcome.faults)[:4])})",
             remedy="The warnings above say why; the others are written.",
         )
 

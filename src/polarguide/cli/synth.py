@@ -52,16 +52,16 @@ def synth(
     plan = render.Plan(overrides.apply(spec), settings, out)
     _confirm(render.expected_time([plan], reporter, threads=compute.threads), yes)
     folder = importlib.import_module("polarguide.synth.folder")
-    done = render.synthesize(plan.spec, out, settings, reporter, threads=compute.threads)
-    say(f"scene: {done}   SHA-256 of its {folder.MANIFEST}: {folder.scene_digest(done)}")
+    rendered = render.synthesize(plan.spec, out, settings, reporter, threads=compute.threads)
+    say(f"scene: {rendered}   SHA-256 of its {folder.MANIFEST}: {folder.scene_digest(rendered)}")
     if settings.sensor == "ideal":
-        say(f"next: polarguide train {done} --out runs/{done.name}")
+        say(f"next: polarguide train {rendered} --out runs/{rendered.name}")
     elif settings.sensor == "filter":
-        say(f"next: polarguide prepare {done / 'raw'} --out {done}-prepared --poses {done}")
+        say(f"next: polarguide prepare {rendered / 'raw'} --out {rendered}-prepared --poses {rendered}")
     else:
         say(
-            f"next: polarguide prepare {done / 'raw'} --out {done}-prepared --sensor {settings.sensor.upper()} "
-            f"--bits 12 --black-level 64 --calibration {done / 'calibration.json'} --poses {done}",
+            f"next: polarguide prepare {rendered / 'raw'} --out {rendered}-prepared --sensor {settings.sensor.upper()} "
+            f"--bits 12 --black-level 64 --calibration {rendered / 'calibration.json'} --poses {rendered}",
         )
 
 

@@ -64,10 +64,10 @@ def install_package(module: str) -> str:
     """The command that adds the package of a module, in a version that polarguide works with."""
     module = module.partition(".")[0]
     package = _plain(DISTRIBUTIONS.get(module, module))
-    known = (
+    specified = (
         text for text, _ in _requirements() if (name := _NAME.match(text)) and _plain(name[0]) == package
     )
-    return _pip(next(known, package))
+    return _pip(next(specified, package))
 
 
 def _plain(name: str) -> str:
@@ -77,8 +77,8 @@ def _plain(name: str) -> str:
 
 def _pip(*packages: str) -> str:
     """A command line of the pip that installs where this program runs: not always the one on the shell's path."""
-    found = shutil.which("pip")
-    ours = found is not None and Path(found).parent == Path(sys.executable).parent
+    executable = shutil.which("pip")
+    ours = executable is not None and Path(executable).parent == Path(sys.executable).parent
     return shlex.join([*(["pip"] if ours else [sys.executable, "-m", "pip"]), "install", *packages])
 
 
@@ -109,12 +109,12 @@ def _requirements() -> list[tuple[str, str]]:
         lines = metadata.requires("polarguide") or []
     except metadata.PackageNotFoundError:
         return []
-    found = []
+    requirements = []
     for line in lines:
         text, _, condition = line.partition(";")
         extra = _EXTRA.search(condition)
-        found.append((text.strip(), extra[1] if extra else ""))
-    return found
+        requirements.append((text.strip(), extra[1] if extra else ""))
+    return requirements
 
 
 def require_package(module: str, what: str) -> None:

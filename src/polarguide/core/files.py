@@ -74,11 +74,11 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     make_folder(path)
     with temporary_folder(path) as temporary:
         yield temporary
-        for made in sorted(temporary.iterdir()):
-            with open(made, "rb") as file:
+        for entry in sorted(temporary.iterdir()):
+            with open(entry, "rb") as file:
                 os.fsync(file.fileno())
-        for made in sorted(temporary.iterdir()):
-            os.replace(made, path / made.name)
+        for entry in sorted(temporary.iterdir()):
+            os.replace(entry, path / entry.name)
         _sync_folder(path)
 
 

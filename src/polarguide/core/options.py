@@ -69,9 +69,9 @@ def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
     Raises:
         PolarguideError: it is not one of the choices.
     """
-    known = list(choices)
-    if value not in known:
-        expected = "one of " + ", ".join(known)
+    allowed = list(choices)
+    if value not in allowed:
+        expected = "one of " + ", ".join(allowed)
         raise PolarguideError(name, expected=expected, found=value, remedy="Correct the name.")
 
 
@@ -82,16 +82,16 @@ _SIZE = re.compile(r"(?P<count>\d+(\.\d*)?|\.\d+) ?(?P<unit>[kmgt])(?P<binary>i?
 
 def gibibytes(text: str) -> float | None:
     """A size such as 4GB, 600MB or 3.5GiB in GiB; None for other texts, and for a number without a unit."""
-    found = _SIZE.fullmatch(text.strip())
-    if found is None:
+    match = _SIZE.fullmatch(text.strip())
+    if match is None:
         return None
-    units = _BINARY if found["binary"] else _UNITS
-    return float(found["count"]) * units[found["unit"].lower()] / _BINARY["g"]
+    units = _BINARY if match["binary"] else _UNITS
+    return float(match["count"]) * units[match["unit"].lower()] / _BINARY["g"]
 
 
-def index_of(asked: float | None, scene: float | None = None) -> float:
+def index_of(specified: float | None, scene: float | None = None) -> float:
     """The refractive index that was asked for, else that of ``scene.json``, else ``INDEX``."""
-    return next((index for index in (asked, scene) if index is not None), INDEX)
+    return next((index for index in (specified, scene) if index is not None), INDEX)
 
 
 @dataclass(frozen=True)

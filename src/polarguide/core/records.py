@@ -220,11 +220,11 @@ def _limits(form: Any) -> str:
         least, above, most, below = (getattr(option, name, None) for name in ("ge", "gt", "le", "lt"))
         if least is not None and most is not None:
             return f"{least:.10g} to {most:.10g}"
-        words = (
+        texts = (
             (least, "{:.10g} or more"), (above, "above {:.10g}"), (most, "up to {:.10g}"), (below, "below {:.10g}"),
         )  # fmt: skip
-        if any(limit is not None for limit, _ in words):
-            return " and ".join(text.format(limit) for limit, text in words if limit is not None)
+        if any(limit is not None for limit, _ in texts):
+            return " and ".join(text.format(limit) for limit, text in texts if limit is not None)
     return ""
 
 

@@ -42,9 +42,9 @@ def _posix(module: str) -> Any | None:
 
 def stop_signals() -> list[int]:
     """SIGTERM; and SIGHUP, of a terminal that goes away, unless it is ignored (nohup) or there is none."""
-    found = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    signals = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     return [
-        number for number in found if signal.getsignal(number) != signal.SIG_IGN or number == signal.SIGTERM
+        number for number in signals if signal.getsignal(number) != signal.SIG_IGN or number == signal.SIGTERM
     ]
 
 
@@ -203,20 +203,20 @@ class MemoryBound:
 
     def keep(self) -> None:
         """Call once per step, when allocations of successive steps have similar sizes."""
-        held = resident_memory()
-        if held is None:
+        resident = resident_memory()
+        if resident is None:
             return
         if self._waits:  # steps take what they need again: under the most of it there is nothing to return
-            self._most, self._waits = max(self._most, held), self._waits - 1
+            self._most, self._waits = max(self._most, resident), self._waits - 1
             self._bound = min(max(self._least, GROWTH * self._most), self._limit)
-        elif held > self._bound:
+        elif resident > self._bound:
             return_freed_memory()
             self._most, self._waits = 0.0, SETTLED
 
     def clear(self) -> None:
         """Call between two operations whose allocations have different sizes, such as a view's targets and a step."""
-        held = resident_memory()
-        if held is not None and held > PARTLY * self._limit:
+        resident = resident_memory()
+        if resident is not None and resident > PARTLY * self._limit:
             return_freed_memory()
 
     def between(self, items: Iterable[Item]) -> Iterator[Item]:
@@ -258,15 +258,15 @@ def free_memory(group: Path = Path("/sys/fs/cgroup")) -> int | None:
 
     What a control group holds of files goes when memory is asked for, and counts as free.
     """
-    found = []
+    limits = []
     with contextlib.suppress(OSError, ValueError, IndexError):
         lines = Path("/proc/meminfo").read_text().splitlines()
-        found += [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+        limits += [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
     with contextlib.suppress(OSError, ValueError):
         free = int((group / "memory.max").read_text()) - int((group / "memory.current").read_text())
-        held = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-        found.append(free + int(held.get("inactive_file", 0)) + int(held.get("active_file", 0)))
-    return max(0, min(found)) if found else None
+        statistics = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        limits.append(free + int(statistics.get("inactive_file", 0)) + int(statistics.get("active_file", 0)))
+    return max(0, min(limits)) if limits else None
 
 
 def machine_busy_seconds() -> float | None:

@@ -107,7 +107,7 @@ def _state(place: Path, spec: SceneSpec, bench: Bench) -> State:
 
 def _command(out: PathLike, options: BenchOptions, places: Mapping[str, Path]) -> str:
     """The command line that asks for this."""
-    words = ["polarguide", "bench", "--out", str(out)]
-    words += ["--held-back"] if options.held_back else []
-    words += ["--scenes", *places] if options.scenes else []
-    return shlex.join(words)
+    line = ["polarguide", "bench", "--out", str(out)]
+    line += ["--held-back"] if options.held_back else []
+    line += ["--scenes", *places] if options.scenes else []
+    return shlex.join(line)

@@ -101,8 +101,8 @@ class Curve(NamedTuple):
 
 def read_curve(run: Path, name: str) -> Curve | None:
     """The curve of a run by its log, at most ``POINTS`` points; None where there is no line to draw."""
-    found = [(row["step"], row.get("seconds"), row.get("psnr")) for row in RunLog(run).rows()]
-    rows = [row for row in found if None not in row]
+    measured = [(row["step"], row.get("seconds"), row.get("psnr")) for row in RunLog(run).rows()]
+    rows = [row for row in measured if None not in row]
     if len(rows) < 2:
         return None
     steps, seconds, psnr = np.array(rows, np.float64).T
@@ -175,9 +175,9 @@ def exposure_svg(results: Results, pictures: Mapping[tuple[str, str], int]) -> s
     Returns:
         None where there is nothing to draw.
     """
-    taken = {row: [pictures[scene, row] for scene in results.scenes] for row in results.recipes}
-    rows = sorted(taken, key=lambda row: max(taken[row]))
-    columns = [[row, " to ".join(map(str, sorted({min(taken[row]), max(taken[row])})))] for row in rows]
+    numbers = {row: [pictures[scene, row] for scene in results.scenes] for row in results.recipes}
+    rows = sorted(numbers, key=lambda row: max(numbers[row]))
+    columns = [[row, " to ".join(map(str, sorted({min(numbers[row]), max(numbers[row])})))] for row in rows]
     panels = []
     for metric in _metrics(OVER_PICTURES):
         series = [Series(scene, []) for scene in results.scenes]

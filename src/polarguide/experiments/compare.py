@@ -160,41 +160,41 @@ def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
         expected = "a recipe with ablations: " + ", ".join(ABLATIONS)
         remedy = "Take one of these, or use compare."
         raise PolarguideError("base", expected=expected, found=base, remedy=remedy)
-    wanted = [name.removeprefix(f"{base}:") for name in only]
-    for name in wanted:
+    selected = [name.removeprefix(f"{base}:") for name in only]
+    for name in selected:
         check_choice("only", name, names)
-    return (base, *(f"{base}:{name}" for name in names if name in wanted or not only))
+    return (base, *(f"{base}:{name}" for name in names if name in selected or not only))
 
 
 def _checked_recipes(recipes: Sequence[str | Method]) -> tuple[Method, ...]:
     """The recipes as they are registered: runs are trained in other processes, which know recipes by name."""
-    found = tuple(recipe_named(recipe if isinstance(recipe, str) else recipe.name) for recipe in recipes)
-    for asked, known in zip(recipes, found, strict=True):
-        if isinstance(asked, Method) and asked != known:
+    registered = tuple(recipe_named(recipe if isinstance(recipe, str) else recipe.name) for recipe in recipes)
+    for passed, own in zip(recipes, registered, strict=True):
+        if isinstance(passed, Method) and passed != own:
             raise PolarguideError(
                 "recipes",
-                expected=f"the registered recipe {known.name}",
+                expected=f"the registered recipe {own.name}",
                 found="one of this name with other values",
                 remedy="Give it a name of its own, and register it under the entry points polarguide.recipes.",
             )
-    if not found:
+    if not registered:
         remedy = "Name at least one recipe."
         raise PolarguideError("compare", expected="a recipe", found="none", remedy=remedy)
-    names = [recipe.name for recipe in found]
+    names = [recipe.name for recipe in registered]
     if len(set(names)) < len(names):
         remedy = "Name each once."
         raise PolarguideError("recipes", expected="every name once", found=" ".join(names), remedy=remedy)
-    return found
+    return registered
 
 
 def _train(
     comparison: Comparison, scenes: Sequence[SceneEntry], plan: Sequence[PlannedRun], reporter: Reporter
 ) -> dict[Path, str]:
     """Train and score what is missing; the last words of what failed, by run folder."""
-    wanted = [run for run in plan if run.state() != "done"]
-    parallel = min(comparison.options.parallel, len(wanted))
-    reporter.say(f"runs: {len(plan)}, of them finished before: {len(plan) - len(wanted)}")
-    jobs = [_job(comparison, run, alone=parallel == 1) for run in wanted]
+    unfinished = [run for run in plan if run.state() != "done"]
+    parallel = min(comparison.options.parallel, len(unfinished))
+    reporter.say(f"runs: {len(plan)}, of them finished before: {len(plan) - len(unfinished)}")
+    jobs = [_job(comparison, run, alone=parallel == 1) for run in unfinished]
     failures: dict[Path, str] = {}
     if not jobs:
         return failures

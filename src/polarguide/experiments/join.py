@@ -113,14 +113,14 @@ def join_records(records: dict[str, Record], *, against: str | None = None) -> R
         check_choice("against", against, list(recipes))
     order = {name: index for names in (scenes, recipes) for index, name in enumerate(names)}
     settings = [record.settings for record in records.values()]
-    made = [record.provenance for record in records.values()]
+    provenances = [record.provenance for record in records.values()]
     return Record(
         format=FORMAT,
         provenance=msgspec.structs.replace(
             first.provenance,
-            sources=_each(of.sources for of in made),
-            command=_each(of.command for of in made),
-            date=max(of.date for of in made),
+            sources=_each(of.sources for of in provenances),
+            command=_each(of.command for of in provenances),
+            date=max(of.date for of in provenances),
         ),
         settings=msgspec.structs.replace(
             first.settings,
@@ -139,17 +139,17 @@ def _each(texts: Iterable[str]) -> str:
     return "; ".join(dict.fromkeys(texts))
 
 
-def _check_same_code(ours: Provenance, theirs: Provenance, known: str, name: str) -> None:
+def _check_same_code(ours: Provenance, theirs: Provenance, label: str, name: str) -> None:
     """Of one version, and of one commit or with equal digests: compilers may make other bytes of the same sources."""
-    _check_same(ours.version, theirs.version, f"{name} (provenance.version)", known)
+    _check_same(ours.version, theirs.version, f"{name} (provenance.version)", label)
     if ours.commit is None or ours.commit != theirs.commit:
-        (wanted, found) = (f"{of.sources}, commit {of.commit}" for of in (ours, theirs))
+        (code, found) = (f"{of.sources}, commit {of.commit}" for of in (ours, theirs))
         if ours.sources != theirs.sources:
-            _check_same(wanted, found, f"{name} (provenance.sources)", known)
+            _check_same(code, found, f"{name} (provenance.sources)", label)
 
 
-def _check_same(wanted: object, found: object, where: str, known: str) -> None:
-    if wanted != found:
+def _check_same(first: object, found: object, where: str, label: str) -> None:
+    if first != found:
         raise PolarguideError(
-            where, expected=f"{shortened(wanted)}, as {known} has it", found=shortened(found), remedy=_REMEDY
+            where, expected=f"{shortened(first)}, as {label} has it", found=shortened(found), remedy=_REMEDY
         )

@@ -60,9 +60,9 @@ class CompareOptions(SceneOptions):
         for name in self.exposures:
             check_choice("exposures", name, EXPOSURES)
         if len(set(self.exposures)) < len(self.exposures):
-            found = " ".join(self.exposures)
+            kinds = " ".join(self.exposures)
             raise PolarguideError(
-                "exposures", expected="every word once", found=found, remedy="Name each once."
+                "exposures", expected="every word once", found=kinds, remedy="Name each once."
             )
 
     @property

@@ -114,7 +114,7 @@ class Comparison:
     def command(self) -> str:
         """A command line that asks for the same."""
         settings, options = self.settings, self.options
-        given: dict[str, Sequence[object]] = {
+        arguments: dict[str, Sequence[object]] = {
             "--recipes": [recipe.name for recipe in self.recipes],
             "--steps": [self.steps, *(f"{name}={n}" for name, n in self.steps_of.items())],
             "--seeds": [options.seeds],
@@ -129,8 +129,8 @@ class Comparison:
             "--materials": [settings.materials] if settings.materials != "auto" else [],
             "--exposures": options.exposures,
         }
-        words = [word for option, values in given.items() if values for word in (option, *values)]
-        return self.asked or shlex.join(map(str, ["polarguide", "compare", *self.scenes, *words]))
+        line = [word for option, values in arguments.items() if values for word in (option, *values)]
+        return self.asked or shlex.join(map(str, ["polarguide", "compare", *self.scenes, *line]))
 
 
 @dataclass(frozen=True)
@@ -181,20 +181,25 @@ class PlannedRun:
         if not (self.folder / CONFIGURATION).exists():
             return "new"
         try:
-            found = RunConfiguration.load(self.folder)
+            configuration = RunConfiguration.load(self.folder)
         except PolarguideError:
             return "begun"  # going on with it will say what does not match
         same = (
-            found.scene_digest == self.scene.digest
-            and found.recipe_data == self.recipe.data()
-            and found.settings.fit(self.settings)
-            and (found.recipe, found.downscale, found.transfer, found.test_views)
+            configuration.scene_digest == self.scene.digest
+            and configuration.recipe_data == self.recipe.data()
+            and configuration.settings.fit(self.settings)
+            and (
+                configuration.recipe,
+                configuration.downscale,
+                configuration.transfer,
+                configuration.test_views,
+            )
             == (self.recipe.name, self.reading.downscale, self.reading.transfer, self.scene.test_views)
         )
         if same and self.metrics() is not None:
             return "done"
         # Scoring looks for the scene where the training found it: going on with the training takes up a moved one.
-        moved = found.scene != str(self.scene.path.resolve())
+        moved = configuration.scene != str(self.scene.path.resolve())
         leaves = family_of(self.recipe).leaves
         finished = (self.folder / leaves).exists() and trained_steps(self.folder) == self.steps
         return "trained" if same and finished and not moved else "begun"

@@ -134,13 +134,13 @@ class Record(msgspec.Struct):
         _require("format", self.format, (FORMAT, FORMER))
         self.format = FORMAT
         names = {"scene": [s.name for s in self.scenes], "recipe": [r.name for r in self.recipes]}
-        for kind, known in names.items():
-            if len(set(known)) < len(known):
-                raise _fault(f"{kind}s", "every name once", known)
+        for kind, names_of_kind in names.items():
+            if len(set(names_of_kind)) < len(names_of_kind):
+                raise _fault(f"{kind}s", "every name once", names_of_kind)
         _require("settings.against", self.settings.against, [*names["recipe"], None])
         for index, run in enumerate(self.runs):
-            for kind, known in names.items():
-                _require(f"runs[{index}].{kind}", getattr(run, kind), known)
+            for kind, names_of_kind in names.items():
+                _require(f"runs[{index}].{kind}", getattr(run, kind), names_of_kind)
             if (run.metrics is None) == (run.state == "done"):
                 expected = "values for a run that is done and null for another"
                 raise _fault(f"runs[{index}].metrics", expected, run.metrics)
@@ -155,9 +155,9 @@ def read_results(path: Path) -> Record:
     return read_record(path, Record, remedy=REMEDY)
 
 
-def _require(where: str, value: object, known: object) -> None:
-    if value not in known:  # type: ignore[operator]
-        raise _fault(where, "one of " + ", ".join(str(name) for name in known if name is not None), value)  # type: ignore[attr-defined]
+def _require(where: str, value: object, allowed: object) -> None:
+    if value not in allowed:  # type: ignore[operator]
+        raise _fault(where, "one of " + ", ".join(str(name) for name in allowed if name is not None), value)  # type: ignore[attr-defined]
 
 
 def _fault(where: str, expected: str, found: object) -> PolarguideError:

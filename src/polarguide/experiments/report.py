@@ -67,10 +67,10 @@ def write_report(
     remarks: list[str] = []
     curves: dict[str, list[Curve]] = {}
     sheets: dict[str, list[tuple[str, str]]] = {}
-    done = [run for run in plan if run.state() == "done"]
+    finished = [run for run in plan if run.state() == "done"]
     for scene in scenes:
         first: dict[str, PlannedRun] = {}  # by row, the run with the lowest seed
-        for run in done:
+        for run in finished:
             if run.scene.name == scene.name:
                 first.setdefault(run.row.name, run)
         runs = [first[row.name] for row in comparison.rows if row.name in first]
@@ -93,7 +93,7 @@ def write_report(
                 views += [view] if view is not None else []
                 remarks += [remark] if remark is not None else []
                 advance(count)
-    text = report_html(results, views, curves, remarks, sheets, _health(done))
+    text = report_html(results, views, curves, remarks, sheets, _health(finished))
     write_text(comparison.out / REPORT, text)
 
 
@@ -195,7 +195,7 @@ def report_html(
         layers={key: label for key, label in LAYERS.items() if metal or key != "metalness"},
         legend=LEGEND,
         remarks=remarks,
-        sheets={scene: found for scene, found in sheets.items() if found},
+        sheets={scene: sheet for scene, sheet in sheets.items() if sheet},
         health=health,
         gradient=figures.color_gradient("inferno"),
         curves=[

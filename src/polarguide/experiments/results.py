@@ -90,13 +90,13 @@ class Results:
     @cached_property
     def parts(self) -> pd.DataFrame:
         """Scores by object and by material of every scene and recipe, means over its seeds with their spreads."""
-        found: dict[tuple[str, ...], list[PartScores]] = {}
+        scores: dict[tuple[str, ...], list[PartScores]] = {}
         for run in self.record.runs:
             for kind, scored in (("object", run.objects), ("material", run.materials)):
                 for name, part in scored.items():
-                    found.setdefault((run.scene, run.recipe, kind, name), []).append(part)
+                    scores.setdefault((run.scene, run.recipe, kind, name), []).append(part)
         rows = []
-        for place, seeds in found.items():
+        for place, seeds in scores.items():
             cells = [cell_of([part.metrics.get(column.key) for part in seeds]) for column in PART_METRICS]
             rows.append(
                 [*place, seeds[0].material, seeds[0].pixels, seeds[0].views, len(seeds), *_pairs(cells)]
@@ -120,12 +120,12 @@ class Results:
         rows = []
         for scene in [*self.scenes, None] if len(self.scenes) > 1 else self.scenes:
             for index, recipe in enumerate(self.recipes):
-                done = [r.scene for r in self.record.runs if r.recipe == recipe and r.metrics is not None]
+                scored = [r.scene for r in self.record.runs if r.recipe == recipe and r.metrics is not None]
                 cells = {}
                 for key, of in values.items():
                     numbers = [v[index, :, 0] for s, v in of.items() if scene in (None, s)]
                     cells[key] = cell_of(known(numbers[0])) if scene and numbers else _over_scenes(numbers)
-                finished = len(done) if scene is None else done.count(scene)
+                finished = len(scored) if scene is None else scored.count(scene)
                 rows.append(Row(scene, recipe, finished, cells))
         return rows
 

@@ -50,11 +50,11 @@ CONTROL = "unpolarized"
 
 def controlled(recipes: Sequence[str]) -> dict[str, list[str]]:
     """The recipes that have controls among them, each with these."""
-    found = {
+    by_recipe = {
         recipe: [name for name in recipes if f"{name}-".startswith(f"{recipe}:{CONTROL}-")]
         for recipe in recipes
     }
-    return {recipe: controls for recipe, controls in found.items() if controls}
+    return {recipe: controls for recipe, controls in by_recipe.items() if controls}
 
 
 def known_scatter(key: str, black_share: float | None) -> float | None:
@@ -69,15 +69,15 @@ def values_of(
     """What ``value`` gives of every run by unit, of the scenes that have any (all, or those that are named)."""
     recipes = {recipe.name: index for index, recipe in enumerate(record.recipes)}
     seeds = {seed: index for index, seed in enumerate(sorted({run.seed for run in record.runs}))}
-    found: Values = {}
+    values: Values = {}
     for scene in scenes or [scene.name for scene in record.scenes]:
         runs = [(run, value(run)) for run in record.runs if run.scene == scene]
         units = dict.fromkeys(unit for _, of in runs for unit, number in of.items() if number is not None)
         if units:
-            found[scene] = np.full((len(recipes), len(seeds), len(units)), np.nan)
+            values[scene] = np.full((len(recipes), len(seeds), len(units)), np.nan)
         for run, of in runs if units else ():
-            found[scene][recipes[run.recipe], seeds[run.seed]] = np.array([of.get(u) for u in units], float)
-    return found
+            values[scene][recipes[run.recipe], seeds[run.seed]] = np.array([of.get(u) for u in units], float)
+    return values
 
 
 def metric_of_runs(key: str) -> Callable[[RunRecord], dict[str, float | None]]:
@@ -210,7 +210,7 @@ def pair(
         What ``estimate`` gives, ``other``, and those ``left_out`` that had no runs to pair; None where there is nothing
         to pair, or nothing that all have and the choice could rest on.
     """
-    place = {known.name: index for index, known in enumerate(record.recipes)}
+    place = {entry.name: index for index, entry in enumerate(record.recipes)}
     pairs = {o: [paired(v[place[recipe]], v[place[o]]) for v in values.values()] for o in others}
     whole = [other for other in others if values and all(apart.size for apart in pairs[other])]
     if len(whole) > 1:
@@ -257,17 +257,17 @@ def differences(record: Record, compared: Sequence[Metric]) -> list[dict[str, An
     recipes = [recipe.name for recipe in record.recipes]
     scenes: list[str | None] = [scene.name for scene in record.scenes]
     values = {column.key: values_of(record, metric_of_views(column)) for column in compared}
-    wanted = [("control", recipe, controls) for recipe, controls in controlled(recipes).items()]
+    pairs = [("control", recipe, controls) for recipe, controls in controlled(recipes).items()]
     against = record.settings.against
     if against is not None:
-        wanted += [("against", recipe, [against]) for recipe in recipes if recipe != against]
-    found = []
+        pairs += [("against", recipe, [against]) for recipe in recipes if recipe != against]
+    rows = []
     for scene in [*scenes, None] if len(scenes) > 1 else scenes:
-        for why, recipe, others in wanted:
+        for why, recipe, others in pairs:
             for column in compared:
                 of = {s: v for s, v in values[column.key].items() if scene in (None, s)}
                 of_pair = pair(record, of, recipe, others, column)
                 if of_pair is not None:
                     named = {"scene": scene, "recipe": recipe, "other": "", "why": why, "metric": column.key}
-                    found.append(named | of_pair)
-    return found
+                    rows.append(named | of_pair)
+    return rows

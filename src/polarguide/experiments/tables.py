@@ -86,14 +86,14 @@ def signed(value: float, column: Metric) -> str:
 
 def sections(results: Results) -> list[Section]:
     """All tables of a comparison, in the order in which they are shown; only those that have rows."""
-    made = (
+    tables = (
         scores_section(results),
         control_section(results),
         against_section(results),
         part_section(results, "object"),
         part_section(results, "material"),
     )
-    return [section for section in made if section.blocks]
+    return [section for section in tables if section.blocks]
 
 
 def scores_section(results: Results) -> Section:
@@ -110,14 +110,14 @@ def scores_section(results: Results) -> Section:
             means = {i: m for i, row in enumerate(rows) if (m := row.cells[column.key].mean) is not None}
             of = {s: v for s, v in values[column.key].items() if scene in (None, s)}
             bold[column.key] = leaders(means, of, column, scatter_on(results.record, of, column))
-        made = [
+        parts = [
             (
                 [(row.recipe, True, _remark(row, results))],
                 [_score(row, column, index in bold[column.key], results) for column in columns],
             )
             for index, row in enumerate(rows)
         ]
-        blocks.append((scene or MEAN_TITLE, made))
+        blocks.append((scene or MEAN_TITLE, parts))
     return Section("scores", "", ("recipe",), [c.heading for c in columns], blocks, notes(results))
 
 
@@ -165,13 +165,13 @@ def _remark(row: Row, results: Results) -> str:
     """Its number of steps where that is not the others', and what is missing of it, else its seeds if rows differ."""
     (steps,) = (recipe.steps for recipe in results.record.recipes if recipe.name == row.recipe)
     states = [r.state for r in results.record.runs if r.recipe == row.recipe and row.scene in (None, r.scene)]
-    done, missing = states.count("done"), ""
-    if states and not done:
+    finished, missing = states.count("done"), ""
+    if states and not finished:
         missing = "failed" if "failed" in states else "missing"
-    elif done < len(states):
-        missing = f"{done} of {len(states)} {'runs' if row.scene is None else 'seeds'}"
+    elif finished < len(states):
+        missing = f"{finished} of {len(states)} {'runs' if row.scene is None else 'seeds'}"
     elif row.scene is not None and len(seed_counts(results)) > 1:
-        missing = f"{done} seed{'' if done == 1 else 's'}"
+        missing = f"{finished} seed{'' if finished == 1 else 's'}"
     return ", ".join(filter(None, (f"{steps:,} steps" if steps is not UNSET else "", missing)))
 
 
@@ -190,30 +190,30 @@ def notes(results: Results) -> list[str]:
         )
         > 1,
     }
-    made = [text for text, holds in stated.items() if holds]
-    made += [f"{scene.name}: {text}" for scene in record.scenes for text in scene.warnings or ()]
-    done = [run for run in record.runs if run.state == "done"]
+    sentences = [text for text, holds in stated.items() if holds]
+    sentences += [f"{scene.name}: {text}" for scene in record.scenes for text in scene.warnings or ()]
+    finished = [run for run in record.runs if run.state == "done"]
     for label, field in (("LPIPS", "lpips_reason"), (MESH_LABEL, "mesh_reason")):
-        reasons = dict.fromkeys(getattr(run, field) for run in done)
-        made += [f"{label} {NOT_APPLICABLE}: {reason}." for reason in reasons if reason]
+        reasons = dict.fromkeys(getattr(run, field) for run in finished)
+        sentences += [f"{label} {NOT_APPLICABLE}: {reason}." for reason in reasons if reason]
     for run in record.runs:
         if run.state != "done":
             what = "failed" if run.state == "failed" else "has not finished"
-            made.append(
+            sentences.append(
                 f"{run.scene}, {run.recipe}, seed {run.seed} {what}" + (f": {run.error}" if run.error else "")
             )
-    return made
+    return sentences
 
 
 def control_section(results: Results) -> Section:
     """What polarization buys: a block for every recipe with controls, a row for every scene and one over scenes."""
-    found = [d for d in results.compared if d["why"] == "control"]
-    columns = _columns(found)
+    compared = [d for d in results.compared if d["why"] == "control"]
+    columns = _columns(compared)
     blocks, stated = [], []
     for recipe, controls in controlled(results.recipes).items():
         letters = dict(zip(controls, "abcdefghij", strict=False)) if len(controls) > 1 else {}
         names = ", ".join(f"{letters[c]}: {c}" if letters else c for c in controls)
-        mine = [d for d in found if d["recipe"] == recipe]
+        mine = [d for d in compared if d["recipe"] == recipe]
         rows = [
             _row(s, False, [d for d in mine if d["scene"] == s], columns, letters) for s in _places(results)
         ]
@@ -226,7 +226,7 @@ def control_section(results: Results) -> Section:
     stated += dict.fromkeys(
         f"{d['scene'] or OVER_SCENES}, {d['recipe']}: chosen without {', '.join(d['left_out'])}, for want of "
         "runs to pair."
-        for d in found
+        for d in compared
         if d["left_out"]
     )
     headings = [column.heading for column in columns]
@@ -237,11 +237,11 @@ def control_section(results: Results) -> Section:
 def against_section(results: Results) -> Section:
     """Differences to a recipe that was asked for: a block for every scene, a row for every other recipe."""
     against = results.record.settings.against
-    found = [d for d in results.compared if d["why"] == "against"]
-    columns = _columns(found)
+    compared = [d for d in results.compared if d["why"] == "against"]
+    columns = _columns(compared)
     blocks = []
     for scene in _places(results) if against is not None else []:
-        mine = [d for d in found if d["scene"] == scene]
+        mine = [d for d in compared if d["scene"] == scene]
         rows = [
             _row(recipe, True, [d for d in mine if d["recipe"] == recipe], columns, {})
             for recipe in results.recipes
@@ -257,20 +257,20 @@ def _places(results: Results) -> list[str | None]:
     return [*results.scenes, None] if len(results.scenes) > 1 else [*results.scenes]
 
 
-def _columns(found: Sequence[Mapping[str, Any]]) -> list[Metric]:
-    there = {difference["metric"] for difference in found}
+def _columns(compared: Sequence[Mapping[str, Any]]) -> list[Metric]:
+    there = {difference["metric"] for difference in compared}
     return [column for column in COLUMNS if column.shown == "tables" and column.key in there]
 
 
 def _row(
     name: str | None,
     code: bool,
-    found: Sequence[Mapping[str, Any]],
+    compared: Sequence[Mapping[str, Any]],
     columns: Sequence[Metric],
     letters: Mapping[str, str],
 ) -> TableRow:
     """The differences of one row; what most of its intervals are over is said once, the others in their cells."""
-    by_key = {difference["metric"]: difference for difference in found}
+    by_key = {difference["metric"]: difference for difference in compared}
     units = [_unit(by_key[column.key]) for column in columns if column.key in by_key]
     usual = max(dict.fromkeys(units), key=units.count, default="")
     cells = []
@@ -283,7 +283,7 @@ def _row(
         interval = "" if of["low"] is None else f"[{signed(of['low'], column)}, {signed(of['high'], column)}]"
         more = " ".join(filter(None, (interval, "" if unit == usual else f"({unit})", letter)))
         cells.append(_gain(of["mean"], of["noise"], column, more))
-    remark = "" if found else "no runs to pair"
+    remark = "" if compared else "no runs to pair"
     return [(name or OVER_SCENES, code, remark), (usual, False, "")], cells
 
 
@@ -322,16 +322,16 @@ def part_section(results: Results, kind: str) -> Section:
                 rows.append(([(name, False, "") for name in names], cells))
         if rows:
             blocks.append((column.heading, rows))
-    made = [_HOW_PARTS]
+    parts = [_HOW_PARTS]
     if with_controls:
-        made.append(
+        parts.append(
             "The last columns: what polarization buys, the difference to the better control; bold and ≈ as above."
         )
     if kind == "material":
-        made.append("Means over the scenes that have the material, with one weight each.")
+        parts.append("Means over the scenes that have the material, with one weight each.")
     headings = [*results.recipes, *(f"{recipe} {MINUS} control" for recipe in with_controls)]
     titles = ("scene", "object", "material") if kind == "object" else ("material", "scenes")
-    return Section(f"{kind}s", f"By {kind}", titles, headings, blocks, made)
+    return Section(f"{kind}s", f"By {kind}", titles, headings, blocks, parts)
 
 
 def _part_score(kind: str, labels: Sequence[str], key: str, run: RunRecord) -> dict[str, float | None]:
@@ -361,7 +361,7 @@ def _gains(
 ) -> Iterator[TableCell]:
     """What polarization buys of every recipe with controls."""
     for recipe, controls in recipes.items():
-        found = None
+        gain = None
         if column.better is not None:
-            found = pair(results.record, values, recipe, controls, column, scatter=False)
-        yield EMPTY if found is None else _gain(found["mean"], found["noise"], column)
+            gain = pair(results.record, values, recipe, controls, column, scatter=False)
+        yield EMPTY if gain is None else _gain(gain["mean"], gain["noise"], column)

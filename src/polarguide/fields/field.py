@@ -53,9 +53,9 @@ class Region:
         x, y, z = frame.center.tolist()
         return cls((x, y, z), unit, max(1.0, MARGIN * farthest / unit))
 
-    def first_radius(self, wanted: float) -> float:
+    def first_radius(self, radius: float) -> float:
         """Of the sphere that a surface starts as: what is wanted, but no camera stands near it or in it."""
-        return min(wanted, 0.5 * self.radius)
+        return min(radius, 0.5 * self.radius)
 
     def inner(self, points: Tensor) -> Tensor:
         """World points [..., 3] in the field's own coordinates."""
@@ -180,8 +180,8 @@ class GridField(Field):
         self.first_radius = region.first_radius(shape.first_radius)
         self.shape_grids = SmoothGrids(shape.resolutions)
         self.features = FeatureGrids(shape.resolutions, shape.channels, 0.1, generator)
-        given = self.features.width + 3 + 3 + direction_width()
-        self.head = network((given, shape.width, shape.width, 3), generator)
+        inputs = self.features.width + 3 + 3 + direction_width()
+        self.head = network((inputs, shape.width, shape.width, 3), generator)
         self.map_distances()
 
     def geometry(self, places: Tensor) -> Geometry:
@@ -194,13 +194,13 @@ class GridField(Field):
 
     def color(self, places: Tensor, directions: Tensor, normals: Tensor, features: Tensor) -> Tensor:
         """See ``Field``."""
-        given = (
+        inputs = (
             features,
             places / self.region.radius,
             normals,
             self.direction_share * encoded_directions(directions),
         )
-        color: Tensor = torch.sigmoid(self.head(torch.cat(given, dim=-1)))
+        color: Tensor = torch.sigmoid(self.head(torch.cat(inputs, dim=-1)))
         return color
 
     @torch.no_grad()
@@ -231,17 +231,17 @@ class Background(nn.Module):
 
     def forward(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """Density [N] and shown colors [N, 3] at places in a ball of radius 1 (``Region.surroundings``)."""
-        found = self.head(self.grids(places))
-        return softplus(found[:, 0]), torch.sigmoid(found[:, 1:])
+        values = self.head(self.grids(places))
+        return softplus(values[:, 0]), torch.sigmoid(values[:, 1:])
 
 
 def network(widths: Sequence[int], generator: torch.Generator) -> nn.Sequential:
     """Linear layers of these widths with ReLUs between them, drawn as He et al. (2015) do."""
     layers: list[nn.Module] = []
-    for given, made in pairwise(widths):
-        layer = nn.Linear(given, made)
+    for inputs, outputs in pairwise(widths):
+        layer = nn.Linear(inputs, outputs)
         with torch.no_grad():
-            layer.weight.copy_(torch.randn(made, given, generator=generator) * math.sqrt(2 / given))
+            layer.weight.copy_(torch.randn(outputs, inputs, generator=generator) * math.sqrt(2 / inputs))
             layer.bias.zero_()
         layers += [layer, nn.ReLU()]
     return nn.Sequential(*layers[:-1])
@@ -289,45 +289,45 @@ class NetworkField(Field):
         """See ``Field``."""
         learns = torch.is_grad_enabled()
         with torch.enable_grad():
-            given = places.detach().requires_grad_()
-            found = self._distance(given)
-            (slope,) = torch.autograd.grad(found[:, 0].sum(), given, create_graph=learns, retain_graph=True)
-        return Geometry(found[:, 0], slope, found[:, 1:])
+            points = places.detach().requires_grad_()
+            values = self._distance(points)
+            (slope,) = torch.autograd.grad(values[:, 0].sum(), points, create_graph=learns, retain_graph=True)
+        return Geometry(values[:, 0], slope, values[:, 1:])
 
     def color(self, places: Tensor, directions: Tensor, normals: Tensor, features: Tensor) -> Tensor:
         """See ``Field``."""
-        seen = self.direction_share * encoded_directions(directions)
-        given = torch.cat((features, places / self.region.radius, normals, seen), dim=-1)
-        color: Tensor = torch.sigmoid(self.head(given))
+        encoding = self.direction_share * encoded_directions(directions)
+        inputs = torch.cat((features, places / self.region.radius, normals, encoding), dim=-1)
+        color: Tensor = torch.sigmoid(self.head(inputs))
         return color
 
     @torch.no_grad()
     def lattice(self, axes: Sequence[Tensor]) -> Tensor:
         """See ``Field``."""
         places = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
-        found = [self._distance(part)[:, 0] for part in places.view(-1, 3).split(CHUNK)]
-        return torch.cat(found).view(places.shape[:-1])
+        distances = [self._distance(part)[:, 0] for part in places.view(-1, 3).split(CHUNK)]
+        return torch.cat(distances).view(places.shape[:-1])
 
     def _distance(self, places: Tensor) -> Tensor:
         """Distance and features [N, 1 + WIDTH] at places [N, 3], in the sphere of radius 1 that the network knows."""
-        given = encoded(places / self.region.radius, PLACE_FREQUENCIES)
-        found = given
+        encoding = encoded(places / self.region.radius, PLACE_FREQUENCIES)
+        hidden = encoding
         for k, layer in enumerate(self.layers):
             if k == SKIP:
-                found = torch.cat((found, given), dim=-1) / math.sqrt(2)
-            found = layer(found)
+                hidden = torch.cat((hidden, encoding), dim=-1) / math.sqrt(2)
+            hidden = layer(hidden)
             if k < DEPTH:
-                found = softplus(found, SOFTNESS)
-        return torch.cat((self.region.radius * found[:, :1], found[:, 1:]), dim=-1)
+                hidden = softplus(hidden, SOFTNESS)
+        return torch.cat((self.region.radius * hidden[:, :1], hidden[:, 1:]), dim=-1)
 
 
 def _distance_layers(radius: float, generator: torch.Generator) -> nn.ModuleList:
     """Layers that begin as the distance of a sphere (Gropp et al. 2020): positive outside."""
-    given = 3 * (1 + 2 * PLACE_FREQUENCIES)
+    encoded_width = 3 * (1 + 2 * PLACE_FREQUENCIES)
     layers = []
     for k in range(DEPTH + 1):
-        inputs = given if k == 0 else WIDTH
-        outputs = WIDTH + 1 if k == DEPTH else WIDTH - given if k + 1 == SKIP else WIDTH
+        inputs = encoded_width if k == 0 else WIDTH
+        outputs = WIDTH + 1 if k == DEPTH else WIDTH - encoded_width if k + 1 == SKIP else WIDTH
         layer = nn.Linear(inputs, outputs)
         with torch.no_grad():
             noise = torch.randn(outputs, inputs, generator=generator)
@@ -340,6 +340,6 @@ def _distance_layers(radius: float, generator: torch.Generator) -> nn.ModuleList
                 if k == 0:
                     layer.weight[:, 3:] = 0
                 elif k == SKIP:
-                    layer.weight[:, -(given - 3) :] = 0
+                    layer.weight[:, -(encoded_width - 3) :] = 0
         layers.append(layer)
     return nn.ModuleList(layers)

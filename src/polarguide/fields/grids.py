@@ -49,11 +49,11 @@ class SmoothGrids(nn.Module):
 
     def forward(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """Values [N] and slopes [N, 3] at places [N, 3]; what lies outside the cube counts as on its surface."""
-        found = torch.zeros(len(places), 4, 1, dtype=places.dtype, device=places.device)
+        sums = torch.zeros(len(places), 4, 1, dtype=places.dtype, device=places.device)
         for resolution, table in zip(self.resolutions, self.levels, strict=True):
             nodes, weights = spline_weights(places, resolution)
-            found = found + _Gather.apply(table, nodes, weights)
-        return found[:, 0, 0], found[:, 1:, 0]
+            sums = sums + _Gather.apply(table, nodes, weights)
+        return sums[:, 0, 0], sums[:, 1:, 0]
 
 
 class FeatureGrids(nn.Module):
@@ -76,11 +76,11 @@ class FeatureGrids(nn.Module):
 
     def forward(self, places: Tensor) -> Tensor:
         """Features [N, width] at places [N, 3]; what lies outside the cube counts as on its surface."""
-        found = []
+        features = []
         for resolution, table in zip(self.resolutions, self.levels, strict=True):
             nodes, weights = linear_weights(places, resolution)
-            found.append(_Gather.apply(table, nodes, weights[:, None])[:, 0])
-        return torch.cat(found, dim=1)
+            features.append(_Gather.apply(table, nodes, weights[:, None])[:, 0])
+        return torch.cat(features, dim=1)
 
 
 def spline_weights(places: Tensor, resolution: int) -> tuple[Tensor, Tensor]:

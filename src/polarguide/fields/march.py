@@ -80,12 +80,12 @@ def march(
         before, after = _sections(along, begin, end, (end - begin) / sampling.coarse)
     places = origin[:, None] + along[..., None] * direction[:, None]
     flat, rays = places.view(-1, 3), direction[:, None].expand(-1, fine, -1).reshape(-1, 3)
-    seen: Geometry = field.geometry(flat)
-    normals = unit(seen.slope)
+    geometry: Geometry = field.geometry(flat)
+    normals = unit(geometry.slope)
     # The color does not bend normals: grids would paint with bumps.
-    colors = field.color(flat, rays, normals.detach(), seen.features).view(count, fine, 3)
-    falling = dot(rays, seen.slope).view(count, fine).clamp(max=0)
-    distance = seen.distance.view(count, fine)
+    colors = field.color(flat, rays, normals.detach(), geometry.features).view(count, fine, 3)
+    falling = dot(rays, geometry.slope).view(count, fine).clamp(max=0)
+    distance = geometry.distance.view(count, fine)
     first, last = ((distance + falling * step) * field.sharpness for step in (before, after))
     alpha = section_opacity(first, last)
     if kept is not None:
@@ -96,7 +96,7 @@ def march(
     if kept is None:
         color = color + through[:, -1:] * _behind(field, origin, direction, sampling.background, generator)
     shape = (count, fine, 3)
-    return Marched(color, along, weights, places, seen.slope.view(shape), normals.view(shape))
+    return Marched(color, along, weights, places, geometry.slope.view(shape), normals.view(shape))
 
 
 def trace(field: Field, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:

@@ -92,8 +92,8 @@ class FieldModel:
             camera: any. normals: they come with the colors. surface: its depth is that of the surface in any case.
             kept: see ``Kept``; None: all, with what lies behind.
         """
-        seen = [self._seen(*rays, depth, kept) for rays in self._rays(camera)]
-        color, normal, opacity, distance = (torch.cat(parts) for parts in zip(*seen, strict=True))
+        batches = [self._seen(*rays, depth, kept) for rays in self._rays(camera)]
+        color, normal, opacity, distance = (torch.cat(parts) for parts in zip(*batches, strict=True))
         size = (camera.height, camera.width)
         final = srgb_decode(color).view(*size, 3)
         rays = camera.rays(device=self.device)
@@ -119,9 +119,9 @@ class FieldModel:
         far = depth.to(rays).flatten() / rays[:, 2] / self.field.region.unit
         shares = []
         for (origin, direction), reach in zip(self._rays(camera), far.split(CHUNK), strict=True):
-            seen = march(self.field, origin, direction, self.recipe.sampling)
-            near = (seen.weights * (seen.along < reach[:, None])).sum(dim=1)
-            shares.append(near / seen.opacity.clamp(min=1e-6))
+            marched = march(self.field, origin, direction, self.recipe.sampling)
+            near = (marched.weights * (marched.along < reach[:, None])).sum(dim=1)
+            shares.append(near / marched.opacity.clamp(min=1e-6))
         return torch.cat(shares).view(depth.shape)
 
     @torch.no_grad()
@@ -137,13 +137,13 @@ class FieldModel:
     @torch.no_grad()
     def surface(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """Normals [N, 3], and linear colors [N, 3] seen from straight above, at places [N, 3] of the surface."""
-        found = []
+        colors = []
         for part in self.field.region.inner(places.to(self.device, torch.float32)).split(CHUNK):
             geometry = self.field.geometry(part)
             normal = unit(geometry.slope)
             color = self.field.color(part, -normal, normal, geometry.features)
-            found.append(torch.cat((normal, srgb_decode(color)), dim=1))
-        normal, color = torch.cat(found).to(places).split(3, dim=1)
+            colors.append(torch.cat((normal, srgb_decode(color)), dim=1))
+        normal, color = torch.cat(colors).to(places).split(3, dim=1)
         return normal, color
 
     def _rays(self, camera: Camera) -> list[tuple[Tensor, Tensor]]:
@@ -154,10 +154,10 @@ class FieldModel:
 
     def _seen(self, origin: Tensor, direction: Tensor, depth: bool, kept: Kept | None) -> _Seen:
         region = self.field.region
-        shown = None if kept is None else lambda inner: kept(region.world(inner))
-        seen = march(self.field, origin, direction, self.recipe.sampling, kept=shown)
-        distance = seen.distance
+        inside = None if kept is None else lambda inner: kept(region.world(inner))
+        marched = march(self.field, origin, direction, self.recipe.sampling, kept=inside)
+        distance = marched.distance
         if depth:
             traced, hit = trace(self.field, origin, direction)
             distance = torch.where(hit & (kept is None), traced, distance)
-        return _Seen(seen.color, seen.normal, seen.opacity, distance)
+        return _Seen(marched.color, marched.normal, marched.opacity, distance)

@@ -73,16 +73,16 @@ class FieldState:
         own = {f"field.{name}": values for name, values in state.field.state_dict().items()}
         loaded = {name: _like(values, _given(tensors, name), name) for name, values in own.items()}
         state.field.load_state_dict({name.removeprefix("field."): t for name, t in loaded.items()})
-        known = {"scalars", "region", *own}
+        names_known = {"scalars", "region", *own}
         for name, values in state.field.named_parameters():
             names = {key: f"adam.{name}.{key}" for key in MOMENTS}
-            known |= set(names.values())
+            names_known |= set(names.values())
             if not tensors.keys().isdisjoint(names.values()):
                 state.optimizer.state[values] = {
                     key: _like(values if key != "step" else torch.zeros(()), _given(tensors, full), full)
                     for key, full in names.items()
                 }
-        strangers = sorted(tensors.keys() - known)
+        strangers = sorted(tensors.keys() - names_known)
         if strangers:
             raise ValueError(f"{strangers[0][:80]}, which is not known")
         return state
@@ -94,14 +94,14 @@ def _given(tensors: Mapping[str, Tensor], name: str) -> Tensor:
     return tensors[name]
 
 
-def _like(own: Tensor, found: Tensor, name: str) -> Tensor:
+def _like(own: Tensor, values: Tensor, name: str) -> Tensor:
     """What was found, if it is finite and in the shape and type of what the recipe makes."""
-    if found.shape != own.shape or found.dtype != own.dtype:
+    if values.shape != own.shape or values.dtype != own.dtype:
         expected = f"{list(own.shape)}, {own.dtype}"
-        raise ValueError(f"{name} of shape {list(found.shape)}, {found.dtype}, not {expected}")
-    if not bool(torch.isfinite(found).all()):
+        raise ValueError(f"{name} of shape {list(values.shape)}, {values.dtype}, not {expected}")
+    if not bool(torch.isfinite(values).all()):
         raise ValueError(f"{name} with values that are not finite")
-    return found.to(own.device)
+    return values.to(own.device)
 
 
 def _step(scalars: Tensor) -> int:

@@ -48,15 +48,17 @@ def target_of(view: View, store: ViewStore, device: torch.device) -> Target:
             entry["valid"] = Packed((~view.invalid).to(device))
         if view.is_determined:
             gray = luminance(view.stokes())
-            known = dolp(gray) * ~(view.saturated | view.invalid)
-            entry["dolp"], entry["aolp"] = packed(known.to(device)), packed(aolp(gray).to(device))
+            degree = dolp(gray) * ~(view.saturated | view.invalid)
+            entry["dolp"], entry["aolp"] = packed(degree.to(device)), packed(aolp(gray).to(device))
         return entry
 
-    kept = store.get("target", view.name, make)
-    picture = unpacked(kept["picture"]).view(-1, 3)
+    stored = store.get("target", view.name, make)
+    picture = unpacked(stored["picture"]).view(-1, 3)
     nothing = torch.zeros(len(picture), device=device)
-    degree, angle = (unpacked(kept[name]).flatten() if name in kept else nothing for name in ("dolp", "aolp"))
-    valid = kept["valid"].codes.flatten() if "valid" in kept else nothing == 0
+    degree, angle = (
+        unpacked(stored[name]).flatten() if name in stored else nothing for name in ("dolp", "aolp")
+    )
+    valid = stored["valid"].codes.flatten() if "valid" in stored else nothing == 0
     return Target(picture, degree, torch.remainder(angle, torch.pi), valid.nonzero()[:, 0])
 
 

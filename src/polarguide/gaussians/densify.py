@@ -120,24 +120,24 @@ class DensityStatistics:
         self.clear(count)
 
     @classmethod
-    def of(cls, gradient: Tensor, seen: Tensor) -> DensityStatistics:
+    def of(cls, gradient: Tensor, counts: Tensor) -> DensityStatistics:
         """From sums as of the attributes."""
         statistics = cls(0, gradient.shape[0] if gradient.ndim == 2 else 1, gradient.device)
-        statistics.gradient, statistics.seen = gradient, seen
+        statistics.gradient, statistics.seen = gradient, counts
         return statistics
 
     def add(self, screen_gradient: Tensor, radii: Tensor, width: int, height: int, slot: int = 0) -> None:
         """Add one picture. screen_gradient: [N, 2] per pixel, converted to units of half a picture."""
         x, y = screen_gradient.unbind(1)
         norm = torch.stack((x * (width / 2), y * (height / 2)), dim=1).norm(dim=1)
-        gradient, seen = (t[slot] if t.ndim == 2 else t for t in (self.gradient, self.seen))
+        gradient, counts = (t[slot] if t.ndim == 2 else t for t in (self.gradient, self.seen))
         gradient += norm
-        seen += (radii > 0).to(seen)
+        counts += (radii > 0).to(counts)
 
     def mean(self) -> Tensor:
         """Mean gradient norm, [N]; 0 where never seen."""
-        gradient, seen = (_in_order(t) for t in (self.gradient, self.seen))
-        return gradient / seen.clamp(min=1)
+        gradient, counts = (_in_order(t) for t in (self.gradient, self.seen))
+        return gradient / counts.clamp(min=1)
 
     def clear(self, count: int) -> None:
         """Start again with ``count`` Gaussians."""

@@ -42,12 +42,12 @@ def shortest_axis_normals_reference(
     length = x * x + y * y + z * z
     twice = 2 / (w * w + length).clamp(min=1e-24)
     along = x * ax + y * ay + z * az
-    kept = 1 - twice * length
+    diagonal = 1 - twice * length
     normals = torch.stack(
         (
-            kept * ax + twice * (x * along + w * (y * az - z * ay)),
-            kept * ay + twice * (y * along + w * (z * ax - x * az)),
-            kept * az + twice * (z * along + w * (x * ay - y * ax)),
+            diagonal * ax + twice * (x * along + w * (y * az - z * ay)),
+            diagonal * ay + twice * (y * along + w * (z * ax - x * az)),
+            diagonal * az + twice * (z * along + w * (x * ay - y * ax)),
         ),
         dim=-1,
     )

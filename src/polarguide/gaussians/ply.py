@@ -131,7 +131,7 @@ def read_ply(path: str | Path) -> dict[str, Any]:
         return _from_columns(table[:, [column[f] for f in fields]], shape)
 
     extra = {}
-    taken = {*RELEASE_FIELDS}
+    allowed = {*RELEASE_FIELDS}
     for comment in element.comments:
         if match := re.fullmatch(r"extra (\w+)((?: \d+)*)", comment):
             shape = tuple(int(size) for size in match[2].split())
@@ -139,8 +139,8 @@ def read_ply(path: str | Path) -> dict[str, Any]:
             if not set(fields) <= set(names):
                 raise _unreadable(path, f"the fields of {match[1]} that a comment announces", "some missing")
             extra[match[1]] = tensor(fields, *shape)
-            taken |= set(fields)
-    extra |= {name: tensor([name]) for name in names if name not in taken}
+            allowed |= set(fields)
+    extra |= {name: tensor([name]) for name in names if name not in allowed}
     return {
         "means": tensor(["x", "y", "z"], 3),
         "log_scales": tensor([f"scale_{i}" for i in range(3)], 3),

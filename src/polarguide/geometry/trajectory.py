@@ -63,20 +63,22 @@ def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
     Cameras that stand in the same place as the one before are left out.
     """
-    kept = list(cameras[:1])
+    keyframes = list(cameras[:1])
     for camera in cameras[1:]:
-        if float((camera.center - kept[-1].center).norm()) > 1e-9:
-            kept.append(camera)
-    if len(kept) == 1:
-        return kept * frames
-    times, wanted = np.arange(len(kept)), np.linspace(0, len(kept) - 1, frames)
-    centers = CubicSpline(times, torch.stack([camera.center for camera in kept]).numpy())(wanted)
-    turns = Rotation.from_matrix(torch.stack([camera.rotation for camera in kept]).numpy())
-    rotations = RotationSpline(times, turns)(wanted).as_matrix()
+        if float((camera.center - keyframes[-1].center).norm()) > 1e-9:
+            keyframes.append(camera)
+    if len(keyframes) == 1:
+        return keyframes * frames
+    times, sampled = np.arange(len(keyframes)), np.linspace(0, len(keyframes) - 1, frames)
+    centers = CubicSpline(times, torch.stack([camera.center for camera in keyframes]).numpy())(sampled)
+    turns = Rotation.from_matrix(torch.stack([camera.rotation for camera in keyframes]).numpy())
+    rotations = RotationSpline(times, turns)(sampled).as_matrix()
     path = []
     for center, matrix in zip(centers, rotations, strict=True):
         rotation = torch.from_numpy(np.ascontiguousarray(matrix))
-        path.append(replace(kept[0], rotation=rotation, translation=-rotation @ torch.from_numpy(center)))
+        path.append(
+            replace(keyframes[0], rotation=rotation, translation=-rotation @ torch.from_numpy(center))
+        )
     return path
 
 

@@ -24,17 +24,17 @@ def srgb_encode(linear: Tensor) -> Tensor:
     return torch.where(linear <= 0.0031308, 12.92 * linear, curved)
 
 
-def srgb_decode(shown: Tensor) -> Tensor:
+def srgb_decode(encoded: Tensor) -> Tensor:
     """Shown values to linear ones: ``v / 12.92`` up to 0.04045, else ``((v + 0.055) / 1.055)^2.4``.
 
     Args:
-        shown: any shape; [0, 1] maps to [0, 1]. Not clipped.
+        encoded: any shape; [0, 1] maps to [0, 1]. Not clipped.
 
     Returns:
         The same shape, differentiable.
     """
-    curved = ((shown.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
-    return torch.where(shown <= 0.04045, shown / 12.92, curved)
+    curved = ((encoded.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
+    return torch.where(encoded <= 0.04045, encoded / 12.92, curved)
 
 
 def shown(linear: Tensor) -> Tensor:
@@ -52,6 +52,6 @@ def srgb_encode_array(linear: NDArray[Any]) -> NDArray[Any]:
     return np.where(linear <= 0.0031308, 12.92 * linear, curved)
 
 
-def srgb_decode_array(shown: NDArray[Any]) -> NDArray[Any]:
+def srgb_decode_array(encoded: NDArray[Any]) -> NDArray[Any]:
     """``srgb_decode`` for NumPy arrays in [0, 1]."""
-    return np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

@@ -59,11 +59,11 @@ _views: WeakKeyDictionary[Camera, dict[torch.device, _View]] = WeakKeyDictionary
 
 def _view(camera: Camera, device: torch.device) -> _View:
     """The camera on a device, kept for each camera, so that a second rendering copies nothing there."""
-    kept = _views.setdefault(camera, {})
-    if device not in kept:
+    by_device = _views.setdefault(camera, {})
+    if device not in by_device:
         matrices = (camera.world_to_camera, camera.intrinsics)
-        kept[device] = _View(*(t[None].to(device, torch.float32) for t in matrices))
-    return kept[device]
+        by_device[device] = _View(*(t[None].to(device, torch.float32) for t in matrices))
+    return by_device[device]
 
 
 def has_gsplat() -> bool:
@@ -114,13 +114,13 @@ def _add_headers() -> None:
     """
     from torch.utils.cpp_extension import CUDA_HOME
 
-    found = importlib.util.find_spec("nvidia")
-    if CUDA_HOME is None or found is None or (Path(CUDA_HOME) / "include" / "cusparse.h").exists():
+    package = importlib.util.find_spec("nvidia")
+    if CUDA_HOME is None or package is None or (Path(CUDA_HOME) / "include" / "cusparse.h").exists():
         return
-    roots = [Path(root) for root in found.submodule_search_locations or ()]
+    roots = [Path(root) for root in package.submodule_search_locations or ()]
     folders = sorted({str(header.parent) for root in roots for header in root.glob("*/include/*.h")})
-    known = os.environ.get("CPATH", "").split(os.pathsep)
-    os.environ["CPATH"] = os.pathsep.join(dict.fromkeys([*filter(None, known), *folders]))
+    searched = os.environ.get("CPATH", "").split(os.pathsep)
+    os.environ["CPATH"] = os.pathsep.join(dict.fromkeys([*filter(None, searched), *folders]))
 
 
 def _no_kernels(found: str) -> PolarguideError:

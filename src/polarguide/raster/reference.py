@@ -95,10 +95,10 @@ def rasterize_reference(
         reach = 2 * torch.log(opacities.clamp(min=MINIMUM_ALPHA) / MINIMUM_ALPHA)
         half = torch.sqrt(reach[:, None] * torch.stack((covariances[:, 0, 0], covariances[:, 1, 1]), dim=-1))
         size = torch.tensor([camera.width, camera.height]).to(means)
-        seen = visible & ((means2d + half > 0) & (means2d - half < size)).all(dim=1)
-        radii = torch.where(seen, radii, torch.zeros_like(radii))
-    held = None if again is None else again.reshape(*shape, len(still))
-    return Rasterized(image, coverage.reshape(shape), radii, held)
+        inside = visible & ((means2d + half > 0) & (means2d - half < size)).all(dim=1)
+        radii = torch.where(inside, radii, torch.zeros_like(radii))
+    detached = None if again is None else again.reshape(*shape, len(still))
+    return Rasterized(image, coverage.reshape(shape), radii, detached)
 
 
 def _with_statistic(image: Tensor, means2d: Tensor, statistic: ScreenStatistic) -> Tensor:

@@ -111,33 +111,33 @@ def alpha_in_front(splats: Splats, camera: Camera, depth: Tensor, rasterize: Ras
     """
     pose = camera.pose(splats.means.dtype, splats.means.device)
     places = ((splats.means - pose.center) @ pose.rotation[2])[:, None]
-    asked = (depth > 0).cpu()
-    wanted = depth.to(splats.means.device, splats.means.dtype)
-    low, high, total = (torch.zeros_like(wanted) for _ in range(3))
-    start, end = torch.zeros_like(wanted), torch.full_like(wanted, torch.inf)
-    open_pixels = asked
+    covered = (depth > 0).cpu()
+    limit = depth.to(splats.means.device, splats.means.dtype)
+    low, high, total = (torch.zeros_like(limit) for _ in range(3))
+    start, end = torch.zeros_like(limit), torch.full_like(limit, torch.inf)
+    open_pixels = covered
     for _ in range(PASSES):
         if not bool(open_pixels.any()):
             break
-        ends = _spread(wanted.cpu()[open_pixels]).to(wanted)
+        ends = _spread(limit.cpu()[open_pixels]).to(limit)
         slab = torch.searchsorted(ends, places.contiguous(), right=True)
-        features = torch.zeros(len(places), len(ends) + 1, dtype=wanted.dtype, device=wanted.device)
+        features = torch.zeros(len(places), len(ends) + 1, dtype=limit.dtype, device=limit.device)
         features.scatter_(1, slab, 1.0)
         weights = rasterize(splats._replace(features=features), camera).features
         upto = torch.cat((torch.zeros_like(weights[..., :1]), weights.cumsum(dim=-1)), dim=-1)
         bounds = torch.cat((ends.new_zeros(1), ends, ends.new_full((1,), torch.inf)))
-        at = torch.searchsorted(ends, wanted, right=True)[..., None]
-        now = open_pixels.to(wanted.device)
-        for values, found in ((low, upto.gather(-1, at)), (high, upto.gather(-1, at + 1))):
-            values[now] = found[..., 0][now]
+        at = torch.searchsorted(ends, limit, right=True)[..., None]
+        now = open_pixels.to(limit.device)
+        for values, bound in ((low, upto.gather(-1, at)), (high, upto.gather(-1, at + 1))):
+            values[now] = bound[..., 0][now]
         start[now], end[now] = bounds[at[..., 0]][now], bounds[at[..., 0] + 1][now]
         total[now] = upto[..., -1][now]
         half = total / 2
-        undecided = (low < half) & (high >= half) & (wanted > start) & (end > start * (1 + 1e-3))
-        open_pixels = asked & undecided.cpu()
-    along = torch.where(end.isfinite(), (wanted - start) / (end - start).clamp(min=1e-12), 0.0)
+        undecided = (low < half) & (high >= half) & (limit > start) & (end > start * (1 + 1e-3))
+        open_pixels = covered & undecided.cpu()
+    along = torch.where(end.isfinite(), (limit - start) / (end - start).clamp(min=1e-12), 0.0)
     share = (low + along * (high - low)) / total.clamp(min=1e-12)
-    return torch.where(asked.to(total.device) & (total > 0), share.clamp(0, 1), 0.0)
+    return torch.where(covered.to(total.device) & (total > 0), share.clamp(0, 1), 0.0)
 
 
 def _spread(depths: Tensor) -> Tensor:

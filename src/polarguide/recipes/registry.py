@@ -63,23 +63,23 @@ def recipe_named(name: str) -> Method:
         return _BUILT_IN[name]
     base = name.partition(":")[0]
     offers, failures = _plugins()
-    found = offers.get(name, {})
-    if len(found) == 1:
-        return next(iter(found.values()))
-    if found:
+    offered = offers.get(name, {})
+    if len(offered) == 1:
+        return next(iter(offered.values()))
+    if offered:
         raise PolarguideError(
             f"recipe {name}",
             expected="one plug-in with that name",
-            found=" and ".join(found),
+            found=" and ".join(offered),
             remedy="Uninstall one of them.",
         )
     if base in failures:
         raise failures[base]
-    known = [*RECIPES, *(key for key in _BUILT_IN if key.startswith(f"{base}:")), *offers]
+    names = [*RECIPES, *(key for key in _BUILT_IN if key.startswith(f"{base}:")), *offers]
     broken = "".join(f"; a plug-in that cannot be loaded: {error}" for error in failures.values())
     raise PolarguideError(
         "recipe",
-        expected="one of " + ", ".join(known),
+        expected="one of " + ", ".join(names),
         found=name + broken,
         remedy="Take one of these; a recipe of another version needs that version.",
     )
@@ -120,9 +120,9 @@ def _recipes_of(entry: EntryPoint) -> tuple[Method, ...]:
     where = f"plug-in {entry.name} ({entry.value})"
     remedy = "Update or uninstall the package that brings it."
     try:
-        given = entry.load()
-        given = given() if callable(given) else given
-        recipes = (given,) if isinstance(given, Method) else tuple(given)
+        loaded = entry.load()
+        loaded = loaded() if callable(loaded) else loaded
+        recipes = (loaded,) if isinstance(loaded, Method) else tuple(loaded)
     except Exception as error:
         found = f"{type(error).__name__}: {error}"
         raise PolarguideError(where, expected="recipes", found=found, remedy=remedy) from error

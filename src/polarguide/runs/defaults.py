@@ -27,7 +27,7 @@ more of them would give at full size was not studied.
 
 
 def most_gaussians(
-    pixels: int, method: Method, asked: TrainSettings, resumed: ResolvedSettings | None = None
+    pixels: int, method: Method, settings: TrainSettings, resumed: ResolvedSettings | None = None
 ) -> int:
     """How many Gaussians there may be for so many pixels of all views; 0 of a field, which has none.
 
@@ -39,7 +39,7 @@ def most_gaussians(
     assert isinstance(method, Recipe)
     recorded = {} if resumed is None else _recorded(resumed)
     by_size = min(int(pixels / method.densification.pixels_each), MOST_GAUSSIANS)
-    return recorded.get("gaussians", by_size) if asked.gaussians is None else asked.gaussians
+    return recorded.get("gaussians", by_size) if settings.gaussians is None else settings.gaussians
 
 
 def compared_steps(*specified: int | None) -> int:
@@ -70,7 +70,7 @@ def resolve(
     """
     recorded = {} if resumed is None else _recorded(resumed)
     sizes = [view.camera.width * view.camera.height for view in scene.train_views]
-    taken: dict[str, Any] = {
+    values: dict[str, Any] = {
         **vars(settings),
         "steps": _steps(sizes, method),
         "refractive_index": index_of(None, scene.refractive_index),
@@ -79,12 +79,12 @@ def resolve(
         "gaussians": most_gaussians(sum(sizes), method, settings, resumed),
         **settings.specified(),
     }
-    if taken["background"] == "auto":
-        taken["background"] = _background(scene, method)
-    found = ResolvedSettings(**taken)
+    if values["background"] == "auto":
+        values["background"] = _background(scene, method)
+    resolved = ResolvedSettings(**values)
     if isinstance(method, NeuralRecipe):
-        _refuse_for_field(found, method)
-    return found
+        _refuse_for_field(resolved, method)
+    return resolved
 
 
 def _recorded(resumed: ResolvedSettings) -> dict[str, Any]:
@@ -106,14 +106,14 @@ def _background(scene: Scene, method: Method) -> Background:
 
 
 def _refuse_for_field(settings: ResolvedSettings, method: NeuralRecipe) -> None:
-    for name, found, most in (
+    for name, value, most in (
         ("gaussians", settings.gaussians, 0),
         ("views_per_step", settings.views_per_step, 1),
     ):
-        if found > most:
+        if value > most:
             raise PolarguideError(
                 name,
                 expected=f"{most} with the recipe {method.name}, a field",
-                found=str(found),
+                found=str(value),
                 remedy="Leave it out.",
             )

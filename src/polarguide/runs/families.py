@@ -53,12 +53,12 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
     lines: list[tuple[str, str, Exposure, float | None, str]] = []
     for view in scene.views:
         for number, exposure in enumerate(view.exposures):
-            file, found = names[view.name][number], of.get((view.name, number))
-            if found is None:
+            file, judged = names[view.name][number], of.get((view.name, number))
+            if judged is None:
                 lines.append((file, view.name, exposure, None, ""))
                 continue
-            note = "doubtful" if found.doubtful and not found.said.known else ""
-            lines.append((file, view.name, found.believed, found.modulation, note))
+            note = "doubtful" if judged.doubtful and not judged.said.known else ""
+            lines.append((file, view.name, judged.believed, judged.modulation, note))
     write_text(out / TABLE, table_text(lines))
 
     def named(chosen: Sequence[Judgment]) -> str:
@@ -92,11 +92,12 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
         reporter.warn(
             f"{named(plain)} look as if taken without a filter, or through a circular one mounted the wrong way round."
         )
-    known = [judgment for judgment in judgments if judgment.said.angle is not None]
-    if known and all(judgment.limit >= ANY for judgment in known):
+    specified = [judgment for judgment in judgments if judgment.said.angle is not None]
+    if specified and all(judgment.limit >= ANY for judgment in specified):
         reporter.say(
             f"known angles were not checked: the model predicts polarization too poorly (pictures look "
-            f"{known[0].usual:.0f} degrees off in the median). polarguide inspect {scene.root} checks them by itself."
+            f"{specified[0].usual:.0f} degrees off in the median). "
+            f"polarguide inspect {scene.root} checks them by itself."
         )
     if wrong := [judgment for judgment in judgments if judgment.contradicts]:
         first = wrong[0]
@@ -166,7 +167,7 @@ class Family(ABC):
 
     @abstractmethod
     def plan(
-        self, pixels: Sequence[int], method: Any, gaussians: int, limit: float | None, *, held: bool
+        self, pixels: Sequence[int], method: Any, gaussians: int, limit: float | None, *, in_memory: bool
     ) -> MemoryPlan:
         """How a training stays within its memory; see ``plan_memory``."""
 
@@ -224,21 +225,21 @@ class GaussianFamily(Family):
     leaves = PLY
 
     def plan(
-        self, pixels: Sequence[int], method: Recipe, gaussians: int, limit: float | None, *, held: bool
+        self, pixels: Sequence[int], method: Recipe, gaussians: int, limit: float | None, *, in_memory: bool
     ) -> MemoryPlan:
         """See ``Family``."""
-        return plan_memory(pixels, method, gaussians, limit=limit, held=held)
+        return plan_memory(pixels, method, gaussians, limit=limit, in_memory=in_memory)
 
     def check(self, state: Any, settings: ResolvedSettings, out: Path) -> None:
         """See ``Family``; refuses sums of the density control for other views a step, too."""
         super().check(state, settings, out)
         sums = state.statistics.gradient
-        found = sums.shape[0] if sums.ndim == 2 else 1
-        if found != settings.views_per_step:
+        views = sums.shape[0] if sums.ndim == 2 else 1
+        if views != settings.views_per_step:
             raise PolarguideError(
                 out / CHECKPOINT,
                 expected=f"the state of a training with {settings.views_per_step} views a step",
-                found=f"one with {found}",
+                found=f"one with {views}",
                 remedy="Train again into a new folder.",
             )
 
@@ -256,10 +257,10 @@ class GaussianFamily(Family):
     ) -> AngleTrainer:
         """See ``Family``."""
         warn_of_unused_materials(scene, method, settings, backend, reporter.warn)
-        made = AngleTrainer(scene, method, settings, backend, state, ranks, store, reporter.warn, memory)
-        if made.polarizers.ignored:
+        trainer = AngleTrainer(scene, method, settings, backend, state, ranks, store, reporter.warn, memory)
+        if trainer.polarizers.ignored:
             reporter.warn(_ignored(method))
-        return made
+        return trainer
 
     def forecast(
         self, scene: Scene, method: Recipe, settings: ResolvedSettings, backend: Backend, peak: int
@@ -300,10 +301,10 @@ class FieldFamily(Family):
         gaussians: int,
         limit: float | None,
         *,
-        held: bool,
+        in_memory: bool,
     ) -> MemoryPlan:
         """See ``Family``."""
-        return plan_field_memory(pixels, method, limit=limit, held=held)
+        return plan_field_memory(pixels, method, limit=limit, in_memory=in_memory)
 
     def trainer(
         self,

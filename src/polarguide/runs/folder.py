@@ -122,18 +122,18 @@ class RunConfiguration:
                 found=f"one of version {written}",
                 remedy=f"Train again into a new folder, or open it with polarguide {_series(written)}.",
             )
-        found = decode(data, cls, path, remedy=remedy)
-        _refuse_unknown(decode(data, dict[str, Any], path, remedy=remedy), found, path, remedy)
-        return found
+        configuration = decode(data, cls, path, remedy=remedy)
+        _refuse_unknown(decode(data, dict[str, Any], path, remedy=remedy), configuration, path, remedy)
+        return configuration
 
 
-def _refuse_unknown(data: dict[str, Any], found: RunConfiguration, path: Path, remedy: str) -> None:
+def _refuse_unknown(data: dict[str, Any], record: RunConfiguration, path: Path, remedy: str) -> None:
     """Refuse a record with more in it than is known: what was trained then may be something else."""
-    for place, values, of in (("", data, found), ("settings.", data["settings"], found.settings)):
-        known = [field.name for field in dataclasses.fields(of)]
-        for name in sorted(values.keys() - known):
+    for place, values, of in (("", data, record), ("settings.", data["settings"], record.settings)):
+        names = [field.name for field in dataclasses.fields(of)]
+        for name in sorted(values.keys() - names):
             where = f"{path} ({place}{name[:100]})"
-            raise PolarguideError(where, expected=f"only {', '.join(known)}", found=name[:100], remedy=remedy)
+            raise PolarguideError(where, expected=f"only {', '.join(names)}", found=name[:100], remedy=remedy)
 
 
 @dataclass(frozen=True)
@@ -214,8 +214,8 @@ def trained_steps(run: Path) -> int | None:
     """After how many steps a run's checkpoint was written; None where there is none that says so."""
     try:
         with safe_open(run / CHECKPOINT, framework="pt") as file:
-            said = (file.metadata() or {}).get("polarguide", "")
-        return int(said.rpartition(" ")[2])
+            record = (file.metadata() or {}).get("polarguide", "")
+        return int(record.rpartition(" ")[2])
     except (SafetensorError, OSError, ValueError):
         return None
 
@@ -266,8 +266,8 @@ class RunLog:
     def cut(self, step: int) -> None:
         """Drop lines at or after a step, which a resumed training writes again, and what are no lines of ours."""
         if os.path.lexists(self._path):
-            kept = [line for line, row in self._lines() if row["step"] < step]
-            write_text(self._path, "".join(f"{line}\n" for line in kept))
+            lines = [line for line, row in self._lines() if row["step"] < step]
+            write_text(self._path, "".join(f"{line}\n" for line in lines))
 
     def rows(self) -> list[dict[str, Any]]:
         """The lines that are whole, none where there is no log; a kill can cut one short.
@@ -281,13 +281,13 @@ class RunLog:
         """Lines that are ours, as they stand there and as values."""
         if not os.path.lexists(self._path):
             return []
-        found = []
+        rows = []
         remedy = "Remove it: a training needs none."
         for line in read_file(self._path, largest=LARGEST_RECORD, remedy=remedy).split(b"\n"):
             with contextlib.suppress(ValueError, RecursionError):  # msgspec's are ValueErrors
                 row: dict[str, Any] = msgspec.to_builtins(_ROWS.decode(line))
-                found.append((line.decode(), row))
-        return found
+                rows.append((line.decode(), row))
+        return rows
 
     def elapsed(self) -> tuple[float, bool]:
         """Training seconds that the log accounts for, and whether the machine worked for nobody else."""

@@ -69,14 +69,14 @@ class MemoryPlan:
 
 
 def plan_memory(
-    pixels: Sequence[int], recipe: Recipe, gaussians: int, *, limit: float | None, held: bool = False
+    pixels: Sequence[int], recipe: Recipe, gaussians: int, *, limit: float | None, in_memory: bool = False
 ) -> MemoryPlan:
     """Share out memory among a training's step, its Gaussians and its views.
 
     Args:
         pixels: of each view as it is trained on. recipe: the method. gaussians: most that there may be.
         limit: GiB that the process may take; None: what is free, but a fifth.
-        held: whether the pictures are in memory already.
+        in_memory: whether the pictures are in memory already.
 
     Raises:
         PolarguideError: a limit that was given is too small; the message has the least that suffices.
@@ -88,20 +88,20 @@ def plan_memory(
     step = (max(STEP, PRIORS) if guided else STEP) * largest + SPLAT * gaussians
     own = PROCESS + 4 * floats * COPIES * gaussians + max(step, 4 * floats * WRITTEN * gaussians)
     what = f" and up to {gaussians:,} Gaussians"
-    return _shared(pixels, own, of_view, limit, held, what, "fewer --gaussians, or ")
+    return _shared(pixels, own, of_view, limit, in_memory, what, "fewer --gaussians, or ")
 
 
 def plan_field_memory(
-    pixels: Sequence[int], recipe: NeuralRecipe, *, limit: float | None, held: bool = False
+    pixels: Sequence[int], recipe: NeuralRecipe, *, limit: float | None, in_memory: bool = False
 ) -> MemoryPlan:
     """The same for a field: ``plan_memory``."""
     largest = max(pixels, default=0)
     own = PROCESS + 4 * recipe.numbers * FIELD_COPIES + SAMPLE * recipe.sampling.samples + READ_VIEW * largest
-    return _shared(pixels, own, TARGET_KEPT, limit, held, "", "")
+    return _shared(pixels, own, TARGET_KEPT, limit, in_memory, "", "")
 
 
 def _shared(
-    pixels: Sequence[int], own: int, of_view: int, limit: float | None, held: bool, what: str, less: str
+    pixels: Sequence[int], own: int, of_view: int, limit: float | None, in_memory: bool, what: str, less: str
 ) -> MemoryPlan:
     """Share out memory: ``own`` is what a training takes beside its views, ``of_view`` a pixel of what it keeps of
     them.
@@ -112,8 +112,8 @@ def _shared(
     largest, total = max(pixels, default=0), sum(pixels)
     now = resident_memory() or 0
     work = now + own
-    pictures = 0 if held else (KEPT - MASKS) * total
-    masks = 0 if held else (MASKS - 3) * total
+    pictures = 0 if in_memory else (KEPT - MASKS) * total
+    masks = 0 if in_memory else (MASKS - 3) * total
     # The photograph of one view, decoded again, and its targets.
     least = work + masks + (KEPT + of_view) * largest
     least = max(least, now + PROCESS + MASKS * total + 4 * READ * largest)
@@ -130,8 +130,10 @@ def _shared(
     if whole <= allowed:
         return MemoryPlan(True, None, whole)
     filled = int(FILLED * allowed)
-    hold = held or (work + masks + pictures + of_view * largest <= filled and of_view * total <= pictures)
-    room = filled - work - masks - (pictures if hold and not held else KEPT * largest)
+    hold = in_memory or (
+        work + masks + pictures + of_view * largest <= filled and of_view * total <= pictures
+    )
+    room = filled - work - masks - (pictures if hold and not in_memory else KEPT * largest)
     return MemoryPlan(hold, max(0, room), max(least, min(allowed, whole)))
 
 
@@ -249,8 +251,8 @@ def forecast(
     most = max(first, min(GROWTH * first, settings.gaussians))
     coarse = coarse_steps(recipe, scene.train_views, settings.steps)
     seconds, of_view = _measured(trainer, coarse)
-    made = _priors_made(recipe, settings, len(scene.train_views), coarse)
-    priors = sum(count * of_view.get(size, 0.0) for size, count in made.items())
+    computed = _priors_made(recipe, settings, len(scene.train_views), coarse)
+    priors = sum(count * of_view.get(size, 0.0) for size, count in computed.items())
     again = 1 + _search_share(scene, recipe, settings)
     least = greatest = again * (seconds + priors)
     if most != first:
@@ -283,24 +285,29 @@ def _measured(trainer: Trainer, coarse: int) -> tuple[float, dict[bool, float]]:
     """
     schedule, steps = trainer.schedule, trainer.settings.steps
     stages = [schedule.at(step).stage for step in range(steps)]
-    found: dict[tuple[bool, bool, object], float] = {}
+    seconds: dict[tuple[bool, bool, object], float] = {}
     priors: dict[bool, float] = {}
     for step in range(1, steps - 1):
         position = schedule.at(step)
         small = step < coarse
         kind = small, position.stage.reflection, position.stage.weights
-        if kind in found or position.actions or stages[step + 1] is not position.stage or step + 1 == coarse:
+        if (
+            kind in seconds
+            or position.actions
+            or stages[step + 1] is not position.stage
+            or step + 1 == coarse
+        ):
             continue
         if (step + 1) % trainer.recipe.densification.every == 0:
             continue
-        if not found or (position.stage.weights.priors and small not in priors):
+        if not seconds or (position.stage.weights.priors and small not in priors):
             # What is loaded and made once, on another view: this one shall have no priors yet.
             _timed(trainer, step + 1)
-        fresh, found[kind] = _timed(trainer, step), _timed(trainer, step)
+        fresh, seconds[kind] = _timed(trainer, step), _timed(trainer, step)
         if position.stage.weights.priors:
-            priors[small] = max(priors.get(small, 0.0), fresh - found[kind])
+            priors[small] = max(priors.get(small, 0.0), fresh - seconds[kind])
     kinds = ((step < coarse, stage.reflection, stage.weights) for step, stage in enumerate(stages))
-    return sum(found.get(kind, max(found.values())) for kind in kinds), priors
+    return sum(seconds.get(kind, max(seconds.values())) for kind in kinds), priors
 
 
 def _timed(trainer: Trainer, step: int) -> float:
@@ -314,15 +321,15 @@ def _timed(trainer: Trainer, step: int) -> float:
 def _priors_made(recipe: Recipe, settings: ResolvedSettings, views: int, coarse: int) -> dict[bool, int]:
     """How many times priors of a view are computed, by whether its picture is one of the smaller ones."""
     schedule, due = Schedule(recipe, settings.steps), views
-    made = {True: 0, False: 0}
+    counts = {True: 0, False: 0}
     for step in range(settings.steps):
         position = schedule.at(step)
         if "refresh_priors" in position.actions or step == coarse:
             due = views
         if position.stage.weights.priors:
-            made[step < coarse] += min(due, settings.views_per_step)
+            counts[step < coarse] += min(due, settings.views_per_step)
             due -= min(due, settings.views_per_step)
-    return made
+    return counts
 
 
 @torch.no_grad()

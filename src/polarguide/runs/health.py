@@ -175,13 +175,13 @@ class Health:
     @property
     def summary(self) -> str:
         """A sentence about a run that nothing is to be warned of, or of which nothing is known."""
-        found = {name: view.psnr for name, view in self.views.items() if view.psnr is not None}
-        if not found:
+        psnrs = {name: view.psnr for name, view in self.views.items() if view.psnr is not None}
+        if not psnrs:
             return "health: no training view was looked at, the training was too short"
-        worst = min(found, key=lambda name: found[name])
+        worst = min(psnrs, key=lambda name: psnrs[name])
         return (
-            f"health: {len(self.views)} training views looked at, the worst is {worst} with {found[worst]:.1f} dB "
-            f"(median {median(found.values()):.1f})"
+            f"health: {len(self.views)} training views looked at, the worst is {worst} with {psnrs[worst]:.1f} dB "
+            f"(median {median(psnrs.values()):.1f})"
         )
 
     def save(self, run: Path) -> None:
@@ -239,19 +239,19 @@ def examine(model: Model, evidence: Evidence, points: Tensor, steps: int, report
     cameras = [view.camera for view in views]
     free = free_space(points, cameras, Densification.free_share, Densification.free_quantile)
     nearest = free.radii.tolist()
-    found, seen = {}, None
+    by_view, visible = {}, None
     with reporter.track("checking the result", len(views)) as advance:
         for view, near in zip(views, nearest, strict=True):
             facts, radii = _look(model, view, LIMITS.brighter * brightest, near, evidence.filters)
-            found[view.name] = facts
+            by_view[view.name] = facts
             if radii is not None:
-                seen = radii > 0 if seen is None else seen | (radii > 0)
-            advance(len(found))
-    for name, psnr in _beside(views, {name: facts.psnr for name, facts in found.items()}).items():
-        found[name] = dataclasses.replace(found[name], beside=psnr)
+                visible = radii > 0 if visible is None else visible | (radii > 0)
+            advance(len(by_view))
+    for name, psnr in _beside(views, {name: facts.psnr for name, facts in by_view.items()}).items():
+        by_view[name] = dataclasses.replace(by_view[name], beside=psnr)
     enough = len(views) == min(MOST_VIEWS, len(evidence.views))  # others may see what a few do not
-    unseen = float((~seen).float().mean()) if seen is not None and enough else None
-    return Health(evidence.polarization, tuple(warnings_of(found, unseen)), found, brightest, unseen)
+    unseen = float((~visible).float().mean()) if visible is not None and enough else None
+    return Health(evidence.polarization, tuple(warnings_of(by_view, unseen)), by_view, brightest, unseen)
 
 
 def _counted(view: View) -> Tensor:
@@ -283,9 +283,9 @@ def _look(
     error = errors[:, counted].square().mean().double()
     psnr = None if bool(error.isnan()) else min(float(-10 * torch.log10(error)), HIGHEST_PSNR)
     burned = ~(result.final <= limit).all(dim=-1) & counted
-    shown, light = local.photograph().mean(dim=-1), result.final.mean(dim=-1)
+    photograph, light = local.photograph().mean(dim=-1), result.final.mean(dim=-1)
     lit = ~black_pixels(view).to(model.device)
-    bare = _inner(lit & counted) & (result.alpha < 0.5) & (light < shown / 2)
+    bare = _inner(lit & counted) & (result.alpha < 0.5) & (light < photograph / 2)
     fog = None
     if near > 0:
         depth = torch.full_like(result.alpha, near)
@@ -298,28 +298,28 @@ def _compared(view: View, final: Tensor, stokes: Tensor | None) -> tuple[Tensor,
 
     That is each picture behind its filter, where that is predicted, and else the photograph.
     """
-    known = [k for k, exposure in enumerate(view.exposures) if exposure.known]
-    if stokes is None or not known:
+    indices = [k for k, exposure in enumerate(view.exposures) if exposure.known]
+    if stokes is None or not indices:
         return view.photograph()[None], final[None]
     rays = view.camera.rays(device=final.device)
-    behind = analyzers([view.exposures[k] for k in known], rays, view.mount)
+    behind = analyzers([view.exposures[k] for k in indices], rays, view.mount)
     predicted = torch.stack([final + behind_analyzer(stokes, each) for each in behind])
-    return view.intensities()[known], predicted
+    return view.intensities()[indices], predicted
 
 
 def _beside(views: Sequence[View], psnr: Mapping[str, float | None]) -> dict[str, float]:
     """For each view the median PSNR of those nearest to it, by where cameras stand and look; empty for few views."""
-    known = [view for view in views if psnr[view.name] is not None]
-    if len(known) <= NEIGHBORS:
+    scored = [view for view in views if psnr[view.name] is not None]
+    if len(scored) <= NEIGHBORS:
         return {}
-    centers = torch.stack([view.camera.center for view in known])
+    centers = torch.stack([view.camera.center for view in scored])
     away = (centers - centers.mean(dim=0)).norm(dim=1).mean().clamp(min=1e-12)
-    places = torch.cat((centers / away, torch.stack([view.camera.rotation[2] for view in known])), dim=1)
+    places = torch.cat((centers / away, torch.stack([view.camera.rotation[2] for view in scored])), dim=1)
     distances = torch.cdist(places, places).fill_diagonal_(torch.inf)
     nearest = distances.topk(NEIGHBORS, largest=False).indices.tolist()
-    values = [float(psnr[view.name] or 0.0) for view in known]
+    values = [float(psnr[view.name] or 0.0) for view in scored]
     return {
-        view.name: median(values[place] for place in row) for view, row in zip(known, nearest, strict=True)
+        view.name: median(values[place] for place in row) for view, row in zip(scored, nearest, strict=True)
     }
 
 
@@ -338,11 +338,11 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
     Args:
         views: those that were looked at. unseen: as of ``Health``. limits: from where on.
     """
-    found = []
+    warnings = []
     bare = {name: view.bare for name, view in views.items() if view.bare > limits.bare}
     burned = {name: view.burned for name, view in views.items() if view.burned > limits.burned}
     if burned:
-        found.append(
+        warnings.append(
             f"the result has burned: {_worst(burned)} are over {limits.brighter:g} times as bright as anything that "
             "was measured. Their pictures do not determine the light there: do not use this run; add pictures of "
             "these views at other angles, or without a filter, and train again."
@@ -353,29 +353,29 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
             f"{name} ({views[name].psnr:.1f} dB, beside {views[name].beside:.1f})" for name in far[:4]
         )
         more = f" and {len(far) - 4} more" if len(far) > 4 else ""
-        found.append(
+        warnings.append(
             f"training views far under those beside them: {worst}{more}. Pose, polarizer angle, exposure or focus of "
             f"these photographs may be wrong: compare them with polarguide render --views {','.join(far[:4])}, and "
             "correct them or leave them out."
         )
     fog = {name: view.fog for name, view in views.items() if view.fog is not None and view.fog > limits.fog}
     if fog:
-        found.append(
+        warnings.append(
             f"fog hangs before the cameras of {_worst(fog, 'of the light')}, where no surface can be, and new "
             "views near them show it: add views from there, or, if the subject stands alone, train with --background "
             "black or masked."
         )
     if bare:
-        found.append(
+        warnings.append(
             f"the result has holes where the photographs show something: {_worst(bare)}. Add views or points there; "
             "if surroundings are missing, train with --background scene."
         )
     if unseen is not None and unseen > limits.unseen:
-        found.append(
+        warnings.append(
             f"{100 * unseen:.0f} % of the Gaussians are outside all of the {len(views)} training views that were "
             "looked at: nothing is known of them. Keep them out of exports with a crop box (polarguide present --crop)."
         )
-    return found
+    return warnings
 
 
 def _far_under(views: Mapping[str, ViewHealth], limits: Limits) -> list[str]:

@@ -117,8 +117,8 @@ class OpenedRun:
         Raises:
             PolarguideError: the recipe learns something else.
         """
-        found = self.gaussian_model("gaussians").state.gaussians
-        return {name: found[name].detach() for name in found.names}
+        gaussians = self.gaussian_model("gaussians").state.gaussians
+        return {name: gaussians[name].detach() for name in gaussians.names}
 
     def gaussian_model(self, what: str) -> GaussianModel:
         """The model, for what needs Gaussians; ``what`` asks for them.
@@ -149,8 +149,8 @@ class OpenedRun:
         """What layers and normals rest on, for people: ``measured``, ``fitted`` or ``none``, with what it does not hold
         for. ``not recorded`` where there is no ``health``.
         """
-        found = self.health
-        return "not recorded" if found is None else found.polarization.text
+        health = self.health
+        return "not recorded" if health is None else health.polarization.text
 
     @property
     def light(self) -> dict[str, Tensor]:
@@ -164,31 +164,31 @@ class OpenedRun:
         Raises:
             PolarguideError: it is not there any more, cannot be read, or was read otherwise than for the training.
         """
-        configuration, found = self.configuration, self._scene_source
+        configuration, scene = self.configuration, self._scene_source
         options = SceneOptions(configuration.downscale, configuration.transfer, split="every-8th")
         recorded = configuration.test_views
-        if not isinstance(found, Scene):
-            folder = configuration.scene if found is None else found
-            found = read_scene(folder, options, self._reporter, recorded)
-        if (found.downscale, found.transfer) != (options.downscale, options.transfer):
+        if not isinstance(scene, Scene):
+            folder = configuration.scene if scene is None else scene
+            scene = read_scene(folder, options, self._reporter, recorded)
+        if (scene.downscale, scene.transfer) != (options.downscale, options.transfer):
             expected = (
                 f"downscale {options.downscale}, transfer {options.transfer}, as {self.folder} was trained"
             )
-            given = f"downscale {found.downscale}, transfer {found.transfer}"
-            raise PolarguideError("scene", expected=expected, found=given, remedy="Load it like that.")
-        if found.digest != configuration.scene_digest:
-            _warn(f"{found.root} has changed since {self.folder} was trained on it.")
-        if recorded is not None and recorded != found.test_names:
-            names = {view.name for view in found.views}
-            found = replace(found, test_names=tuple(name for name in recorded if name in names))
-        found = select_exposures(found, configuration.settings.exposures)
-        return mask_background(found) if configuration.settings.background == "masked" else found
+            reading = f"downscale {scene.downscale}, transfer {scene.transfer}"
+            raise PolarguideError("scene", expected=expected, found=reading, remedy="Load it like that.")
+        if scene.digest != configuration.scene_digest:
+            _warn(f"{scene.root} has changed since {self.folder} was trained on it.")
+        if recorded is not None and recorded != scene.test_names:
+            names = {view.name for view in scene.views}
+            scene = replace(scene, test_names=tuple(name for name in recorded if name in names))
+        scene = select_exposures(scene, configuration.settings.exposures)
+        return mask_background(scene) if configuration.settings.background == "masked" else scene
 
     @property
     def scene_folder(self) -> Path:
         """Where the scene is, or was when it was trained on."""
-        found = self._scene_source
-        return found.root if isinstance(found, Scene) else Path(found or self.configuration.scene)
+        source = self._scene_source
+        return source.root if isinstance(source, Scene) else Path(source or self.configuration.scene)
 
     @property
     def presentation(self) -> Presentation:
@@ -255,8 +255,8 @@ class OpenedRun:
             PolarguideError: there is no such layer, or this recipe has not got it.
         """
         names = checked_layers([layers] if isinstance(layers, str) else list(layers))
-        shown = {"normal", "depth"} & {*names}
-        return self.chosen_layers(self.result(camera, surface=bool(shown)), names)
+        geometry = {"normal", "depth"} & {*names}
+        return self.chosen_layers(self.result(camera, surface=bool(geometry)), names)
 
     def chosen_layers(self, result: RenderResult, names: Iterable[str]) -> dict[str, Tensor]:
         """Layers of a picture by name.

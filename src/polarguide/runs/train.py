@@ -302,7 +302,7 @@ def _planned(
     family: Family,
     scene: Scene | PathLike,
     recipe: Method,
-    asked: TrainSettings,
+    settings: TrainSettings,
     resumed: ResolvedSettings | None,
     reading: SceneOptions,
 ) -> MemoryPlan:
@@ -311,8 +311,8 @@ def _planned(
         pixels = [view.camera.width * view.camera.height for view in scene.train_views]
     else:
         pixels = pixels_of(Path(scene), reading.downscale)
-    gaussians = most_gaussians(sum(pixels), recipe, asked, resumed)
-    return family.plan(pixels, recipe, gaussians, reading.memory, held=isinstance(scene, Scene))
+    gaussians = most_gaussians(sum(pixels), recipe, settings, resumed)
+    return family.plan(pixels, recipe, gaussians, reading.memory, in_memory=isinstance(scene, Scene))
 
 
 def _store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter) -> ViewStore:
@@ -359,8 +359,8 @@ def _check_scene(scene: Scene) -> None:
     cameras = [view.camera for view in scene.train_views]
     ahead = (scene.points.double() @ c.rotation[2] + c.translation[2] > 0 for c in cameras)
     if len(scene.points) and not any(bool(each.any()) for each in ahead):
-        said = f"{scene.root}: all points lie behind all cameras: poses and points do not belong together."
-        warnings.warn(said, PolarguideWarning, stacklevel=2)
+        fault = f"{scene.root}: all points lie behind all cameras: poses and points do not belong together."
+        warnings.warn(fault, PolarguideWarning, stacklevel=2)
 
 
 def _first_difference(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:

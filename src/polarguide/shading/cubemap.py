@@ -255,10 +255,10 @@ class _Between(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, directions: Tensor, level: Tensor, *levels: Tensor) -> Tensor:
         directions, level = directions.detach().contiguous(), level.detach().contiguous()
-        kept = [t.detach().contiguous() for t in levels]
-        out = directions.new_empty(len(directions), kept[0].shape[-1])
-        _native.mips_forward(kept, directions, level, out)
-        ctx.save_for_backward(directions, level, *kept)
+        contiguous = [t.detach().contiguous() for t in levels]
+        out = directions.new_empty(len(directions), contiguous[0].shape[-1])
+        _native.mips_forward(contiguous, directions, level, out)
+        ctx.save_for_backward(directions, level, *contiguous)
         return out
 
     @staticmethod
@@ -301,8 +301,8 @@ def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> T
     """
     native = len(levels) <= MOST_LEVELS and 1 <= levels[0].shape[-1] <= MOST_CHANNELS
     if native and fits(directions, level, *levels):
-        found: Tensor = _Between.apply(directions, level, *levels)
-        return found
+        looked_up: Tensor = _Between.apply(directions, level, *levels)
+        return looked_up
     return mip_lookup_reference(levels, directions, level)
 
 

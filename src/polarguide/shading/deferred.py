@@ -102,8 +102,8 @@ class DeferredShading(ShadingModel):
 
     def as_recorded(self, data: Mapping[str, Any]) -> ShadingModel:
         """Without metals and indices where there could be none."""
-        known = {name: getattr(self, name) and data.get(name, False) for name in ("metal", "indices")}
-        return replace(self, **known)
+        parts = {name: getattr(self, name) and data.get(name, False) for name in ("metal", "indices")}
+        return replace(self, **parts)
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
@@ -135,7 +135,9 @@ class DeferredShading(ShadingModel):
 
     def initial_parameters(self, colors: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
         """The same strength everywhere, no light of the Gaussians' own, and no metal."""
-        zeros = {name: torch.zeros(len(colors), *given.shape) for name, given in self.parameters.items()}
+        zeros = {
+            name: torch.zeros(len(colors), *parameter.shape) for name, parameter in self.parameters.items()
+        }
         logit = torch.logit(torch.tensor(self.first_strength))
         first = {**zeros, "strength_logits": logit.expand(len(colors)).clone()}
         if self.metal:
@@ -324,8 +326,8 @@ class DeferredShading(ShadingModel):
                 splatted["normal"].flatten(0, 1),
                 self.radiance(texels),
             )
-        found = layers if metal is None else with_metal(layers, metal)
-        return {**found, "metalness": metalness_picture(metal, features), "metal": metal}
+        mixed = layers if metal is None else with_metal(layers, metal)
+        return {**mixed, "metalness": metalness_picture(metal, features), "metal": metal}
 
     def _index_picture(self, splatted: GBuffer) -> Tensor | None:
         """Refractive indices [H, W]; None: the run's everywhere."""
@@ -342,7 +344,7 @@ class DeferredShading(ShadingModel):
             first, local = layout.first("metal"), layout.first("local")
             metal = MetalArguments(where_metal(pixels, first), first, local, MINIMUM_SHARE, BLUR)
             levels = metal_mips(self.radiance(texels))
-        found = reflect_native(
+        shaded = reflect_native(
             pixels,
             world_rays_native(camera),
             texels,
@@ -362,25 +364,25 @@ class DeferredShading(ShadingModel):
             *(("detached specular", "detached diffuse") if detached else ()),
         ]
         layers: dict[str, Any] = {
-            name: layer.unflatten(0, features.shape[:2]) for name, layer in zip(names, found, strict=False)
+            name: layer.unflatten(0, features.shape[:2]) for name, layer in zip(names, shaded, strict=False)
         }
         layers |= {"strength": splatted["strength"][..., 0], "index": self._index_picture(splatted)}
         if self.metal:
-            shown = None if metal is None else MetalPixels(metal.pixels, *found[len(names) :])
-            layers |= {"metalness": metalness_picture(shown, features), "metal": shown}
+            metals = None if metal is None else MetalPixels(metal.pixels, *shaded[len(names) :])
+            layers |= {"metalness": metalness_picture(metals, features), "metal": metals}
         return layers
 
     def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
         """Colors [N, 3] of Gaussians by themselves; see ``ShadingModel``."""
         directions = mirrored(rays, normals).contiguous()
-        seen = self.radiance(cubemap_lookup(light["texels"], directions))
+        reflected = self.radiance(cubemap_lookup(light["texels"], directions))
         if self.local:
-            seen = (seen + local_light(gaussians, directions, 3)).clamp(min=0)
+            reflected = (reflected + local_light(gaussians, directions, 3)).clamp(min=0)
         cosine = -(rays * normals).sum(dim=-1, keepdim=True).clamp(-1, 0)
         base, strength = harmonic_colors(gaussians, rays), self.strength(gaussians)[:, None]
         several = self._has_indices(gaussians)
         index = self.refractive_index + gaussians["index_offset"][:, None] if several else None
-        specular, diffuse = self.contributions(base, strength, seen, cosine, index)
+        specular, diffuse = self.contributions(base, strength, reflected, cosine, index)
         if not self._has_metal(gaussians):
             return specular + diffuse
         metal = self._metals(gaussians)

@@ -149,11 +149,11 @@ class DirectionalShading(ShadingModel):
             features: [P, 4] of any length; zero reads the light without them.
         """
         levels = box_mips(light["texels"])
-        found = mip_lookup(levels, directions, len(levels) * roughness)
+        looked_up = mip_lookup(levels, directions, len(levels) * roughness)
         squared = features.square().sum(dim=-1, keepdim=True)
         factors = features * torch.rsqrt(squared.clamp(min=1e-6))
-        outer = (found[:, :, None] * factors[:, None, :]).flatten(1)
-        hidden = torch.cat((found, outer), dim=1)
+        outer = (looked_up[:, :, None] * factors[:, None, :]).flatten(1)
+        hidden = torch.cat((looked_up, outer), dim=1)
         for layer in (0, 1):
             hidden = relu(torch.addmm(light[f"mlp_bias_{layer}"], hidden, light[f"mlp_weight_{layer}"]))
         out = torch.addmm(light["mlp_bias_2"], hidden, light["mlp_weight_2"])

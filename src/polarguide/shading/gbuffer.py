@@ -72,8 +72,8 @@ def splatting(
     pose = camera.pose(torch.float32, core[0].device)
     forward = pose.rotation[2].contiguous() if depth else None
     settings = _Settings(sh_degree, pose.center.contiguous(), forward, normals)
-    given = applied(_Splatting, settings, *core, outward, *described[:-1], _joined(described.further))
-    return Splats(*given), Layout(_widths(described.widths, normals=normals, depth=depth))
+    tensors = applied(_Splatting, settings, *core, outward, *described[:-1], _joined(described.further))
+    return Splats(*tensors), Layout(_widths(described.widths, normals=normals, depth=depth))
 
 
 def splatting_reference(
@@ -121,8 +121,8 @@ class _Settings(NamedTuple):
 
 def _native_splatting(settings: _Settings, core: Any, others: Any) -> Any:
     """The native pass for these Gaussians, which it holds."""
-    given: list[Any] = [*core, *settings, GRAZING, *others]
-    return _native.Splatting(*given)
+    tensors: list[Any] = [*core, *settings, GRAZING, *others]
+    return _native.Splatting(*tensors)
 
 
 class _Splatting(torch.autograd.Function):
@@ -133,13 +133,13 @@ class _Splatting(torch.autograd.Function):
         assert quaternions is not None
         contiguous = [None if t is None else t.detach().contiguous() for t in given]
         core = [t for t in contiguous[: len(_CORE)] if t is not None]
-        made = _native_splatting(settings, core, contiguous[len(_CORE) :])
+        outputs = _native_splatting(settings, core, contiguous[len(_CORE) :])
         count, light = len(means), given[len(_CORE) + 2]
         scales, opacities = means.new_empty(count, 3), means.new_empty(count)
-        features = means.new_empty(count, made.channels)
+        features = means.new_empty(count, outputs.channels)
         learns = any(ctx.needs_input_grad)
         mirrored = means.new_empty(count, 3) if learns and light is not None else None
-        made.forward(scales, opacities, features, mirrored)
+        outputs.forward(scales, opacities, features, mirrored)
         if learns:
             ctx.settings = settings
             ctx.save_for_backward(*contiguous, scales, opacities, features, mirrored)
@@ -148,8 +148,8 @@ class _Splatting(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        *given, scales, opacities, features, mirrored = ctx.saved_tensors
-        core, (outward, strength, dc, rest, metalness, further) = given[: len(_CORE)], given[len(_CORE) :]
+        *inputs, scales, opacities, features, mirrored = ctx.saved_tensors
+        core, (outward, strength, dc, rest, metalness, further) = inputs[: len(_CORE)], inputs[len(_CORE) :]
         others = [outward, strength, dc, rest, metalness, further]
         to_core = [torch.empty_like(t) for t in core]
         to_learned = [None if t is None else torch.empty_like(t) for t in (strength, dc, rest, further)]
@@ -206,11 +206,11 @@ def render(
         shading: what is splatted, and how it makes the picture. light: its learned light, by name.
     """
     normals, depth = request.normals or shading.needs_normals, request.depth
-    given, layout = splatting(
+    gaussian_splats, layout = splatting(
         gaussians, camera, shading, sh_degree=request.sh_degree, normals=normals, depth=depth
     )
     rotated = NORMAL_CHANNELS if request.normal_rotation_only and normals else ()
-    picture = rasterize(given, camera, statistic=request.statistic, still=rotated)
+    picture = rasterize(gaussian_splats, camera, statistic=request.statistic, still=rotated)
     features, normal, camera_depth = split(picture.features, picture.alpha, layout)
     splatted = GBuffer(features, picture.alpha, layout)
     if request.layers_detached and normals:
@@ -220,12 +220,14 @@ def render(
     blended = None
     if request.at_median_depth and (normals or depth):
         directions = (
-            given.features[:, layout.channels("normal")] if normals else torch.zeros_like(given.means)
+            gaussian_splats.features[:, layout.channels("normal")]
+            if normals
+            else torch.zeros_like(gaussian_splats.means)
         )
-        found = surface_picture(given._replace(features=directions), camera)
-        camera_depth = found.depth if depth else None
+        surface = surface_picture(gaussian_splats._replace(features=directions), camera)
+        camera_depth = surface.depth if depth else None
         if normals:
-            normal, blended = picture.alpha[..., None] * found.directions, normal
+            normal, blended = picture.alpha[..., None] * surface.directions, normal
     return RenderResult(
         final=layers["final"],
         base=splatted["color"],

@@ -52,11 +52,11 @@ def any_nonzero(values: Tensor) -> bool:
     if values.is_meta:
         return False
     version = None if values.is_inference() else values._version
-    kept = getattr(values, "_polarguide_nonzero", None)
-    if kept is None or version is None or kept[0] != version:
-        kept = version, bool((values != 0).any())
-        values._polarguide_nonzero = kept  # type: ignore[attr-defined]
-    return bool(kept[1])
+    cached = getattr(values, "_polarguide_nonzero", None)
+    if cached is None or version is None or cached[0] != version:
+        cached = version, bool((values != 0).any())
+        values._polarguide_nonzero = cached  # type: ignore[attr-defined]
+    return bool(cached[1])
 
 
 def reflectance(logits: Tensor) -> Tensor:
@@ -98,18 +98,18 @@ def metal_pixels(
     """
     pixels = where_metal(features, layout.first("metal"))
     # All channels at once: each part taken by itself would send back a picture of all of them.
-    shown, rays, facing = features[pixels], rays[pixels], unit(normal[pixels], 1e-3)
-    metal = shown[:, layout.channels("metal")]
+    values, rays, facing = features[pixels], rays[pixels], unit(normal[pixels], 1e-3)
+    metal = values[:, layout.channels("metal")]
     share = metal[:, 3]
     along = dot(rays, facing)[:, None]
     inverse = 1 / share.clamp(min=MINIMUM_SHARE)
     level = BLUR * metal[:, 4] * inverse
-    seen = mip_lookup(metal_mips(light), (rays - 2 * along * facing).contiguous(), level)
+    mirrored = mip_lookup(metal_mips(light), (rays - 2 * along * facing).contiguous(), level)
     if "local" in layout:
-        seen = (seen + shown[:, layout.channels("local")]).clamp(min=0)
+        mirrored = (mirrored + values[:, layout.channels("local")]).clamp(min=0)
     reflectances = metal[:, :3] * inverse[:, None]
     mean, slope = optics.conductor(-along, reflectances)
-    return MetalPixels(pixels, share.detach(), share[:, None] * mean * seen, slope)
+    return MetalPixels(pixels, share.detach(), share[:, None] * mean * mirrored, slope)
 
 
 def with_metal(layers: Mapping[str, Any], metal: MetalPixels) -> dict[str, Any]:
@@ -188,8 +188,8 @@ def convert(gaussians: Gaussians, metal: Tensor, reflectances: Tensor) -> Tensor
 
 def _local(gaussians: Gaussians) -> list[tuple[str, Tensor]]:
     """Names and values of the light of their own, if they have some."""
-    found = ((name, gaussians.get(name)) for name in ("local_dc", "local_rest"))
-    return [(name, own) for name, own in found if own is not None]
+    tensors = ((name, gaussians.get(name)) for name in ("local_dc", "local_rest"))
+    return [(name, own) for name, own in tensors if own is not None]
 
 
 @torch.no_grad()
@@ -225,7 +225,7 @@ def mirror_base(
     axes = shortest_axis_normals(
         means, gaussians["quaternions"], gaussians["log_scales"], means.new_zeros(3), None
     )
-    found = [gaussians[name].clone() for name in ("local_dc", "local_rest")]
+    originals = [gaussians[name].clone() for name in ("local_dc", "local_rest")]
     for chosen in fresh.nonzero()[:, 0].split(CHUNK):
         normals = axes[chosen]
         seen_along = toward - 2 * (normals @ toward.T)[..., None] * normals[:, None]
@@ -233,6 +233,6 @@ def mirror_base(
         base = sh_basis(seen_along, 3) @ coefficients + 0.5
         target = base / reflectance(gaussians["reflectance_logits"][chosen])[:, None] - far
         local = solve @ target
-        found[0][chosen], found[1][chosen] = local[:, 0], local[:, 1:]
-    for name, values in zip(("local_dc", "local_rest"), found, strict=True):
+        originals[0][chosen], originals[1][chosen] = local[:, 0], local[:, 1:]
+    for name, values in zip(("local_dc", "local_rest"), originals, strict=True):
         gaussians.overwrite(name, values, fresh)

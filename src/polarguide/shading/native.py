@@ -54,43 +54,54 @@ class _Reflect(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         features, rays, texels = (t.detach().contiguous() for t in (features, rays, texels))
         learns = any(ctx.needs_input_grad)
-        directions, seen = (torch.empty_like(rays) if learns else None for _ in range(2))
+        directions, reflected_rays = (torch.empty_like(rays) if learns else None for _ in range(2))
         layers = [torch.empty_like(rays) for _ in range(4)]
-        _native.reflect_forward(features, rays, texels, fresnel, local, ior, index, directions, seen, *layers)
+        _native.reflect_forward(
+            features, rays, texels, fresnel, local, ior, index, directions, reflected_rays, *layers
+        )
         ctx.model, ctx.metal = (fresnel, local, ior, index), metal
         ctx.set_materialize_grads(False)
-        found: list[Tensor] = []
-        kept: list[Tensor] = []
+        outputs: list[Tensor] = []
+        saved: list[Tensor] = []
         if metal is not None:
-            given = features, rays, *metal
+            inputs = features, rays, *metal
             count = len(metal.pixels)
             mirrored, reflected, slope, light = (rays.new_empty(count, 3) for _ in range(4))
             share, level = rays.new_empty(count), rays.new_empty(count)
             mips = [t.detach().contiguous() for t in levels]
-            _native.metal_directions(*given, mirrored, level)
+            _native.metal_directions(*inputs, mirrored, level)
             _native.mips_forward(mips, mirrored, level, light)
-            _native.metal_layers(*given, light, share, reflected, slope, *layers[:2])
-            kept = [metal.pixels, mirrored, level, light, *mips]
+            _native.metal_layers(*inputs, light, share, reflected, slope, *layers[:2])
+            saved = [metal.pixels, mirrored, level, light, *mips]
             ctx.mark_non_differentiable(share)
-            found = [share, reflected, slope]
-        ctx.save_for_backward(features, rays, texels, directions, seen, *kept)
+            outputs = [share, reflected, slope]
+        ctx.save_for_backward(features, rays, texels, directions, reflected_rays, *saved)
         again = [layers[1].clone(), layers[2].clone()] if detached else []
-        return (*layers, *again, *found)
+        return (*layers, *again, *outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        features, rays, texels, directions, seen, *kept = ctx.saved_tensors
+        features, rays, texels, directions, reflected_rays, *saved = ctx.saved_tensors
         contiguous = [None if g is None else g.contiguous() for g in grads]
         by_metal = contiguous[-2:]
         to_layers = contiguous if ctx.metal is None else contiguous[:-3]
         to_layers += [None] * (6 - len(to_layers))
-        to_features, to_seen = torch.empty_like(features), torch.empty_like(seen)
+        to_features, to_seen = torch.empty_like(features), torch.empty_like(reflected_rays)
         # What comes by the detached layers goes to the texels, and not by way of the directions to the normals.
-        held = to_layers[4] is not None or to_layers[5] is not None
-        to_look_up = torch.empty_like(seen) if held else None
-        given: list[Any] = [features, rays, seen, *ctx.model, *to_layers, to_seen, to_look_up, to_features]
-        _native.reflect_backward_layers(*given)
+        needs_metal = to_layers[4] is not None or to_layers[5] is not None
+        to_look_up = torch.empty_like(reflected_rays) if needs_metal else None
+        inputs: list[Any] = [
+            features,
+            rays,
+            reflected_rays,
+            *ctx.model,
+            *to_layers,
+            to_seen,
+            to_look_up,
+            to_features,
+        ]
+        _native.reflect_backward_layers(*inputs)
         to_texels, to_directions = torch.empty_like(texels), torch.empty_like(directions)
         if to_look_up is None:
             _native.cubemap_backward(texels, directions, to_seen, to_texels, to_directions)
@@ -100,15 +111,15 @@ class _Reflect(torch.autograd.Function):
         _native.reflect_backward_directions(features, rays, to_directions, to_features)
         to_levels: Sequence[Tensor | None] = [None] * len(ctx.needs_input_grad[9:])
         if ctx.metal is not None:
-            _, mirrored, level, light, *levels = kept
+            _, mirrored, level, light, *levels = saved
             to_light, by_layers = torch.empty_like(light), [*to_layers[:2], to_layers[4]]
-            given = [features, rays, *ctx.metal, light, *by_layers, *by_metal, to_light, to_features]
-            _native.metal_backward_layers(*given)
+            inputs = [features, rays, *ctx.metal, light, *by_layers, *by_metal, to_light, to_features]
+            _native.metal_backward_layers(*inputs)
             to_mirrored, to_level, to_levels = mips_backward(
                 levels, mirrored, level, to_light, any(ctx.needs_input_grad[9:])
             )
-            given = [features, rays, *ctx.metal, to_mirrored, to_level, to_features]
-            _native.metal_backward_directions(*given)
+            inputs = [features, rays, *ctx.metal, to_mirrored, to_level, to_features]
+            _native.metal_backward_directions(*inputs)
         return to_features, None, to_texels, None, None, None, None, None, None, *to_levels
 
 
@@ -165,11 +176,11 @@ class _Split(torch.autograd.Function):
     def forward(
         ctx: Any, features: Tensor, alpha: Tensor, deep: bool
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        kept, covered = features.detach().contiguous(), alpha.detach().contiguous()
-        normal = kept.new_empty(*covered.shape, 3)
+        values, covered = features.detach().contiguous(), alpha.detach().contiguous()
+        normal = values.new_empty(*covered.shape, 3)
         depth = torch.empty_like(covered) if deep else None
         flat_depth = None if depth is None else depth.view(-1)
-        _native.gbuffer_split(kept.flatten(0, 1), covered.view(-1), normal.view(-1, 3), flat_depth)
+        _native.gbuffer_split(values.flatten(0, 1), covered.view(-1), normal.view(-1, 3), flat_depth)
         ctx.save_for_backward(covered, depth)
         ctx.channels = features.shape[-1]
         ctx.set_materialize_grads(False)

@@ -144,15 +144,15 @@ class RenderResult:
 
     def resized(self, width: int, height: int) -> RenderResult:
         """The pictures in another size, each pixel that of the nearest place; nothing else is kept."""
-        found: dict[str, Any] = {}
+        pictures: dict[str, Any] = {}
         for name in LAYERS:
             if (layer := getattr(self, name)) is not None:
                 rows, columns = (
                     (torch.arange(new, device=layer.device) * old) // new
                     for new, old in zip((height, width), layer.shape[:2], strict=True)
                 )
-                found[name] = layer[rows][:, columns]
+                pictures[name] = layer[rows][:, columns]
         bare: dict[str, Any] = dict.fromkeys(
             ("detached_layers", "rotation_only_normal", "radii", "metal", "index", "blended_normal")
         )
-        return replace(self, **bare, **found)
+        return replace(self, **bare, **pictures)

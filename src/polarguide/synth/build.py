@@ -212,9 +212,9 @@ def _user_mesh(path: Path) -> Mesh:
     faces = np.array(params["faces"], np.int64).reshape(-1, 3)
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)  # Mitsuba takes a negative corner for the first
     if not whole.any() or faces.min() < 0 or faces.max() >= len(points):
-        found = f"corners {faces.min()} to {faces.max()} of {len(points)}" if whole.any() else "no triangle"
+        extent = f"corners {faces.min()} to {faces.max()} of {len(points)}" if whole.any() else "no triangle"
         raise PolarguideError(
-            path, expected="triangles between its points", found=found, remedy="Export it again."
+            path, expected="triangles between its points", found=extent, remedy="Export it again."
         )
     params = _mesh_arrays(path, kind, flat=False)
     normals = np.array(params["vertex_normals"], float).reshape(-1, 3)
@@ -233,8 +233,8 @@ def _mesh_arrays(path: Path, kind: str, *, flat: bool) -> Any:
         UnicodeDecodeError,
     ) as error:  # what Mitsuba says ends in the reason, or quotes the file
         quoted = isinstance(error, UnicodeDecodeError)
-        said = "a line of its header that is no text" if quoted else str(error)
-        reason = said.rpartition("shape plugin of type")[2].partition(": ")[2] or said
+        fault = "a line of its header that is no text" if quoted else str(error)
+        reason = fault.rpartition("shape plugin of type")[2].partition(": ")[2] or fault
         raise PolarguideError(
             path,
             expected="a complete mesh of triangles",

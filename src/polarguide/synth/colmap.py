@@ -115,16 +115,16 @@ def sample_sparse_points(
     color, view = np.concatenate(colors), np.concatenate(home)
     hits = intersect(built, origin, ray)
     places = origin + hits.distance[:, None] * ray
-    seen = _visible(built, cameras, places) & (random.random((len(places), len(cameras))) < FOUND)
+    visible = _visible(built, cameras, places) & (random.random((len(places), len(cameras))) < FOUND)
     ghost, places = _mirrored(built, origin, ray, places, hits.normal, hits.thing, random)
     # A reflection is consistent only between neighbors.
     near = np.abs(np.arange(len(cameras)) - view[:, None]) <= 1
-    seen = np.where(ghost[:, None], near, seen)
-    seen[np.arange(len(view)), view] = True
-    shown = np.array([False, *built.spec.shown])[hits.thing]
-    keep = np.flatnonzero(shown & (seen.sum(1) >= 2))
+    visible = np.where(ghost[:, None], near, visible)
+    visible[np.arange(len(view)), view] = True
+    drawn = np.array([False, *built.spec.shown])[hits.thing]
+    keep = np.flatnonzero(drawn & (visible.sum(1) >= 2))
     keep = np.sort(random.permutation(keep)[:count])
-    tracks = [_track(places[k], np.flatnonzero(seen[k]), cameras, random) for k in keep]
+    tracks = [_track(places[k], np.flatnonzero(visible[k]), cameras, random) for k in keep]
     reach = np.linalg.norm(places - origin, axis=1)[keep]
     size = NOISE_PIXELS * reach / cameras[0].fx
     moved = places[keep] + size[:, None] * random.normal(size=(len(keep), 3))
@@ -137,7 +137,7 @@ def sample_sparse_points(
 
 def _visible(built: BuiltScene, cameras: Sequence[Camera], places: Array) -> NDArray[np.bool_]:
     """Whether each camera sees each of the points [M, 3]: [M, V]."""
-    seen = np.zeros((len(places), len(cameras)), bool)
+    visible = np.zeros((len(places), len(cameras)), bool)
     for number, camera in enumerate(cameras):
         x, y, z = _project(camera, places).T
         inside = np.flatnonzero(
@@ -148,8 +148,8 @@ def _visible(built: BuiltScene, cameras: Sequence[Camera], places: Array) -> NDA
         way = places[inside] - camera.center.numpy()
         length = np.linalg.norm(way, axis=1)
         hits = intersect(built, np.broadcast_to(camera.center.numpy(), way.shape), way / length[:, None])
-        seen[inside, number] = np.abs(hits.distance - length) < 2e-3 * length
-    return seen
+        visible[inside, number] = np.abs(hits.distance - length) < 2e-3 * length
+    return visible
 
 
 def _mirrored(
@@ -163,19 +163,19 @@ def _mirrored(
 ) -> tuple[NDArray[np.bool_], Array]:
     """Replace some points on smooth surfaces by the virtual images of reflected points: (which, points)."""
     sharp = np.array([False] + [item.material.roughness < SMOOTH for item in built.spec.things])
-    wanted = np.flatnonzero(
+    chosen = np.flatnonzero(
         sharp[thing] & (random.random(len(thing)) < VIRTUAL / max(sharp[thing].mean(), VIRTUAL))
     )
     ghost = np.zeros(len(places), bool)
-    if len(wanted) == 0:
+    if len(chosen) == 0:
         return ghost, places
-    d, n = ray[wanted], normal[wanted]
+    d, n = ray[chosen], normal[chosen]
     back = d - 2 * (d * n).sum(-1, keepdims=True) * n
-    hits = intersect(built, places[wanted] + 1e-4 * n, back)
+    hits = intersect(built, places[chosen] + 1e-4 * n, back)
     hit = hits.distance > 0
-    ghost[wanted[hit]] = True
+    ghost[chosen[hit]] = True
     places = places.copy()
-    places[wanted[hit]] += hits.distance[hit][:, None] * d[hit]
+    places[chosen[hit]] += hits.distance[hit][:, None] * d[hit]
     return ghost, places
 
 
@@ -210,7 +210,7 @@ def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], s
     first = cameras[0]
     inner = " ".join(f"{float(v)!r}" for v in (first.fx, first.fy, first.cx, first.cy))
     write_text(folder / "cameras.txt", f"# one camera\n1 PINHOLE {first.width} {first.height} {inner}\n")
-    seen: list[list[str]] = [[] for _ in names]
+    observations: list[list[str]] = [[] for _ in names]
     rows = []
     for number, (place, color, track) in enumerate(
         zip(sparse.points, sparse.colors, sparse.tracks, strict=True), 1
@@ -218,8 +218,8 @@ def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], s
         errors = []
         parts = []
         for view, x, y in track:
-            parts.append(f"{view + 1} {len(seen[view])}")
-            seen[view].append(f"{x:.3f} {y:.3f} {number}")
+            parts.append(f"{view + 1} {len(observations[view])}")
+            observations[view].append(f"{x:.3f} {y:.3f} {number}")
             px, py, _ = _project(cameras[view], place[None])[0]
             errors.append(np.hypot(px - x, py - y))
         xyz = " ".join(f"{v:.6f}" for v in place)
@@ -230,5 +230,5 @@ def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], s
     for number, (camera, name) in enumerate(zip(cameras, names, strict=True)):
         numbers = (*quaternion(camera.rotation), *camera.translation.tolist())
         pose = " ".join(f"{v:.15g}" for v in numbers)
-        lines += [f"{number + 1} {pose} 1 {name}.png", " ".join(seen[number])]
+        lines += [f"{number + 1} {pose} 1 {name}.png", " ".join(observations[number])]
     write_text(folder / "images.txt", "# two lines an image\n" + "\n".join(lines) + "\n")

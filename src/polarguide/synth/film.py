@@ -75,13 +75,13 @@ def render_lobes(
         passes += 1
     batch = samples // passes
     total = np.zeros((pixels, 7, 3))
-    for done in range(0, samples, batch):
+    for start in range(0, samples, batch):
         for channel, scene in enumerate(scenes):
-            found = _render_pass(scene, camera, (done, batch), seed, limits, center)
+            sums = _render_pass(scene, camera, (start, batch), seed, limits, center)
             if len(scenes) == 1:
-                total += found
+                total += sums
             else:
-                total[..., channel] += found[..., 0]
+                total[..., channel] += sums[..., 0]
     grid = (total / samples).reshape(camera.height, camera.width, 7, 3).transpose(2, 0, 1, 3)
     return LobeRadiance(grid[0:3], grid[3:6], grid[6])
 
@@ -101,8 +101,8 @@ def _render_pass(
                 sums[pixel] += np.array([[float(v) for v in color] for color in parts])
         return sums
     part_values = [opaque_value(mi.UInt32, value) for value in (first, count)]
-    found = _compiled()(scene, lens, part_values, pixels, count, start, limits, center)
-    return np.stack([column.numpy() for column in found], -1).reshape(pixels, 7, -1).astype(np.float64)
+    totals = _compiled()(scene, lens, part_values, pixels, count, start, limits, center)
+    return np.stack([column.numpy() for column in totals], -1).reshape(pixels, 7, -1).astype(np.float64)
 
 
 @functools.cache

@@ -48,9 +48,9 @@ def intersect(built: BuiltScene, origins: Array, toward: Array) -> Intersections
         direction = mi.Vector3f(np.ascontiguousarray(toward.T, np.float32))
         distance, normal, thing = (np.array(value, float) for value in _intersect(built, origin, direction))
         normal = normal.T
-    known = thing > 0
-    normal = np.where((normal * toward).sum(-1, keepdims=True) > 0, -normal, normal) * known[:, None]
-    return Intersections(distance * known, normal, thing.astype(np.uint8))
+    hit = thing > 0
+    normal = np.where((normal * toward).sum(-1, keepdims=True) > 0, -normal, normal) * hit[:, None]
+    return Intersections(distance * hit, normal, thing.astype(np.uint8))
 
 
 def _intersect(built: BuiltScene, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
@@ -72,13 +72,13 @@ def ground_truth_maps(built: BuiltScene, camera: Camera) -> dict[str, NDArray[An
     hits = intersect(built, origins, rays)
     shape = (camera.height, camera.width)
     front = np.array([False] + [thing.foreground for thing in built.spec.things])
-    shown = np.array([False, *built.spec.shown])[hits.thing]
-    depth = shown * hits.distance * (rays @ camera.rotation[2].numpy())
+    drawn = np.array([False, *built.spec.shown])[hits.thing]
+    depth = drawn * hits.distance * (rays @ camera.rotation[2].numpy())
     return {
-        "normal": (shown[:, None] * hits.normal).reshape(*shape, 3).astype(np.float16),
+        "normal": (drawn[:, None] * hits.normal).reshape(*shape, 3).astype(np.float16),
         "depth": depth.reshape(shape).astype(np.float16),
         "mask": front[hits.thing].reshape(shape),
-        "objid": (shown * hits.thing).reshape(shape),
+        "objid": (drawn * hits.thing).reshape(shape),
     }
 
 
@@ -106,8 +106,8 @@ def _layers(path: Path, camera: Camera) -> list[Picture]:
             for name in ("stokes", "specular", "diffuse", "normal", "depth")
         )
     mean = optics.luminance(stokes)
-    degree, known = optics.dolp(mean), depth > 0
-    near, far = np.percentile(depth[known].numpy(), (1, 99)) if known.any() else (0.0, 1.0)
+    degree, covered = optics.dolp(mean), depth > 0
+    near, far = np.percentile(depth[covered].numpy(), (1, 99)) if covered.any() else (0.0, 1.0)
     return [
         figures.radiance_to_rgb(stokes[0] / 2),
         figures.dolp_to_rgb(degree),

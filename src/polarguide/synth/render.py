@@ -195,9 +195,9 @@ def _render_all(job: Job, reporter: Reporter) -> None:
         reporter.say(f"Going on: {len(job.names) - len(left)} of {len(job.names)} views are finished.")
     with reporter.track(f"rendering {job.built.spec.name}", len(job.names)) as progress:
         progress(len(job.names) - len(left))
-        for done, number in enumerate(left, 1):
+        for count, number in enumerate(left, 1):
             _render_view(job, number)
-            progress(len(job.names) - len(left) + done)
+            progress(len(job.names) - len(left) + count)
 
 
 def _render_view(job: Job, number: int) -> None:
@@ -316,11 +316,11 @@ def sweep_scenes(
     plans = sweep_plans(spec, out, settings, overrides, sweep)
     if sweep.parameter == "views":
         return _fewer_views(plans[0], out, sweep, reporter, threads)
-    done = []
+    folders = []
     for value, plan in zip(sweep.values, plans, strict=True):
-        done.append(synthesize(plan.spec, plan.out, plan.settings, reporter, threads=threads))
-        _note(done[-1], sweep.parameter, value)
-    return done
+        folders.append(synthesize(plan.spec, plan.out, plan.settings, reporter, threads=threads))
+        _note(folders[-1], sweep.parameter, value)
+    return folders
 
 
 def sweep_plans(
@@ -371,10 +371,10 @@ def _fewer_views(plan: Plan, out: Path, sweep: Sweep, reporter: Reporter, thread
         )
     whole = synthesize(spec, plan.out, settings, reporter, threads=threads)
     record = json.loads((whole / "scene.json").read_text(encoding="utf-8"))
-    done = []
+    folders = []
     for value in sweep.values:
         member = _member(out, sweep, value)
-        done.append(member)
+        folders.append(member)
         if (member / "scene.json").exists():
             verify_scene(member)
             continue
@@ -389,7 +389,7 @@ def _fewer_views(plan: Plan, out: Path, sweep: Sweep, reporter: Reporter, thread
         folder.write_file(member / "scene.json", json.dumps(smaller, indent=1).encode())
         _note(member, "views", value)
         reporter.say(f"{member}: {len(chosen)} training views")
-    return done
+    return folders
 
 
 def _link(whole: Path, member: Path, names: list[str]) -> None:

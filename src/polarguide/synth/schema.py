@@ -76,15 +76,15 @@ def require_unicode(path: Path) -> None:
         ) from None
 
 
-def only_fields(data: Mapping[str, Any], known: Sequence[str], where: str) -> None:
+def only_fields(data: Mapping[str, Any], allowed: Sequence[str], where: str) -> None:
     """Refuse fields that nothing reads.
 
     Raises:
         PolarguideError: there are some.
     """
-    unknown = sorted(data.keys() - set(known))
+    unknown = sorted(data.keys() - set(allowed))
     if unknown:
-        raise _fault(where, f"only {', '.join(known)}", ", ".join(unknown)[:LONGEST_NAME])
+        raise _fault(where, f"only {', '.join(allowed)}", ", ".join(unknown)[:LONGEST_NAME])
 
 
 def check_color(color: Any, where: str) -> None:

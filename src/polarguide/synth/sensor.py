@@ -152,8 +152,8 @@ def filter_jpeg(
         noise, random, sensor: as in ``sensor.noisy``.
     """
     light = behind_filter(stokes, rays, shot.angle) * 2.0**shot.stops
-    shown = srgb_encode_array(np.clip(noisy(light, noise, random, sensor), 0.0, 1.0))
-    stored = apply_orientation(np.rint(255 * shown).astype(np.uint8), _BACK[shot.orientation])
+    encoded = srgb_encode_array(np.clip(noisy(light, noise, random, sensor), 0.0, 1.0))
+    stored = apply_orientation(np.rint(255 * encoded).astype(np.uint8), _BACK[shot.orientation])
     options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(stored[..., ::-1]), options)
     time = _TIME * Fraction(2.0**shot.stops) if shot.noted else None

@@ -97,13 +97,13 @@ def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
 def _silent_stderr() -> Iterator[None]:
     """Suppress what a library writes to the error stream past Python while it loads."""
     sys.stderr.flush()
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(stderr, 2)
+        os.close(stderr)
         os.close(nowhere)
 
 
@@ -223,12 +223,12 @@ class Overrides:
 
     def apply(self, spec: SceneSpec) -> SceneSpec:
         """The scene with the changes."""
-        given = {name: value for name, value in asdict(self).items() if value is not None}
+        changes = {name: value for name, value in asdict(self).items() if value is not None}
         data = spec.data()
-        data["camera"] |= {name: value for name, value in given.items() if name in ("views", "spacing")}
+        data["camera"] |= {name: value for name, value in changes.items() if name in ("views", "spacing")}
         for thing in data["things"]:
             if thing["foreground"] and thing["material"]["type"] == "plastic":
-                thing["material"] |= {k: v for k, v in given.items() if k in ("roughness", "index")}
+                thing["material"] |= {k: v for k, v in changes.items() if k in ("roughness", "index")}
         # The changes have to pass the checks of a file.
         return parse_scene(data, f"{spec.name} with the flags", folder=spec.folder)
 

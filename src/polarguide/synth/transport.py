@@ -117,10 +117,10 @@ def sample_bsdf(bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, act
     Returns:
         (value, density) for the direction ``toward`` a light; (direction, density, weight, delta) of the sampled one.
     """
-    given = bsdf.eval_pdf(context, si, toward, active)
+    evaluated = bsdf.eval_pdf(context, si, toward, active)
     sample, weight = bsdf.sample(context, si, *numbers, active)
     delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-    return given, (sample.wo, sample.pdf, weight, delta)
+    return evaluated, (sample.wo, sample.pdf, weight, delta)
 
 
 def sample_cosine(
@@ -182,10 +182,12 @@ def trace_paths(
         directly visible radiance of light sources and environment.
     """
     si = scene.ray_intersect(ray)
-    seen = _shown(si) if limits.shown_only else mi.Bool(True)
+    counted = _shown(si) if limits.shown_only else mi.Bool(True)
     emitted = _emitted(scene, si, mi.Bool(True))
     if limits.shown_only:
-        emitted *= dr.select(seen, 1.0, 0.0)  # the scalar variant evaluates emitters that are not active, too
+        emitted *= dr.select(
+            counted, 1.0, 0.0
+        )  # the scalar variant evaluates emitters that are not active, too
     flags = mi.BSDFFlags
     lobes = []
     for kinds, sample_direction in (
@@ -195,7 +197,7 @@ def trace_paths(
         context = mi.BSDFContext()
         context.type_mask = int(kinds)
         numbers = (sampler.next(), sampler.pair(), sampler.pair())
-        start = (dr.identity(mi.Spectrum), numbers, si.is_valid() & seen)
+        start = (dr.identity(mi.Spectrum), numbers, si.is_valid() & counted)
         direct, after = _scatter(scene, ray, si, context, *start, sample_direction)
         lobes.append(_continue_paths(scene, direct, after, sampler, limits))
     return lobes[0], lobes[1], emitted
@@ -219,13 +221,13 @@ def _continue_paths(
             rival = scene.pdf_emitter_direction(place, seen_from, active & (delta ^ True))
         share = dr.select(delta, 1.0, pdf / dr.maximum(pdf + rival, TINY))
         emitted = _emitted(scene, si, active) * dr.select(active, share, 0.0)
-        found = _limited([gain[i, 0] * emitted for i in range(3)], limits.clamp, depth > 1)
+        limited = _limited([gain[i, 0] * emitted for i in range(3)], limits.clamp, depth > 1)
         active = active & si.is_valid() & (depth < limits.depth)
         numbers = (random.next_float32(), _point(random), _point(random))
         direct, state = _scatter(scene, ray, si, both, gain, numbers, active, sample_bsdf)
         direct = _limited(direct, limits.clamp, mi.Bool(True))
         state = _russian_roulette(state, random.next_float32(), depth > ROULETTE_FROM)
-        s0, s1, s2 = (s + a + b for s, a, b in zip((s0, s1, s2), found, direct, strict=True))
+        s0, s1, s2 = (s + a + b for s, a, b in zip((s0, s1, s2), limited, direct, strict=True))
         return (depth + 1, s0, s1, s2, *state, random)
 
     start = (mi.UInt32(1), *light, *after, sampler.later)

@@ -96,8 +96,8 @@ def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: 
         assert depth is not None
         center = camera.pose(means.dtype, means.device).center
         pixel, z, inside = seen_at(means - center, camera)
-        seen = inside & (z < depth[pixel] * (1 + DEPTH_SLACK))
-        total += seen[:, None] * unit(center - means)
+        visible = inside & (z < depth[pixel] * (1 + DEPTH_SLACK))
+        total += visible[:, None] * unit(center - means)
     return total
 
 
@@ -120,14 +120,14 @@ def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: 
     Args:
         gaussians: the Gaussians. cameras: of the pictures. rasterize: of the backend.
     """
-    given = splats(gaussians)
-    views = torch.zeros(len(given.means), device=given.means.device)
+    splatted = splats(gaussians)
+    views = torch.zeros(len(splatted.means), device=splatted.means.device)
     most = torch.zeros_like(views)
     for camera in cameras:
         # The gradient of the summed weights with respect to a feature is the sum of its Gaussian's weights.
         with torch.enable_grad():
-            features = torch.ones_like(given.features).requires_grad_()
-            fixed = type(given)(*(tensor.detach() for tensor in given))
+            features = torch.ones_like(splatted.features).requires_grad_()
+            fixed = type(splatted)(*(tensor.detach() for tensor in splatted))
             rasterize(fixed._replace(features=features), camera).features.sum().backward()
         assert features.grad is not None
         pixels = features.grad[:, 0]
@@ -210,10 +210,10 @@ class DensityControl:
         touched = touched_pixels(state.gaussians, cameras, self._backend.rasterize)
         for values in touched:
             self._ranks.broadcast(values)
-        kept = touched.most >= faint
+        keep = touched.most >= faint
         if self._black:
             enough = len(self._views) >= self._densification.enough_views
-            kept &= touched.views >= (2 if enough else 1)
-        if bool(kept.any()):
-            state.gaussians.keep(kept)
+            keep &= touched.views >= (2 if enough else 1)
+        if bool(keep.any()):
+            state.gaussians.keep(keep)
             state.statistics.clear(len(state.gaussians))

@@ -31,30 +31,30 @@ def refuse_foreign(tensors: Mapping[str, Tensor], recipe: Recipe) -> None:
     Raises:
         ValueError: one is missing, is not known, or has another shape, type or range; the message names it.
     """
-    known = {"scalars", "statistics.gradient", "statistics.seen"}
+    names = {"scalars", "statistics.gradient", "statistics.seen"}
     count = _count(tensors, "gaussians.means")
     shapes = {name: (count, *shape) for name, shape in recipe.shapes.items()}
-    light = {name: given.shape for name, given in recipe.shading.light_parameters.items()}
+    light = {name: parameter.shape for name, parameter in recipe.shading.light_parameters.items()}
     for kind, table, rates in (
         ("gaussians", shapes, recipe.learning_rates),
         ("environment", light, recipe.light_rates),
     ):
         for name, shape in table.items():
             _check_values(tensors, f"{kind}.{name}", shape, name)
-            known.add(f"{kind}.{name}")
+            names.add(f"{kind}.{name}")
             if name in rates:
-                known |= _check_moments(tensors, _moments(kind, name), shape)
+                names |= _check_moments(tensors, _moments(kind, name), shape)
     if any(name.startswith("frozen.") for name in tensors):
         frozen = _count(tensors, "frozen.means")
         for name, each in recipe.shapes.items():
             _check_values(tensors, f"frozen.{name}", (frozen, *each), name)
-            known.add(f"frozen.{name}")
+            names.add(f"frozen.{name}")
     _check_statistics(tensors, count)
     _check_scalars(tensors)
     if "angles" in tensors:
         _check_angles(tensors["angles"])
-        known.add("angles")
-    strangers = sorted(tensors.keys() - known)
+        names.add("angles")
+    strangers = sorted(tensors.keys() - names)
     if strangers:
         raise ValueError(f"{strangers[0][:80]}, which is not known")
 

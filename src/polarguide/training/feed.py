@@ -97,16 +97,16 @@ class Feed:
         """
         size, priors = self._size(step), None
         if step == self._until:  # what was kept of smaller pictures goes
-            self._partial = {key: kept for key, kept in self._partial.items() if key[0] == size}
+            self._partial = {key: entry for key, entry in self._partial.items() if key[0] == size}
             for kind in KINDS:
                 self._store.drop("small " + kind)
         if weights.priors and view.is_determined:
             assert guide is not None
             priors = self._priors(size, view, weights.fields_read, guide)
-        kept = self._store.get(size + "photograph", view.name, lambda: self._photograph(view))
-        valid, empty = (kept[name].codes.float() if name in kept else None for name in ("valid", "empty"))
+        entry = self._store.get(size + "photograph", view.name, lambda: self._photograph(view))
+        valid, empty = (entry[name].codes.float() if name in entry else None for name in ("valid", "empty"))
         if view.is_determined:
-            return StepTargets(view.camera, unpacked(kept["picture"]), valid, empty, priors=priors)
+            return StepTargets(view.camera, unpacked(entry["picture"]), valid, empty, priors=priors)
         if (size, view.name) not in self._partial:
             self._partial[size, view.name] = PartialView.of(view, self._backend.device)
         partial = self._partial[size, view.name]
@@ -148,24 +148,26 @@ class Feed:
         metal = metalness_share(frozen, view.camera, self._backend.rasterize)
 
         def make() -> Entry:
-            found = unguided(view.to(guide.device), self._settings, self._index)._asdict()
-            return {name: Packed(values) for name, values in found.items() if values is not None}
+            fields = unguided(view.to(guide.device), self._settings, self._index)._asdict()
+            return {name: Packed(values) for name, values in fields.items() if values is not None}
 
         # It can be had again for a part of the work, so that it is not worth a file.
-        kept = self._store.get(size + "unguided", view.name, make, disposable=True)
-        known = Unguided(**{name: part.codes for name, part in kept.items()})
+        entry = self._store.get(size + "unguided", view.name, make, disposable=True)
+        unguided_part = Unguided(**{name: part.codes for name, part in entry.items()})
         flat = self._flat_surfaces(size).get(view.name)
         own = index_picture(frozen, view.camera, self._backend.rasterize, self._index)
         index = self._index if own is None else own
-        return pack_priors(view_priors(view, guide, self._settings, index, known, metal, flat), fields)
+        return pack_priors(
+            view_priors(view, guide, self._settings, index, unguided_part, metal, flat), fields
+        )
 
     def _flat_surfaces(self, size: str) -> dict[str, Flat]:
         """Flat surfaces of all views, found when the first priors are needed."""
         if size not in self._flat:
             views = self._views[size] if self._settings.flat else ()
             # On the CPU, so that it is the same wherever one trains.
-            found = flat_surfaces(self._memory.between(views), self._index, self._settings.flat_rules)
-            self._flat[size] = {name: flat.to(self._backend.device) for name, flat in found.items()}
+            surfaces = flat_surfaces(self._memory.between(views), self._index, self._settings.flat_rules)
+            self._flat[size] = {name: flat.to(self._backend.device) for name, flat in surfaces.items()}
         return self._flat[size]
 
 

@@ -95,19 +95,19 @@ def flat_surfaces(views: Iterable[View], refractive_index: float, rules: FlatRul
 
     Views that do not determine the Stokes vector are left out.
     """
-    found, determined = dict[str, Flat](), 0
+    surfaces, determined = dict[str, Flat](), 0
     for view in views:  # one by one, as they come
         if view.is_determined:
             determined += 1
             if (flat := flat_surface(view, refractive_index, rules)) is not None:
-                found[view.name] = flat
-    if not found:
+                surfaces[view.name] = flat
+    if not surfaces:
         return {}
-    normals = torch.stack([flat.normal for flat in found.values()])
-    sizes = torch.stack([flat.where.sum() for flat in found.values()]).to(normals)
+    normals = torch.stack([flat.normal for flat in surfaces.values()])
+    sizes = torch.stack([flat.where.sum() for flat in surfaces.values()]).to(normals)
     alike = normals @ normals.T > torch.cos(torch.deg2rad(normals.new_tensor(rules.alike)))
     enough, agreed = max(rules.fewest, rules.share * determined), {}
-    for (name, flat), others in zip(found.items(), alike, strict=True):
+    for (name, flat), others in zip(surfaces.items(), alike, strict=True):
         if int(others.sum()) >= enough:
             agreed[name] = replace(flat, normal=unit((normals * (others * sizes)[:, None]).sum(dim=0)))
     return agreed

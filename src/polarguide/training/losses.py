@@ -218,9 +218,9 @@ def flatness_loss_reference(log_scales: Tensor, radii: Tensor, extent: float) ->
 class _Flatness(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
-        kept = log_scales.detach().contiguous(), radii.detach().contiguous()
-        total, count = _native.shortest_sum(*kept)
-        ctx.save_for_backward(*kept)
+        inputs = log_scales.detach().contiguous(), radii.detach().contiguous()
+        total, count = _native.shortest_sum(*inputs)
+        ctx.save_for_backward(*inputs)
         ctx.factor = 100 / extent / max(count, 1.0)
         return log_scales.new_tensor(ctx.factor * total)
 

@@ -82,13 +82,13 @@ class Terms(NamedTuple):
 class _PixelTerms(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, camera: Camera, terms: Terms, alpha: Tensor, *inputs: Tensor | None) -> Tensor:
-        given = [None if t is None else t.detach().contiguous() for t in inputs]
-        gradients = [None if t is None else torch.zeros_like(t) for t in given]
+        tensors = [None if t is None else t.detach().contiguous() for t in inputs]
+        gradients = [None if t is None else torch.zeros_like(t) for t in tensors]
         # Pixels in a row; the depth stays a picture.
         (
             (normal, specular, diffuse, metal, depth),
             (to_normal, to_specular, to_diffuse, to_metal, to_depth),
-        ) = ([t if t is None or t.ndim == 2 else t.view(-1, 3) for t in of] for of in (given, gradients))
+        ) = ([t if t is None or t.ndim == 2 else t.view(-1, 3) for t in of] for of in (tensors, gradients))
         assert normal is not None
         assert to_normal is not None
         frame = camera.rays().view(-1, 3), camera.pose(torch.float32, alpha.device).rotation

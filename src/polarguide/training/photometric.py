@@ -75,17 +75,17 @@ def photometric_terms_reference(
     prediction: Tensor, target: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
 ) -> Photometric:
     """The reference implementation of ``photometric_terms``: plain torch, any dtype and device."""
-    shown = srgb_encode(_Clip.apply(prediction))
+    encoded = srgb_encode(_Clip.apply(prediction))
     weight = (torch.ones_like(prediction[..., 0]) if weight is None else weight)[..., None]
-    x, y = shown.permute(2, 0, 1), target.permute(2, 0, 1)
+    x, y = encoded.permute(2, 0, 1), target.permute(2, 0, 1)
     mx, my, xx, yy, xy = _blur(torch.cat((x, y, x * x, y * y, x * y))).split(3)
     numerator = (2 * mx * my + _C1) * (2 * (xy - mx * my) + _C2)
     denominator = (mx * mx + my * my + _C1) * ((xx - mx * mx) + (yy - my * my) + _C2)
     ssim = (numerator / denominator).permute(1, 2, 0)
-    per_value = (1 - ssim_weight) * (shown - target).abs() + ssim_weight * (1 - ssim)
+    per_value = (1 - ssim_weight) * (encoded - target).abs() + ssim_weight * (1 - ssim)
     total = 3 * weight.sum()
     count = torch.where(total > 0, total, torch.ones_like(total))
-    squared = (shown - target).detach().square()
+    squared = (encoded - target).detach().square()
     return Photometric((weight * per_value).sum() / count, (weight * squared).sum() / count)
 
 

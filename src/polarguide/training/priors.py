@@ -81,10 +81,10 @@ def guide_normals(normal: Tensor, rays: Tensor, least: float) -> tuple[Tensor, T
 
     A blended normal that faces away (by up to a pixel's slant) is brought to grazing.
     """
-    known = dot(normal, normal) > least**2
+    reliable = dot(normal, normal) > least**2
     facing = unit(normal)
     away = dot(facing, rays)[..., None].clamp(min=0)
-    return unit(facing - away * 1.001 * rays), known
+    return unit(facing - away * 1.001 * rays), reliable
 
 
 @torch.no_grad()
@@ -93,7 +93,7 @@ def view_priors(
     normal: Tensor,
     settings: Priors,
     refractive_index: float | Tensor,
-    known: Unguided | None = None,
+    precomputed: Unguided | None = None,
     metal: Tensor | None = None,
     flat: Flat | None = None,
 ) -> ViewPriors:
@@ -104,26 +104,26 @@ def view_priors(
         normal: [H, W, 3] normals rendered from the frozen Gaussians, world axes, any length; its device does the work.
         settings: which candidates and which separation.
         refractive_index: of all surfaces, or [H, W] of each pixel.
-        known: ``unguided`` of the view, where it is at hand; needed with the index of each pixel.
+        precomputed: ``unguided`` of the view, where it is at hand; needed with the index of each pixel.
         metal: [H, W] share of metals, where what holds for dielectrics alone does not count; None: no metal.
         flat: a flat surface, whose normal replaces the guide and the color differences where the guide is far from it.
     """
     view, rays = view.to(normal.device), view.camera.rays(device=normal.device)
-    if known is None:
+    if precomputed is None:
         assert not isinstance(refractive_index, Tensor)
-        known = unguided(view, settings, refractive_index)
+        precomputed = unguided(view, settings, refractive_index)
     stokes = view.stokes()
     luminance = optics.luminance(stokes)
     guide = _guide(view, normal, flat, rays, settings)
-    nearest_to, by_color = guide.normal, _by_color(known, guide, settings, rays)
+    nearest_to, by_color = guide.normal, _by_color(precomputed, guide, settings, rays)
     if by_color is not None:
         nearest_to = torch.where(by_color[1][..., None] > 0, by_color[0], guide.normal)
     candidates = _candidates(settings.candidates, luminance, rays, refractive_index)
     chosen = optics.disambiguate(candidates, nearest_to, rays, azimuth_weight=settings.azimuth_weight).normal
     layers = _separated(stokes, guide, settings, refractive_index, rays)
     conditioned = layers.conditioned & ~view.saturated
-    counts = known.usable if settings.live else known.usable & guide.shown
-    weight = (known.degree / settings.full_dolp).clamp(max=1) * counts
+    counts = precomputed.usable if settings.live else precomputed.usable & guide.shown
+    weight = (precomputed.degree / settings.full_dolp).clamp(max=1) * counts
     chromatic, chromatic_weight = (chosen, torch.zeros_like(weight)) if by_color is None else by_color
     weight = torch.maximum(weight, chromatic_weight)
     reliable = (~(view.invalid | view.saturated)).float()
@@ -137,7 +137,7 @@ def view_priors(
         separated=conditioned * (~view.invalid).float(),
         normal=view.camera.to_world(chosen),
         plane=view.camera.to_world(
-            _plane(chosen, by_color, known.degree < settings.chromatic_plane_dolp, rays)
+            _plane(chosen, by_color, precomputed.degree < settings.chromatic_plane_dolp, rays)
         ),
         weight=weight,
         chromatic=view.camera.to_world(chromatic),
@@ -188,17 +188,19 @@ class _Guide(NamedTuple):
 
 
 def _guide(view: View, normal: Tensor, flat: Flat | None, rays: Tensor, settings: Priors) -> _Guide:
-    guide, shown = guide_normals(view.camera.to_camera(normal), rays, settings.minimum_normal)
+    guide, reliable = guide_normals(view.camera.to_camera(normal), rays, settings.minimum_normal)
     if flat is None:
-        return _Guide(guide, shown, guide, torch.zeros_like(shown))
+        return _Guide(guide, reliable, guide, torch.zeros_like(reliable))
     on_plane = view.camera.to_camera(flat.normal).expand_as(guide)
-    astray = flat.where & ~(shown & (dot(guide, on_plane) > math.cos(math.radians(settings.astray))))
-    return _Guide(torch.where(astray[..., None], on_plane, guide), shown | flat.where, on_plane, astray)
+    astray = flat.where & ~(reliable & (dot(guide, on_plane) > math.cos(math.radians(settings.astray))))
+    return _Guide(torch.where(astray[..., None], on_plane, guide), reliable | flat.where, on_plane, astray)
 
 
-def _by_color(known: Unguided, guide: _Guide, settings: Priors, rays: Tensor) -> tuple[Tensor, Tensor] | None:
+def _by_color(
+    precomputed: Unguided, guide: _Guide, settings: Priors, rays: Tensor
+) -> tuple[Tensor, Tensor] | None:
     """Normals [H, W, 3] of the color differences or of a flat surface, and their weight; None: not wanted."""
-    _, _, zenith, azimuth, certainty, colorful = known
+    _, _, zenith, azimuth, certainty, colorful = precomputed
     if zenith is None or azimuth is None or certainty is None or colorful is None:
         return None
     chromatic, weight = facing(zenith, azimuth, guide.normal, rays), certainty * guide.shown
@@ -302,11 +304,11 @@ def _chromatic_angles(
     """Zenith, azimuth and weight in [0, 1] of the normals of the color differences, and how colorful the body is, each
     [H, W].
     """
-    found = optics.chromatic_normals(stokes, refractive_index)
+    chromatic = optics.chromatic_normals(stokes, refractive_index)
     gray, color = settings.gray
     return (
-        found.zenith,
-        found.azimuth,
-        (found.certainty / settings.full_certainty).clamp(max=1) * (found.decided & good),
-        ((found.contrast - gray) / (color - gray)).clamp(0, 1),
+        chromatic.zenith,
+        chromatic.azimuth,
+        (chromatic.certainty / settings.full_certainty).clamp(max=1) * (chromatic.decided & good),
+        ((chromatic.contrast - gray) / (color - gray)).clamp(0, 1),
     )

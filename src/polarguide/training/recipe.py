@@ -274,19 +274,19 @@ class Recipe(Method):
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Every per-Gaussian tensor, with the shape of one Gaussian's values."""
-        own = {name: given.shape for name, given in self.shading.parameters.items()}
+        own = {name: parameter.shape for name, parameter in self.shading.parameters.items()}
         return {**CORE_SHAPES, **(ORIENTED_SHAPES if self.oriented else {}), **own}
 
     @property
     def learning_rates(self) -> dict[str, float]:
         """Learning rates of the per-Gaussian tensors that learn, the shading model's included."""
-        own = {name: given.rate for name, given in self.shading.parameters.items() if given.rate}
+        own = {name: parameter.rate for name, parameter in self.shading.parameters.items() if parameter.rate}
         return {**self.rates, **own}
 
     @property
     def light_rates(self) -> dict[str, float]:
         """Learning rates of the learned light's parameters."""
-        return {name: given.rate for name, given in self.shading.light_parameters.items()}
+        return {name: parameter.rate for name, parameter in self.shading.light_parameters.items()}
 
     def as_recorded(self, data: Mapping[str, Any]) -> Recipe:
         """See ``Method``: shading that a version of before did not know is left out."""

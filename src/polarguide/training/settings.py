@@ -110,9 +110,9 @@ class ResolvedSettings(TrainSettings):
                 remedy = "Restore the file, or train again into a new folder."
                 raise PolarguideError(name, expected="a number", found="nothing", remedy=remedy)
 
-    def fit(self, asked: TrainSettings) -> bool:
+    def fit(self, settings: TrainSettings) -> bool:
         """Whether they are as was asked, whatever was left open."""
-        return asked.specified().items() <= vars(self).items()
+        return settings.specified().items() <= vars(self).items()
 
 
 @dataclass(frozen=True, eq=False)

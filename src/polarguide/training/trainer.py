@@ -291,12 +291,12 @@ def turned_behind(result: RenderResult, near: float, far: float) -> RenderResult
     assert result.normal is not None
     assert result.rotation_only_normal is not None
     assert result.depth is not None
-    held = result.depth.detach()
-    share = shares_before(held, near, far)
+    depth = result.depth.detach()
+    share = shares_before(depth, near, far)
     return replace(
         result,
         normal=result.rotation_only_normal.lerp(result.normal, share[..., None]),
-        depth=held.lerp(result.depth, share),
+        depth=depth.lerp(result.depth, share),
     )
 
 

@@ -57,13 +57,13 @@ def packed(values: Tensor) -> Packed:
     return Packed((values * (FULL / top)).round_().to(torch.int16), top)
 
 
-def unpacked(kept: Packed) -> Tensor:
+def unpacked(entry: Packed) -> Tensor:
     """The values, float32 where they were coded."""
-    if kept.top is None:
-        return kept.codes
+    if entry.top is None:
+        return entry.codes
     # A division by 32767 gives back a 1 exactly, a product with its inverse does not.
-    values = kept.codes.to(torch.float32).div_(FULL)
-    return values if kept.top.device.type == "cpu" and float(kept.top) == 1 else values.mul_(kept.top)
+    values = entry.codes.to(torch.float32).div_(FULL)
+    return values if entry.top.device.type == "cpu" and float(entry.top) == 1 else values.mul_(entry.top)
 
 
 def holds(entry: Entry, fields: frozenset[str]) -> bool:
@@ -89,7 +89,7 @@ def unpack_priors(entry: Entry, camera: Camera, settings: Priors) -> ViewPriors:
     Args:
         entry: by ``pack_priors``. camera: of the view. settings: that they were computed with.
     """
-    values = {name: unpacked(kept) for name, kept in entry.items()}
+    values = {name: unpacked(stored) for name, stored in entry.items()}
     device = next(iter(values.values())).device
     nothing = torch.full((), torch.nan, device=device)
     size = (camera.height, camera.width)
@@ -151,11 +151,11 @@ class ViewStore:
             kind, view: its name. make: makes it. disposable: over the limit it is made again, not put into the file.
         """
         key = (kind, view)
-        found = self._held.get(key) or self._read(key)
-        if found is None:
-            found = make()
-            self._keep(key, found, disposable)
-        return found
+        entry = self._held.get(key) or self._read(key)
+        if entry is None:
+            entry = make()
+            self._keep(key, entry, disposable)
+        return entry
 
     def drop(self, kind: str, view: str | None = None) -> None:
         """Forget the entries of a kind, or one of them.

@@ -131,12 +131,12 @@ def guarded(gate: Gate, check: Check) -> Iterator[None]:
         PolarguideError: it has not listened with what was wrapped; whoever started it has to end it.
     """
     sockets = optional_import("websockets.asyncio.server", "the viewer")
-    listen, taken = sockets.serve, []
+    listen, opened = sockets.serve, []
 
     def serve(handler: Any, *arguments: Any, **options: Any) -> Any:
         if not str(getattr(handler, "__module__", "")).startswith("viser."):  # somebody else's, meanwhile
             return listen(handler, *arguments, **options)
-        taken.append(True)
+        opened.append(True)
         options |= {
             "max_size": LARGEST,
             "logger": _QUIET,
@@ -150,7 +150,7 @@ def guarded(gate: Gate, check: Check) -> Iterator[None]:
             yield
         finally:
             sockets.serve = listen
-    if not taken:
+    if not opened:
         raise PolarguideError(
             "the viewer",
             expected="a viser whose connections can be checked",

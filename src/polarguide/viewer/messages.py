@@ -80,8 +80,8 @@ def checked(raw: bytes | str, control: Callable[[str], Accepts | None], reach: f
             name = msgspec.msgpack.decode(raw, type=_Click).name
             nowhere = {"ray_origin": (0.0,) * 3, "ray_direction": (0.0, 0.0, 1.0), "screen_pos": (0.0, 0.0)}
             owner = msgspec.msgpack.decode(raw, type=dict[str, Any]).get("owner", "")
-            given = {"name": name, "instance_index": None, "modifier": None, "owner": str(owner)[:100]}
-            return _encoded(kind, {**given, **nowhere})
+            node = {"name": name, "instance_index": None, "modifier": None, "owner": str(owner)[:100]}
+            return _encoded(kind, {**node, **nowhere})
         if kind == "ScenePointerMessage":
             pointer = msgspec.msgpack.decode(raw, type=_Pointer)
             return _encoded(kind, _clicked(pointer)) if pointer.event_type == "click" else None

@@ -87,10 +87,10 @@ class Panel:
             self.play = gui.add_button("Play")
             self.save_path = gui.add_button("Save path")
         self.accepts = self._accepted([*layers, *MEASURED], options.views)
-        shown = (self.layer, self.exposure, self.strength, self.turn, self._use_crop, *self._crop)
+        controls = (self.layer, self.exposure, self.strength, self.turn, self._use_crop, *self._crop)
         for control in self._crop:
             control.on_update(lambda _: self._forget_saved())
-        for control in shown:
+        for control in controls:
             control.on_update(lambda _: changed())
 
     def _forget_saved(self) -> None:
@@ -152,8 +152,8 @@ def _percent(crop: Crop | None) -> list[tuple[int, int]]:
     """Where the sliders of a crop box stand."""
     if crop is None:
         return [(-40, 40)] * 3
-    found = []
+    percents = []
     for low, high in zip(crop.low, crop.high, strict=True):
         first = min(max(round(100 * low), CROP[0]), CROP[1] - 1)
-        found.append((first, max(first + 1, min(round(100 * high), CROP[1]))))
-    return found
+        percents.append((first, max(first + 1, min(round(100 * high), CROP[1]))))
+    return percents

@@ -153,8 +153,8 @@ class Viewer:
         """Gains of the photographs' mean, computed when they are first asked for."""
         if self._gray is None:
             photographs = self._photographs.values()
-            kept = [p.view for p in photographs if not p.held_out] or [p.view for p in photographs]
-            self._gray = gray_world(kept)
+            views = [p.view for p in photographs if not p.held_out] or [p.view for p in photographs]
+            self._gray = gray_world(views)
         return self._gray
 
     def _saved(self, presentation: Presentation) -> str:
@@ -178,9 +178,9 @@ class Viewer:
     def _drop(self, client_id: int, error: Exception) -> None:
         """Let a browser go; the server and a training go on."""
         with self._lock:
-            known = self._sessions.pop(client_id, None) is not None
+            removed = self._sessions.pop(client_id, None) is not None
         text = f"the viewer let a browser go: {type(error).__name__}: {error}"
-        if known and text not in self._warned:
+        if removed and text not in self._warned:
             self._warned.add(text)
             self._warn(text)
         connection = self._server._websock_server._live_connections.get(client_id)
@@ -313,15 +313,15 @@ def save_to_run(run: OpenedRun, chosen: Presentation) -> str:
     What its scene says just so is left to the scene. The run's own credit stays.
     """
     own, above = read_presentation(run.folder), read_presentation(run.scene_folder)
-    fields, kept = {}, []
+    fields, unchanged = {}, []
     for name in ("white_balance", "up_axis", "meters_per_unit", "crop"):
-        value, given = getattr(chosen, name), getattr(above, name)
-        fields[name] = None if value == given else value
-        if value is None and given is not None:
-            kept.append(name)
+        value, inherited = getattr(chosen, name), getattr(above, name)
+        fields[name] = None if value == inherited else value
+        if value is None and inherited is not None:
+            unchanged.append(name)
     write_presentation(run.folder, msgspec.structs.replace(own, **fields))
-    if kept:
-        return f"Saved; the scene's own {', '.join(kept)} still counts"
+    if unchanged:
+        return f"Saved; the scene's own {', '.join(unchanged)} still counts"
     return f"Saved to {PRESENTATION_FILE}"
 
 

@@ -79,15 +79,15 @@ def data_uri(picture: Picture, layer: str, side: int) -> str:
     """A picture uint8 RGB [H, W, 3] as a data URI, its longer side at most ``side`` pixels."""
     check_picture(picture, layer)
     factor = side / max(picture.shape[:2])
-    shown = picture
+    resized = picture
     if factor < 1:
         size = (max(1, round(picture.shape[1] * factor)), max(1, round(picture.shape[0] * factor)))
-        shown = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(picture.dtype)
+        resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(picture.dtype)
     if layer in LOSSLESS:
         kind, options = "png", [cv2.IMWRITE_PNG_COMPRESSION, 9]
     else:
         kind, options = "jpeg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    encoded, data = cv2.imencode(f".{kind}", shown[..., ::-1], options)
+    encoded, data = cv2.imencode(f".{kind}", resized[..., ::-1], options)
     if not encoded:
         raise ValueError(f"{layer}: the picture could not be encoded")
     return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"

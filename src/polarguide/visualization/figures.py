@@ -232,13 +232,13 @@ def aolp_to_rgb(aolp: Tensor, dolp: Tensor | None = None) -> Picture:
     """
     angle = aolp.detach().to("cpu", torch.float64)
     value = torch.ones_like(angle) if dolp is None else dolp.detach().to("cpu", torch.float64)
-    known = angle.isfinite() & value.isfinite()
+    valid = angle.isfinite() & value.isfinite()
     third = 2 * math.pi / 3
     hue = 2 * angle.nan_to_num(0.0, 0.0, 0.0)[..., None] - angle.new_tensor([0.0, third, 2 * third])
     # Distance from each primary on the color circle: a full third on, a full third off, linear between.
     distance = (torch.remainder(hue + math.pi, 2 * math.pi) - math.pi).abs()
     color = (2 - distance / (math.pi / 3)).clamp(0, 1)
-    value = torch.where(known, value.nan_to_num(0.0).clamp(0, 1), 0.0)
+    value = torch.where(valid, value.nan_to_num(0.0).clamp(0, 1), 0.0)
     return _to_uint8(color * value[..., None])
 
 

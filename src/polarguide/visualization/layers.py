@@ -60,9 +60,9 @@ def clipping_exposure(values: Tensor) -> float:
     return min(1.0, 1.0 / limit) if limit > 0 else 1.0
 
 
-def depth_range(depth: Tensor, seen: Tensor) -> tuple[float, float]:
-    """Nearest and farthest depth [H, W] worth a color where ``seen`` [H, W]."""
-    values = depth[seen]
+def depth_range(depth: Tensor, mask: Tensor) -> tuple[float, float]:
+    """Nearest and farthest depth [H, W] worth a color where ``mask`` [H, W]."""
+    values = depth[mask]
     if values.numel() == 0:
         return 0.0, 1.0
     near, far = float(values.quantile(0.02)), float(values.quantile(0.9))

@@ -65,14 +65,14 @@ def cross_fitted(view: View, final: Tensor, stokes: Tensor | None) -> Tensor:
 
 def _behind(measured: Tensor, stokes: Tensor, weight: Tensor, rays: Tensor, mount: Mount) -> Tensor:
     """The whole picture behind the analyzer that fits where the weight is."""
-    found = fit_angle(measured, stokes, weight, rays, mount)
-    if found is None:
+    angle = fit_angle(measured, stokes, weight, rays, mount)
+    if angle is None:
         counted = weight[..., None]
         gain = (counted * measured).sum() / (counted * stokes[0] / 2).sum().clamp(min=1e-12)
         return gain * stokes[0] / 2
-    cosine, sine = optics.analyzer(math.radians(found.angle), rays, mount)[..., None].to(stokes)
-    polarized = found.modulation * (stokes[1] * cosine + stokes[2] * sine)
-    return found.gain * (stokes[0] + polarized) / 2
+    cosine, sine = optics.analyzer(math.radians(angle.angle), rays, mount)[..., None].to(stokes)
+    polarized = angle.modulation * (stokes[1] * cosine + stokes[2] * sine)
+    return angle.gain * (stokes[0] + polarized) / 2
 
 
 MINIMUM_SECONDS = 1.5
@@ -239,10 +239,10 @@ def frames_per_second(draw: Callable[[View], object], views: Sequence[View]) -> 
     stopwatch = Stopwatch()
     begin = time.perf_counter()
     while len(times[0]) < rounds or (not slow and time.perf_counter() - begin < MINIMUM_SECONDS):
-        for taken, view in zip(times, views, strict=True):
-            taken.append(_seconds(draw, view))
+        for seconds, view in zip(times, views, strict=True):
+            seconds.append(_seconds(draw, view))
     _, alone = stopwatch.read()
-    return 1 / statistics.median(statistics.median(taken) for taken in times) if alone else None
+    return 1 / statistics.median(statistics.median(seconds) for seconds in times) if alone else None
 
 
 def _seconds(draw: Callable[[View], object], view: View) -> float:

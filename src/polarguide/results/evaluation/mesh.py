@@ -43,19 +43,21 @@ def mesh_scores(surface: Callable[[], Surface], views: Sequence[View]) -> Mappin
         Shares in [0, 1]; nothing where no depth is known. Where there is no surface to fuse, all are 0. Where a library
         is missing, ``mesh_fscore_1_reason`` alone, which names it.
     """
-    known = [view for view in views if view.ground_truth is not None and view.ground_truth.depth is not None]
-    if not any(bool(_known(view)[1].any()) for view in known):
+    measured = [
+        view for view in views if view.ground_truth is not None and view.ground_truth.depth is not None
+    ]
+    if not any(bool(_known(view)[1].any()) for view in measured):
         return {}
     lacking = missing_package()
     if lacking is not None:
         return {"mesh_fscore_1_reason": lacking}
     try:
-        made = surface()
+        mesh = surface()
     except NoSurfaceError:
         return {
             f"mesh_{name}_{end}": 0.0 for end in THRESHOLDS for name in ("accuracy", "completeness", "fscore")
         }
-    return surface_scores(made, known)
+    return surface_scores(mesh, measured)
 
 
 def missing_package() -> str | None:
@@ -139,12 +141,12 @@ def judged(points: Points, views: Sequence[View], reach: float) -> NDArray[np.bo
     Inside: not in a pixel beside the foreground's edge or a jump of the true depth. There surfaces are seen so flat
     that true points lie too far apart to measure a distance to them.
     """
-    found = torch.zeros(len(points), dtype=torch.bool)
+    visible = torch.zeros(len(points), dtype=torch.bool)
     for view in views:
         depth, front, _ = _known(view)
         pixel, z, within = seen_at(torch.from_numpy(points) - view.camera.center, view.camera)
-        found |= within & _inner(depth, front)[pixel] & (z <= depth[pixel] + reach)
-    return found.numpy()
+        visible |= within & _inner(depth, front)[pixel] & (z <= depth[pixel] + reach)
+    return visible.numpy()
 
 
 def _known(view: View) -> tuple[Tensor, Tensor, Tensor]:

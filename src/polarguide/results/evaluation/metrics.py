@@ -106,12 +106,12 @@ def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: K
         raise ValueError(
             f"SSIM: expected at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, found {width} x {height}"
         )
-    kept = _selected(keep, pred_linear).mask
+    selected = _selected(keep, pred_linear).mask
     x, y = (
-        torch.where(kept, shown(picture.to(kept.device, torch.float64)).movedim(-1, 0), 0.0)
+        torch.where(selected, shown(picture.to(selected.device, torch.float64)).movedim(-1, 0), 0.0)
         for picture in (pred_linear, true_linear)
     )
-    weight = _blur(kept.to(torch.float64)[None]).clamp(min=torch.finfo(torch.float64).tiny)
+    weight = _blur(selected.to(torch.float64)[None]).clamp(min=torch.finfo(torch.float64).tiny)
     mean_x, mean_y = _blur(x) / weight, _blur(y) / weight
     variance_x = _blur(x * x) / weight - mean_x**2
     variance_y = _blur(y * y) / weight - mean_y**2
@@ -119,7 +119,7 @@ def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: K
     similarity = ((2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)) / (
         (mean_x**2 + mean_y**2 + SSIM_C1) * (variance_x + variance_y + SSIM_C2)
     )
-    counted = _selected(window_centers(kept) if windows is None else windows, similarity[0])
+    counted = _selected(window_centers(selected) if windows is None else windows, similarity[0])
     return similarity.flatten(1).index_select(1, counted.places).mean()
 
 
@@ -220,25 +220,25 @@ def _shown_error(pred: Tensor, true: Tensor) -> Tensor:
 
 def _kept_angles(pred: Tensor, true: Tensor, keep: Keep) -> Tensor:
     if not isinstance(keep, Selection):
-        known = has_direction(true)
-        keep = known if keep is None else known & keep.to(known.device)
+        directed = has_direction(true)
+        keep = directed if keep is None else directed & keep.to(directed.device)
     return _selected(keep, pred).pick(normal_angles_deg(pred, true))
 
 
 def _kept(pred: Tensor, true: Tensor, keep: Keep) -> tuple[Tensor, Tensor]:
     """The pixels that count as [P, C] float64, on the device of the prediction."""
     _check_pair(pred, true)
-    kept = _selected(keep, pred)
-    return kept.pick(pred.to(torch.float64)), kept.pick(true.to(pred.device, torch.float64))
+    selection = _selected(keep, pred)
+    return selection.pick(pred.to(torch.float64)), selection.pick(true.to(pred.device, torch.float64))
 
 
 def _selected(keep: Keep, picture: Tensor) -> Selection:
     """The pixels of a picture [H, W, ...] that count, on its device."""
     size = picture.shape[:2]
     mask = torch.ones(size, dtype=torch.bool) if keep is None else keep
-    found = mask.mask if isinstance(mask, Selection) else mask
-    if found.dtype != torch.bool or found.shape != size:
-        raise ValueError(f"keep: expected bool {list(size)}, found {found.dtype} {list(found.shape)}")
+    selection = mask.mask if isinstance(mask, Selection) else mask
+    if selection.dtype != torch.bool or selection.shape != size:
+        raise ValueError(f"keep: expected bool {list(size)}, found {selection.dtype} {list(selection.shape)}")
     return mask if isinstance(mask, Selection) else Selection.of(mask, picture.device)
 
 

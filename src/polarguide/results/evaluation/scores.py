@@ -51,7 +51,7 @@ def error_maps(target: ViewTarget, layers: Layers) -> dict[str, ErrorMap]:
     if stokes is not None and measured is not None and keep is not None:
         errors = ((stokes - measured).abs().sum(dim=-1), measured.abs().sum(dim=-1))
         maps["stokes_error"] = ErrorMap(*(torch.where(keep.mask, values, 0.0) for values in errors))
-    return {key: found for key in OBJECT_METRICS if (found := maps[key]) is not None}
+    return {key: error for key in OBJECT_METRICS if (error := maps[key]) is not None}
 
 
 def _squared(pred: Tensor | None, true: Tensor | None, keep: Selection | None) -> ErrorMap | None:
@@ -118,8 +118,8 @@ def _record(sums: Sequence[float], *, metals: bool) -> dict[str, Any]:
     *pairs, metal, light, pixels, views = sums
     record: dict[str, Any] = {"pixels": int(pixels), "views": int(views)}
     for key, error, weight in zip(OBJECT_METRICS, pairs[::2], pairs[1::2], strict=True):
-        known = weight > 0 and (key != "stokes_error" or weight >= LEAST_POLARIZED * light)
-        value = error / weight if known else None
+        counted = weight > 0 and (key != "stokes_error" or weight >= LEAST_POLARIZED * light)
+        value = error / weight if counted else None
         if value is not None and key.endswith("psnr"):
             value = min(decibels(value), HIGHEST_PSNR)
         record[key] = value
@@ -187,11 +187,11 @@ def score_view(
     if by_object is not None:
         by_object.add(target, layers)
     measures = {m.key: m.measure(target, layers) for m in VIEW_METRICS if m.measure is not None}
-    found = _numbers({"nonfinite_pixels": broken.sum(), **measures})
-    lost_pixels = int(found.pop("nonfinite_pixels"))
+    numbers = _numbers({"nonfinite_pixels": broken.sum(), **measures})
+    lost_pixels = int(numbers.pop("nonfinite_pixels"))
     scores: ViewScores = {}
     for metric in VIEW_METRICS:
-        value = found.get(metric.key, math.nan)
+        value = numbers.get(metric.key, math.nan)
         if metric.unit == "dB":
             value = min(decibels(value), HIGHEST_PSNR)
         scores[metric.key] = _number(value)
@@ -232,9 +232,9 @@ def summarize(per_view: Mapping[str, ViewScores]) -> dict[str, float | str | Non
 
 def _numbers(measures: Mapping[str, Tensor | None]) -> dict[str, float]:
     """What tensors [] hold; the only place where scoring waits for their device."""
-    known = {key: value.to(torch.float64) for key, value in measures.items() if value is not None}
-    values: list[float] = torch.stack(list(known.values())).cpu().tolist()
-    return dict(zip(known, values, strict=True))
+    present = {key: value.to(torch.float64) for key, value in measures.items() if value is not None}
+    values: list[float] = torch.stack(list(present.values())).cpu().tolist()
+    return dict(zip(present, values, strict=True))
 
 
 def _plain(layer: Tensor | None) -> Tensor | None:

@@ -90,8 +90,8 @@ def _compared(compare: Callable[..., Tensor], layer: str, *known: str) -> Measur
     """
 
     def measure(target: ViewTarget, layers: Layers) -> Tensor | None:
-        given = [layers[layer], *(getattr(target, name) for name in known)]
-        return None if any(values is None for values in given) else compare(*given)
+        arguments = [layers[layer], *(getattr(target, name) for name in known)]
+        return None if any(values is None for values in arguments) else compare(*arguments)
 
     return measure
 
@@ -296,11 +296,11 @@ def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> li
 
 def _worst_view(record: Mapping[str, Any], metric: Metric) -> list[tuple[str, str]]:
     """The lowest value of a metric among the views, with its name; nothing for a single view."""
-    known = {name: s[metric.key] for name, s in record.get("views", {}).items() if s[metric.key] is not None}
-    if len(known) < 2:
+    scored = {name: s[metric.key] for name, s in record.get("views", {}).items() if s[metric.key] is not None}
+    if len(scored) < 2:
         return []
-    name = min(known, key=lambda view: known[view])
-    return [(f"{metric.label}, worst view", f"{metric.text(known[name])} ({name})")]
+    name = min(scored, key=lambda view: scored[view])
+    return [(f"{metric.label}, worst view", f"{metric.text(scored[name])} ({name})")]
 
 
 def absent_metrics(record: Mapping[str, Any]) -> list[str]:

@@ -60,10 +60,10 @@ class SceneFacts:
         """Look at the test views of a scene."""
         tests = scene.test_views
         centers = torch.stack([view.camera.center for view in scene.views]).numpy()
-        warnings, found = _partly_known(tests), {view.name: foreground(view) for view in tests}
-        masks = {name: mask for name, mask in found.items() if mask is not None}
+        warnings, foregrounds = _partly_known(tests), {view.name: foreground(view) for view in tests}
+        masks = {name: mask for name, mask in foregrounds.items() if mask is not None}
         if 0 < len(masks) < len(tests):
-            lacking = [name for name in found if name not in masks]
+            lacking = [name for name in foregrounds if name not in masks]
             warnings.append(
                 f"Only {len(masks)} of {len(tests)} test views have a mask (not {listed(lacking)}): stokes_error is "
                 "over whole pictures."
@@ -84,8 +84,8 @@ class SceneFacts:
 
 def foreground(view: View) -> Tensor | None:
     """The foreground [H, W] bool: the ground truth's mask, else the user's; None where neither is there."""
-    known = view.ground_truth
-    return known.mask if known is not None and known.mask is not None else view.mask
+    truth = view.ground_truth
+    return truth.mask if truth is not None and truth.mask is not None else view.mask
 
 
 def outside(mask: Tensor) -> Tensor:
@@ -215,14 +215,14 @@ class ViewTarget:
         valid = torch.ones(photograph.shape[:2], dtype=torch.bool) if invalid is None else ~invalid
         mask = getattr(ground_truth, "mask", None)
         names = ("normal", "specular", "diffuse")
-        known = {name: None if mask is None else getattr(ground_truth, name, None) for name in names}
-        there = {name: None if values is None else _there(values, device) for name, values in known.items()}
+        maps = {name: None if mask is None else getattr(ground_truth, name, None) for name in names}
+        there = {name: None if values is None else _there(values, device) for name, values in maps.items()}
         foreground = None if mask is None else mask.to(torch.bool) & valid
         reflective = surface = None
-        if foreground is not None and known["specular"] is not None:
-            reflective = reflective_mask(known["specular"], 2 * photograph.to(torch.float64), foreground)
-        if foreground is not None and known["normal"] is not None:
-            surface = foreground & has_direction(known["normal"])
+        if foreground is not None and maps["specular"] is not None:
+            reflective = reflective_mask(maps["specular"], 2 * photograph.to(torch.float64), foreground)
+        if foreground is not None and maps["normal"] is not None:
+            surface = foreground & has_direction(maps["normal"])
         depth = getattr(ground_truth, "depth", None)
         near = smooth = None
         if depth is not None:
@@ -247,21 +247,21 @@ class ViewTarget:
     def of_view(cls, view: View, facts: SceneFacts, device: torch.device) -> ViewTarget:
         """All that is known of a test view, on a device."""
         target = cls.of(view.photograph(), view.invalid, view.ground_truth, device)
-        masks, known = facts.masks, view.ground_truth
+        masks, truth = facts.masks, view.ground_truth
         polarization = polarized = None
         if view.is_determined:
             polarization = _there(torch.cat(view.stokes()[1:].unbind(0), dim=-1), device)
             counts = ~(view.invalid | view.saturated)
             polarized = Selection.of(counts if masks is None else counts & masks[view.name], device)
         owner = dielectric = None
-        if facts.objects and known is not None and known.object_ids is not None:
-            owner = torch.full_like(known.object_ids, len(facts.objects), dtype=torch.int64)
+        if facts.objects and truth is not None and truth.object_ids is not None:
+            owner = torch.full_like(truth.object_ids, len(facts.objects), dtype=torch.int64)
             for place, item in enumerate(facts.objects):
-                owner[known.object_ids == item.id] = place
+                owner[truth.object_ids == item.id] = place
             plain = [item.material.kind not in (None, *METAL_CLASSES) for item in facts.objects]
             dielectric = torch.tensor([*plain, False])[owner] & ~view.invalid
-            if known.mask is not None:
-                dielectric &= known.mask
+            if truth.mask is not None:
+                dielectric &= truth.mask
         alone = masks[view.name] if masks is not None and facts.object_only else None
         return replace(
             target,

@@ -191,8 +191,8 @@ def _ply(run: OpenedRun, presented: _Presented, path: Path, placement: Placement
         whole = folder / path.name
         model = run.gaussian_model("format ply")
         write_run_ply(whole, model.state, model.shading, _camera_centers(run))
-        kept = None if presented.kept is None else presented.kept.cpu()
-        rewrite_splats(path, whole, placement or presented.placement, kept, presented.comments)
+        selected = None if presented.kept is None else presented.kept.cpu()
+        rewrite_splats(path, whole, placement or presented.placement, selected, presented.comments)
     return path
 
 

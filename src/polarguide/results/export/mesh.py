@@ -51,14 +51,14 @@ def write_mesh(
     """
     trimesh = optional_import("trimesh", "--format mesh")
     binary = path.suffix.lower() == ".glb"
-    shown = torch.from_numpy(mesh.colors)
-    values = (shown if binary else srgb_encode(shown)).mul(255).round().to(torch.uint8).numpy()
+    colors = torch.from_numpy(mesh.colors)
+    values = (colors if binary else srgb_encode(colors)).mul(255).round().to(torch.uint8).numpy()
     vertices, normals = (torch.from_numpy(t) for t in (mesh.surface.vertices, mesh.surface.normals))
     if binary:
         vertices = placement.scale * vertices
     else:
         vertices, normals = placement.points(vertices), placement.directions(normals)
-    made = trimesh.Trimesh(
+    solid = trimesh.Trimesh(
         vertices=vertices.numpy(),
         faces=mesh.surface.faces,
         vertex_normals=normals.numpy(),
@@ -70,14 +70,14 @@ def write_mesh(
         pose = np.eye(4)
         pose[:3, :3] = around.panorama_axes().T.numpy()
         scene = trimesh.Scene()
-        scene.add_geometry(made, node_name="mesh", geom_name="mesh", transform=pose)
+        scene.add_geometry(solid, node_name="mesh", geom_name="mesh", transform=pose)
 
         def about(tree: dict[str, Any]) -> None:
             tree["asset"] |= _asset(placement, origin)
 
         data = scene.export(file_type="glb", include_normals=True, tree_postprocessor=about)
     else:
-        data = with_comments(made.export(file_type="ply", vertex_normal=True), comments(origin, placement))
+        data = with_comments(solid.export(file_type="ply", vertex_normal=True), comments(origin, placement))
     write_whole(path, data)
 
 
@@ -109,20 +109,20 @@ def surface_points(
     """
     outward = outward_directions(gaussians, views, rasterize)
     opaque = torch.sigmoid(gaussians["opacity_logits"]) >= OPAQUE
-    kept = (opaque & (outward.norm(dim=1) > 0)).nonzero()[:, 0]
-    if not len(kept):
+    indices = (opaque & (outward.norm(dim=1) > 0)).nonzero()[:, 0]
+    if not len(indices):
         raise PolarguideError(
             "--format points",
             expected="opaque Gaussians that a view sees",
             found="none",
             remedy="Train for more steps.",
         )
-    means, side = gaussians["means"][kept], outward[kept]
+    means, side = gaussians["means"][indices], outward[indices]
     normals = shortest_axis_normals(
-        means, gaussians["quaternions"][kept], gaussians["log_scales"][kept], torch.zeros(3)
+        means, gaussians["quaternions"][indices], gaussians["log_scales"][indices], torch.zeros(3)
     )
     normals = torch.where((normals * side).sum(dim=1, keepdim=True) < 0, -normals, normals)
-    few = {name: gaussians[name][kept] for name in (*CORE_SHAPES, *shading.parameters)}
+    few = {name: gaussians[name][indices] for name in (*CORE_SHAPES, *shading.parameters)}
     linear = shading.diffuse_colors(few, -normals.contiguous())
     colors = srgb_encode(linear.clamp(0, 1))
     return means, normals, colors

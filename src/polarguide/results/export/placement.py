@@ -125,14 +125,14 @@ class Placement:
 
     def record(self) -> dict[str, Any]:
         """What files say of it: ``units``, ``up_axis``, and how the scene was turned and scaled."""
-        found: dict[str, Any] = {"units": "meters" if self.metric else "units of the scene"}
+        record: dict[str, Any] = {"units": "meters" if self.metric else "units of the scene"}
         if self.upright:
-            found["up_axis"] = "-y"
+            record["up_axis"] = "-y"
         if self.metric:
-            found["meters_per_unit_of_scene"] = self.scale
+            record["meters_per_unit_of_scene"] = self.scale
         if self.upright:
-            found["rotation_of_scene"] = self.rotation.flatten().tolist()
-        return found
+            record["rotation_of_scene"] = self.rotation.flatten().tolist()
+        return record
 
 
 @dataclass(frozen=True)
@@ -148,15 +148,15 @@ class Origin:
 
     def record(self) -> dict[str, str]:
         """By the names that Sketchfab gave to the extras of a glTF asset; what is not known is left out."""
-        shown = self.presentation
-        found = {
-            "title": shown.title,
-            "author": shown.author,
-            "license": shown.license,
-            "source": shown.provenance,
+        presentation = self.presentation
+        texts = {
+            "title": presentation.title,
+            "author": presentation.author,
+            "license": presentation.license,
+            "source": presentation.provenance,
             "made_of": self.made_of,
         }
-        return {name: text for name, text in found.items() if text}
+        return {name: text for name, text in texts.items() if text}
 
 
 IN_PLACE = Placement(torch.eye(3, dtype=torch.float64), 1.0, metric=False, upright=False)
@@ -199,9 +199,9 @@ def rewrite_splats(
     element = PlyData.read(ply)["vertex"]
     table = np.array(element.data if kept is None else element.data[kept.numpy()])
     placement.place(table)
-    made = PlyElement.describe(table, "vertex", comments=[*element.comments, *lines])
+    vertices = PlyElement.describe(table, "vertex", comments=[*element.comments, *lines])
     with atomic(path) as temporary:
-        PlyData([made], byte_order="<").write(temporary)
+        PlyData([vertices], byte_order="<").write(temporary)
 
 
 SUFFIX = ".png"

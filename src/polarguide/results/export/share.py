@@ -81,20 +81,20 @@ def records(gaussians: Parameters, values: Mapping[str, Tensor]) -> NDArray[Any]
         in it are alike.
     """
     opacity = torch.sigmoid(gaussians["opacity_logits"])
-    kept = (opacity >= MINIMUM_ALPHA).nonzero()[:, 0]
-    kept = kept[torch.from_numpy(curve_order(gaussians["means"][kept].numpy()))]
-    axis, side = _axes(gaussians, kept)
+    indices = (opacity >= MINIMUM_ALPHA).nonzero()[:, 0]
+    indices = indices[torch.from_numpy(curve_order(gaussians["means"][indices].numpy()))]
+    axis, side = _axes(gaussians, indices)
     fields = {
-        "mean": gaussians["means"][kept],
-        "opacity": opacity[kept],
-        "rotation": normalize(gaussians["quaternions"][kept], dim=-1),
-        "scales": gaussians["log_scales"][kept],
+        "mean": gaussians["means"][indices],
+        "opacity": opacity[indices],
+        "rotation": normalize(gaussians["quaternions"][indices], dim=-1),
+        "scales": gaussians["log_scales"][indices],
         "axis": axis,
-        **{name: value[kept] for name, value in values.items()},
+        **{name: value[indices] for name, value in values.items()},
     }
     harmonics = {name: harmonics_steps(fields.pop(name)) for name in HARMONICS if name in fields}
     data = np.zeros(
-        len(kept), record_type([*fields, "side", *harmonics, *(f"{name}_scale" for name in harmonics)])
+        len(indices), record_type([*fields, "side", *harmonics, *(f"{name}_scale" for name in harmonics)])
     )
     data["side"] = side.numpy()
     for name, value in fields.items():

@@ -111,8 +111,8 @@ def _store(file: zipfile.ZipFile, name: str, data: bytes) -> None:
 
 def _lossless(pixels: Pixels) -> bytes:
     order = [2, 1, 0, 3][: pixels.shape[2]]
-    done, data = cv2.imencode(".webp", pixels[..., order], [cv2.IMWRITE_WEBP_QUALITY, 101])
-    assert done
+    encoded, data = cv2.imencode(".webp", pixels[..., order], [cv2.IMWRITE_WEBP_QUALITY, 101])
+    assert encoded
     return data.tobytes()
 
 

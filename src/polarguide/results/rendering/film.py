@@ -80,11 +80,11 @@ def _require_whole(encoder: Any, path: Path, count: int) -> None:
         OSError: there are fewer than were written.
     """
     try:
-        found, _ = encoder.count_frames_and_secs(path)
+        frames, _ = encoder.count_frames_and_secs(path)
     except RuntimeError:  # it cannot be read at all
-        found = 0
-    if found != count:
-        raise OSError(f"a file of {found} of {count} pictures, as on a full disk")
+        frames = 0
+    if frames != count:
+        raise OSError(f"a file of {frames} of {count} pictures, as on a full disk")
 
 
 SWINGS = {"orbit": 0.0, "spiral": 0.25}

@@ -93,7 +93,7 @@ def fuse(box: Box, views: Iterable[tuple[Camera, Tensor, Tensor]]) -> tuple[Tens
     step = max(1, _SLAB // (ny * nz))
     axes = [box.low[k] + box.size * (torch.arange(n) + 0.5) for k, n in enumerate(box.counts)]
     for camera, depth, mask in views:
-        known = torch.where(mask, depth, torch.zeros_like(depth)).flatten()
+        depths = torch.where(mask, depth, torch.zeros_like(depth)).flatten()
         turn, shift = camera.rotation, camera.translation
         for begin in range(0, nx, step):
             part = slice(begin, min(begin + step, nx))
@@ -110,7 +110,7 @@ def fuse(box: Box, views: Iterable[tuple[Camera, Tensor, Tensor]]) -> tuple[Tens
             place = (
                 row.clamp(0, camera.height - 1) * camera.width + column.clamp(0, camera.width - 1)
             ).long()
-            surface = known[place.flatten()].reshape(place.shape)
+            surface = depths[place.flatten()].reshape(place.shape)
             distance = (surface - local[2]) / (TRUNCATION * box.size)
             counts = inside & (local[2] > 1e-6) & (surface > 0) & (distance > -1)
             total[part] += torch.where(counts, distance.clamp(max=1), 0.0)
@@ -131,11 +131,11 @@ def surface_of(box: Box, field: Tensor, weight: Tensor, *, least: int = 2, small
     marching_cubes: Callable[..., tuple[NDArray, NDArray, NDArray, NDArray]] = optional_import(
         "skimage.measure", "a mesh"
     ).marching_cubes
-    known = (weight >= least).numpy()
+    certain = (weight >= least).numpy()
     try:
         # Its normals point to smaller values, into the surface; with "descent" its faces turn outward.
         vertices, faces, inward, _ = marching_cubes(
-            field.numpy(), 0.0, mask=known, gradient_direction="descent"
+            field.numpy(), 0.0, mask=certain, gradient_direction="descent"
         )
     except (RuntimeError, ValueError):
         raise NoSurfaceError(
@@ -212,9 +212,9 @@ def fused_surface(
     optional_import("skimage.measure", "a mesh")
     views = [(camera, _kept(render(camera).to("cpu"), camera)) for camera in cameras.values()]
     around = scene_frame(list(cameras.values()))
-    points = [seen_points(camera, seen.depth, seen.mask) for camera, seen in views]
+    points = [seen_points(camera, samples.depth, samples.mask) for camera, samples in views]
     box = box_around(points, around.center, around.distance, resolution)
-    field, weight = fuse(box, ((camera, seen.depth, seen.mask) for camera, seen in views))
+    field, weight = fuse(box, ((camera, samples.depth, samples.mask) for camera, samples in views))
     return surface_of(box, field, weight), views, box
 
 
@@ -236,8 +236,8 @@ def implicit_surface(cameras: Mapping[str, Camera], model: FieldModel, *, resolu
     near = places[(distance.abs() < coarse) & (_in_pictures(cameras, places) >= 2)]
     box = box_around([near], around.center, reach, resolution)
     places, distance = _sampled(box, model)
-    seen = _in_pictures(cameras, places)
-    return surface_of(box, distance, seen)
+    counts = _in_pictures(cameras, places)
+    return surface_of(box, distance, counts)
 
 
 def implicit_mesh(cameras: Mapping[str, Camera], model: FieldModel, *, resolution: int) -> ColoredMesh:
@@ -287,13 +287,13 @@ def painted(surface: Surface, views: list[tuple[Camera, DepthSamples]], box: Box
     own = torch.from_numpy(surface.normals)
     color, normal = torch.zeros_like(vertices), torch.zeros_like(vertices)
     total = torch.zeros(len(vertices), dtype=torch.float64)
-    for camera, seen in views:
+    for camera, samples in views:
         pixel, z, inside = seen_at(vertices - camera.center, camera)
-        near = (seen.depth[pixel] - z).abs() < TRUNCATION * box.size
+        near = (samples.depth[pixel] - z).abs() < TRUNCATION * box.size
         squarely = dot(unit(camera.center - vertices), own).clamp(min=0)
-        weight = (inside & near & seen.mask[pixel]) * squarely
-        color += weight[:, None] * seen.diffuse[pixel]
-        normal += weight[:, None] * seen.normal[pixel]
+        weight = (inside & near & samples.mask[pixel]) * squarely
+        color += weight[:, None] * samples.diffuse[pixel]
+        normal += weight[:, None] * samples.normal[pixel]
         total += weight
     # What no view sees squarely keeps the normal of its surface, and the color gray.
     learned = unit(normal, 1e-9)

@@ -101,11 +101,11 @@ def gains_of(color: Tensor, where: str = "white_balance") -> Vector:
     """
     values = [float(value) for value in color]
     if not (min(values) > 0 and max(values) >= DARKEST and max(values) <= BRIGHTEST):
-        found = ", ".join(f"{value:.3g}" for value in values)
+        listed = ", ".join(f"{value:.3g}" for value in values)
         raise PolarguideError(
             where,
             expected=f"a color of {DARKEST:g} to {BRIGHTEST:g} of full scale in its brightest channel, none of them 0",
-            found=f"R, G, B {found}",
+            found=f"R, G, B {listed}",
             remedy="Pick a place that is gray or white, neither dark nor clipped.",
         )
     gains = [values[1] / value for value in values]

@@ -97,7 +97,7 @@ def write_pictures(
     names = checked_layers(list(run.layers if layers is None else layers))
     chosen = select_views(run.scene, views)
     make_folder(folder)
-    shown: list[tuple[str, dict[str, Picture]]] = []
+    rows: list[tuple[str, dict[str, Picture]]] = []
     missing: set[str] = set()
     gains = run.presentation.gains
     polarization = run.polarization
@@ -126,11 +126,11 @@ def write_pictures(
                     figures.write_png(folder / f"{view.name}_{name}.png", picture, about=about)
                 else:
                     _write_numbers(folder / f"{view.name}_{name}.{format}", getattr(result, name))
-            if len(shown) < SHEET_VIEWS:
-                known = ground_truth_pictures(view, gains)
+            if len(rows) < SHEET_VIEWS:
+                truth = ground_truth_pictures(view, gains)
                 cells = {name: picture for name, picture in pictures.items() if picture is not None}
-                shown.append(
-                    (view.name, cells | {f"{name}, true": known[name] for name in cells if name in known})
+                rows.append(
+                    (view.name, cells | {f"{name}, true": truth[name] for name in cells if name in truth})
                 )
             advance(number + 1)
     if format != "png":
@@ -138,18 +138,18 @@ def write_pictures(
             folder / UNITS_FILE, to_json({name: UNITS[name] for name in names if name not in missing})
         )
     sheet = folder / CONTACT_SHEET
-    figures.write_png(sheet, _sheet(shown, names, f"polarization: {polarization}"), about=about)
+    figures.write_png(sheet, _sheet(rows, names, f"polarization: {polarization}"), about=about)
     if missing:
         reporter.say(f"this recipe has no layer {', '.join(sorted(missing))}")
     return sheet
 
 
-def _sheet(shown: Sequence[tuple[str, dict[str, Picture]]], names: Sequence[str], caption: str) -> Picture:
+def _sheet(views: Sequence[tuple[str, dict[str, Picture]]], names: Sequence[str], caption: str) -> Picture:
     """A row a view, and beside each layer what is true of it. A column that some view has not is left out."""
-    wanted = [column for name in names for column in (name, f"{name}, true")]
-    columns = [column for column in wanted if all(column in cells for _, cells in shown)]
-    rows = [[cells[column] for column in columns] for _, cells in shown]
-    return contact_sheet(rows, [name for name, _ in shown], columns, caption=caption)
+    titles = [column for name in names for column in (name, f"{name}, true")]
+    columns = [column for column in titles if all(column in cells for _, cells in views)]
+    rows = [[cells[column] for column in columns] for _, cells in views]
+    return contact_sheet(rows, [name for name, _ in views], columns, caption=caption)
 
 
 def _unblended(result: RenderResult) -> RenderResult:
@@ -161,9 +161,9 @@ def _unblended(result: RenderResult) -> RenderResult:
 
 def _write_numbers(path: Path, values: Tensor) -> None:
     """Linear numbers of a layer, [H, W] or [H, W, 3], float32."""
-    found = values.detach().cpu().float().contiguous()
+    numbers = values.detach().cpu().float().contiguous()
     if path.suffix == ".exr":
-        write_exr(path, found if found.ndim == 3 else found[..., None].expand(-1, -1, 3))
+        write_exr(path, numbers if numbers.ndim == 3 else numbers[..., None].expand(-1, -1, 3))
         return
     with atomic(path) as temporary, open(temporary, "wb") as file:
-        np.save(file, found.numpy())
+        np.save(file, numbers.numpy())

@@ -94,10 +94,10 @@ def present(
     }
     place.refuse_inherited(name for name, value in changes.items() if value in (None, ""))
     record = {**own.to_record(), **changes}
-    made = decode(record, Presentation, "presentation", remedy="Correct the value; nothing was written.")
+    decoded = decode(record, Presentation, "presentation", remedy="Correct the value; nothing was written.")
     if changes:
-        write_presentation(place.folder, made)
-    return place.shown(made)
+        write_presentation(place.folder, decoded)
+    return place.shown(decoded)
 
 
 class _Place:
@@ -170,15 +170,15 @@ class _Place:
                 remedy="Give the folder of a run of it, or numbers X,Y,Z.",
             )
         camera = self.scene.view(name).camera
-        found = surface_at(self._run.result(camera, depth=True).to("cpu"), camera, x, y)
-        if found is None:
+        hit = surface_at(self._run.result(camera, depth=True).to("cpu"), camera, x, y)
+        if hit is None:
             raise PolarguideError(
                 where,
                 expected=f"a surface at a place in {name}, which is {camera.width} x {camera.height}",
                 found=f"none at {x:g},{y:g}",
                 remedy="Pick a place on an object; polarguide view shows where it is.",
             )
-        return found.point, found.normal
+        return hit.point, hit.normal
 
     def point(self, text: str) -> Tensor:
         """A PLACE as a point [3] in the world.

@@ -90,8 +90,8 @@ def panorama(texels: Tensor, cubemap: RadianceCubemap, around: SceneFrame, heigh
         latitude.cos() * longitude.sin(), latitude.sin(), -latitude.cos() * longitude.cos()
     )
     directions = torch.stack((x, y, z), dim=-1).reshape(-1, 3) @ around.panorama_axes().T
-    found = cubemap_lookup(texels.detach(), directions.to(texels.dtype))
-    return cubemap.radiance(found).reshape(height, 2 * height, 3)
+    radiance = cubemap_lookup(texels.detach(), directions.to(texels.dtype))
+    return cubemap.radiance(radiance).reshape(height, 2 * height, 3)
 
 
 @torch.no_grad()
@@ -106,8 +106,8 @@ def texels_of(picture: Tensor, cubemap: RadianceCubemap, around: SceneFrame, res
     places = torch.stack((across * width / (width + 2), down), dim=-1).reshape(
         1, 6 * resolution, resolution, 2
     )
-    found = grid_sample(wide, places, mode="bilinear", padding_mode="border", align_corners=False)
-    light = found[0].movedim(0, -1).reshape(6, resolution, resolution, 3)
+    sampled = grid_sample(wide, places, mode="bilinear", padding_mode="border", align_corners=False)
+    light = sampled[0].movedim(0, -1).reshape(6, resolution, resolution, 3)
     return cubemap.raw(light).float()
 
 
@@ -115,8 +115,8 @@ def texels_of(picture: Tensor, cubemap: RadianceCubemap, around: SceneFrame, res
 def turned_cubemap(texels: Tensor, turn: Tensor, resolution: int) -> Tensor:
     """Raw texels [6, R, R, C] after turning what they show by a rotation [3, 3] of the world."""
     directions = (texel_directions(resolution).double() @ turn).reshape(-1, 3)
-    found = cubemap_lookup(texels, directions.to(texels))
-    return found.reshape(6, resolution, resolution, -1)
+    sampled = cubemap_lookup(texels, directions.to(texels))
+    return sampled.reshape(6, resolution, resolution, -1)
 
 
 def write_exr(path: Path, picture: Tensor, attributes: Mapping[str, str] = {}) -> None:

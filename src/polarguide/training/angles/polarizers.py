@@ -171,8 +171,8 @@ class Polarizers:
     @property
     def ended(self) -> int:
         """Searches of which all fits have been made."""
-        made = 0 if self.table is None else len(self.table)
-        return sum(made >= end for end in itertools.accumulate(map(len, self._rounds)))
+        count = 0 if self.table is None else len(self.table)
+        return sum(count >= end for end in itertools.accumulate(map(len, self._rounds)))
 
     @property
     def settled(self) -> bool:
@@ -232,9 +232,9 @@ class Polarizers:
             return []
         common = self._common_gain()
         fits = [self._judged(fit) for fit in self._latest()]
-        found = []
+        judgments = []
         for rows, poor in zip(zip(*fits, strict=True), self._unexplained(), strict=True):
-            said = rows[0].said
+            specified = rows[0].said
             telling = [row for row in rows if row.tells] or [row for row in rows if row.guesses]
             judgment = replace((telling or rows)[-1], unexplained=poor)
             if telling:
@@ -244,8 +244,10 @@ class Polarizers:
                 judgment = replace(judgment, angle=angle, scatter=90.0 if few else scatter)
             if wrong := [row for row in rows if row.contradicts]:
                 judgment = replace(wrong[-1], unexplained=poor)
-            found.append(judgment if said.known else replace(judgment, believed=_belief(judgment, common)))
-        return found
+            judgments.append(
+                judgment if specified.known else replace(judgment, believed=_belief(judgment, common))
+            )
+        return judgments
 
     def _judged(self, fit: Tensor) -> list[Judgment]:
         """What one fit [P, 8] says of each picture."""
@@ -269,11 +271,11 @@ class Polarizers:
     def _unexplained(self) -> list[float]:
         """Of each picture what ``Judgment.unexplained`` says; 0 where there was nothing to go by."""
         assert self.table is not None
-        misfit, across, told = self.table[-1, :, -3:].unbind(1)
-        known = told > 0
-        middle = misfit[known].median() if bool(known.any()) else misfit.new_ones(())
+        misfit, across, counted = self.table[-1, :, -3:].unbind(1)
+        measured = counted > 0
+        middle = misfit[measured].median() if bool(measured.any()) else misfit.new_ones(())
         relative = misfit**2 / (middle * across).clamp(min=1e-12)
-        values: list[float] = torch.where(known, relative, torch.zeros_like(relative)).tolist()
+        values: list[float] = torch.where(measured, relative, torch.zeros_like(relative)).tolist()
         return values
 
     def _common_gain(self) -> float | None:
@@ -309,13 +311,13 @@ def search_steps(recipe: Recipe, settings: ResolvedSettings) -> int:
 
 def _belief(judgment: Judgment, common: float | None) -> Exposure:
     """What is believed of a picture of which nothing is said: a photograph where there is no angle to believe."""
-    said = judgment.said
+    specified = judgment.said
     if judgment.unfiltered:
-        return replace(said, filtered=False)
+        return replace(specified, filtered=False)
     if not judgment.guesses:
-        return said
-    gain = said.gain if common is None else said.gain * judgment.gain / common
-    return found_exposure(said, judgment.angle, gain)
+        return specified
+    gain = specified.gain if common is None else specified.gain * judgment.gain / common
+    return found_exposure(specified, judgment.angle, gain)
 
 
 def mean_angle(angles: Sequence[float], spreads: Sequence[float], least_spread: float) -> tuple[float, float]:

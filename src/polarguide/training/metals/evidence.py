@@ -37,24 +37,24 @@ from polarguide.training.metals.observations import Seen, evenly, said_by, seen_
 from polarguide.training.rules import MetalRules
 
 
-def _relative(seen: Seen, dark: float) -> tuple[Tensor, Tensor]:
+def _relative(samples: Seen, dark: float) -> tuple[Tensor, Tensor]:
     """Weights [V, N, 3] of squares, and what their sums over the views are relative to [N, 3]."""
-    above = seen.s0.clamp(min=0) + dark  # the variance of light that is counted grows with the light
-    weight = seen.weight[..., None] / above
+    above = samples.s0.clamp(min=0) + dark  # the variance of light that is counted grows with the light
+    weight = samples.weight[..., None] / above
     return weight, (weight * above * above).sum(dim=0).clamp(min=1e-9)
 
 
-def residuals(seen: Seen, refractive_index: float, rules: MetalRules) -> tuple[Tensor, Tensor, Tensor]:
+def residuals(samples: Seen, refractive_index: float, rules: MetalRules) -> tuple[Tensor, Tensor, Tensor]:
     """Mean squares of the relative residuals of a dielectric and of a metal [N], and the metal's reflectance [N, 3]."""
-    s0, across, cosine = seen.s0, seen.across, seen.cosine[..., None]
+    s0, across, cosine = samples.s0, samples.across, samples.cosine[..., None]
     sine2 = 1 - cosine * cosine
-    weight, scale = _relative(seen, rules.dark)
+    weight, scale = _relative(samples, rules.dark)
     specular, diffuse = (slope * sine2 for slope in optics.dolp_slopes(cosine, refractive_index))
     seen_body, of_body = specular * s0 - across, specular + diffuse
     by_line = weight / (1 + specular * specular)
     body = (by_line * of_body * seen_body).sum(dim=0) / (by_line * of_body**2).sum(dim=0).clamp(min=1e-9)
     misfit = (by_line * (seen_body - of_body * body.clamp(min=0)) ** 2).sum(dim=0) / scale
-    color = (seen.weight[..., None] * s0).sum(dim=0)
+    color = (samples.weight[..., None] * s0).sum(dim=0)
     color = (color / color.amax(dim=1, keepdim=True).clamp(min=1e-6)).clamp(min=0.05)
     best = torch.full_like(misfit[:, 0], torch.inf)
     fitted = torch.zeros_like(color)
@@ -70,10 +70,10 @@ def residuals(seen: Seen, refractive_index: float, rules: MetalRules) -> tuple[T
     return misfit.mean(dim=1), best, fitted
 
 
-def oblique_light(seen: Seen, dark: float) -> Tensor:
+def oblique_light(samples: Seen, dark: float) -> Tensor:
     """Mean squares [N] of the polarization at 45 degrees to the plane of incidence, relative like the residuals."""
-    weight, scale = _relative(seen, dark)
-    return ((weight * seen.oblique**2).sum(dim=0) / scale).mean(dim=1)
+    weight, scale = _relative(samples, dark)
+    return ((weight * samples.oblique**2).sum(dim=0) / scale).mean(dim=1)
 
 
 CHUNK = 1 << 14
@@ -139,7 +139,7 @@ def evidence(
 
     Views whose pictures do not determine the Stokes vector say what the user says of materials in them, no more.
     """
-    said = said_by(gaussians, views, rasterize, memory)
+    labels = said_by(gaussians, views, rasterize, memory)
     explained = None
     if measured := evenly([view for view in views if view.is_determined], rules.most_views):
         looks = seen_by(gaussians, memory.between(measured), rasterize, rules)
@@ -148,8 +148,8 @@ def evidence(
     memory.clear()
     near, alike = _neighborhoods(gaussians, rules.neighbors)
     if explained is None:
-        return _nothing_measured(near, alike, said)
-    return _of_neighbors(explained, near, alike, said, rules)
+        return _nothing_measured(near, alike, labels)
+    return _of_neighbors(explained, near, alike, labels, rules)
 
 
 def _chunks(count: int) -> list[slice]:
@@ -171,60 +171,60 @@ def _neighborhoods(gaussians: Parameters, most: int) -> tuple[Tensor, Tensor]:
     near = torch.empty(len(places), count, dtype=torch.int64, device=means.device)
     alike = means.new_empty(len(places), count)
     for chunk in _chunks(len(places)):
-        found = torch.from_numpy(tree.query(places[chunk], k=count)[1])
-        near[chunk] = found.view(-1, count).to(means.device)
+        neighbors = torch.from_numpy(tree.query(places[chunk], k=count)[1])
+        near[chunk] = neighbors.view(-1, count).to(means.device)
         alike[chunk] = dot(axes[chunk, None], axes[near[chunk]]) ** 4
     return near, alike
 
 
-def _nothing_measured(near: Tensor, alike: Tensor, said: Tensor) -> Evidence:
+def _nothing_measured(near: Tensor, alike: Tensor, labels: Tensor) -> Evidence:
     """Evidence of the user's words alone."""
-    none = said.new_zeros(len(said))
-    gray = said.new_full((len(said), 3), FIRST_REFLECTANCE)
-    return Evidence(none, none, gray, near, alike, none, none, none, none, none, said)
+    none = labels.new_zeros(len(labels))
+    gray = labels.new_full((len(labels), 3), FIRST_REFLECTANCE)
+    return Evidence(none, none, gray, near, alike, none, none, none, none, none, labels)
 
 
 def _explained(looks: Sequence[Tensor], refractive_index: float, rules: MetalRules) -> _Explained:
     """Explanations of all Gaussians, of which ``looks`` are ``seen_by``."""
     parts = []
     for chunk in _chunks(len(looks[0])):
-        seen = seen_of(looks, chunk, rules)
-        total = seen.weight.sum(dim=0)
-        effective = total * total / (seen.weight**2).sum(dim=0).clamp(min=1e-9)
-        color = (seen.weight[..., None] * seen.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
-        known = total.clamp(max=20) * (effective > rules.least_views)
-        fitted = residuals(seen, refractive_index, rules)
-        parts.append(_Explained(*fitted, oblique_light(seen, rules.dark), known, color.clamp(min=0)))
+        samples = seen_of(looks, chunk, rules)
+        total = samples.weight.sum(dim=0)
+        effective = total * total / (samples.weight**2).sum(dim=0).clamp(min=1e-9)
+        color = (samples.weight[..., None] * samples.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
+        certainty = total.clamp(max=20) * (effective > rules.least_views)
+        fitted = residuals(samples, refractive_index, rules)
+        parts.append(_Explained(*fitted, oblique_light(samples, rules.dark), certainty, color.clamp(min=0)))
     return _Explained(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 def _of_neighbors(
-    found: _Explained, near: Tensor, alike: Tensor, said: Tensor, rules: MetalRules
+    explained: _Explained, near: Tensor, alike: Tensor, labels: Tensor, rules: MetalRules
 ) -> Evidence:
     """Evidence of what was measured, over neighborhoods in which those of like color count."""
-    known = found.known
-    mean = (found.color * known[:, None]).sum(dim=0) / known.sum().clamp(min=1e-6)
-    tints = found.color / mean.clamp(min=1e-6)
-    color = found.color + rules.dark
+    certainty = explained.known
+    mean = (explained.color * certainty[:, None]).sum(dim=0) / certainty.sum().clamp(min=1e-6)
+    tints = explained.color / mean.clamp(min=1e-6)
+    color = explained.color + rules.dark
     brightness = color.mean(dim=1)
     floor = rules.least_residual
-    ratio = (found.dielectric.clamp(min=floor) / found.metal.clamp(min=floor)).log()
+    ratio = (explained.dielectric.clamp(min=floor) / explained.metal.clamp(min=floor)).log()
     each = (
         ratio,
-        found.dielectric,
-        found.metal,
-        found.oblique,
-        *found.reflectance.unbind(1),
+        explained.dielectric,
+        explained.metal,
+        explained.oblique,
+        *explained.reflectance.unbind(1),
         *tints.unbind(1),
     )
     means, support = [], []
     for chunk in _chunks(len(near)):
         nearest = near[chunk]
         like_color = _like_color(color, chunk, nearest, rules)
-        trust = (known + 1e-6)[nearest] * like_color
+        trust = (certainty + 1e-6)[nearest] * like_color
         whole = trust.sum(dim=1)
         means.append(torch.stack([(values[nearest] * trust).sum(dim=1) / whole for values in each]))
-        support.append((known > rules.least_weight).float()[nearest].mean(dim=1))
+        support.append((certainty > rules.least_weight).float()[nearest].mean(dim=1))
         alike[chunk] *= like_color
     ratio, dielectric, metal, oblique, *rest = torch.cat(means, dim=1)
     tints = torch.stack(rest[3:], dim=1)
@@ -234,12 +234,12 @@ def _of_neighbors(
         reflectance=torch.stack(rest[:3], dim=1),
         near=near,
         alike=alike,
-        brightness=brightness * known.sum() / (brightness * known).sum().clamp(min=1e-6),
+        brightness=brightness * certainty.sum() / (brightness * certainty).sum().clamp(min=1e-6),
         tint=tints.amin(dim=1) / tints.amax(dim=1).clamp(min=1e-6),
         metal_misfit=metal.sqrt(),
         oblique=oblique.sqrt(),
         support=torch.cat(support),
-        said=said,
+        said=labels,
     )
 
 

@@ -69,7 +69,7 @@ def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal:
     assert normal is not None
     view = view.to(device)
     rays = view.camera.rays(device=device)
-    guide, known = guide_normals(view.camera.to_camera(normal), rays, least_normal)
+    guide, reliable = guide_normals(view.camera.to_camera(normal), rays, least_normal)
     s0, s1, s2 = view.stokes()
     x_ref, up_ref = optics.lens_frame(rays)
     x, y = dot(guide, x_ref), dot(guide, up_ref)
@@ -77,7 +77,7 @@ def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal:
     cosine2, sine = ((x * x - y * y) / sine2)[..., None], (2 * x * y / sine2)[..., None]
     across, oblique = -(s1 * cosine2 + s2 * sine), s2 * cosine2 - s1 * sine
     one = torch.ones_like(x)[..., None]
-    good = (known & ~(view.invalid | view.saturated))[..., None]
+    good = (reliable & ~(view.invalid | view.saturated))[..., None]
     target = torch.cat((one, s0, across, oblique, -dot(guide, rays)[..., None]), dim=-1) * good
     return shares(gaussians, view, target.contiguous(), rasterize)
 
@@ -112,17 +112,17 @@ def said_by(
 ) -> Tensor:
     """Weight [N, 2] of the pixels that the user calls dielectric and metal, over the views."""
     means = gaussians["means"].detach()
-    said = means.new_zeros(len(means), 2)
+    labels = means.new_zeros(len(means), 2)
     for view in memory.between(with_words(views)):
-        said += _said_in(gaussians, view, rasterize)
-    return said
+        labels += _said_in(gaussians, view, rasterize)
+    return labels
 
 
 def contradicted(
     gaussians: Parameters,
     views: Iterable[View],
     rasterize: Rasterize,
-    said: Tensor,
+    labels: Tensor,
     rules: MetalRules,
     memory: MemoryBound = UNBOUNDED,
 ) -> dict[str, float]:
@@ -130,18 +130,18 @@ def contradicted(
     which others say anything.
 
     Args:
-        said: by all views, as of ``said_by``.
+        labels: by all views, as of ``said_by``.
     """
-    found = {}
+    views_contradicted = {}
     for view in memory.between(with_words(views)):
         own = _said_in(gaussians, view, rasterize)
-        others = (said - own).clamp(min=0)
+        others = (labels - own).clamp(min=0)
         own = own * (others.sum(dim=1, keepdim=True) > rules.least_weight)
         opposed = (own * (others.flip(1) > others)).sum()
         share = float(opposed / own.sum().clamp(min=1e-6))
         if share > rules.contradicted:
-            found[view.name] = share
-    return dict(sorted(found.items(), key=lambda item: -item[1]))
+            views_contradicted[view.name] = share
+    return dict(sorted(views_contradicted.items(), key=lambda item: -item[1]))
 
 
 def _said_in(gaussians: Parameters, view: View, rasterize: Rasterize) -> Tensor:
@@ -173,22 +173,22 @@ def index_offsets(
         indices: by the number in ``View.materials``. refractive_index: of the run.
     """
     means = gaussians["means"].detach()
-    said = {view.name: numbers_in(view) for view in views}
-    numbers = sorted(set().union(*said.values()) & indices.keys())
+    labels = {view.name: numbers_in(view) for view in views}
+    numbers = sorted(set().union(*labels.values()) & indices.keys())
     weights = means.new_zeros(len(means), 1 + len(numbers))
     for view in memory.between(with_words(views)):
         assert view.materials is not None
         kinds = view.materials.to(means.device)
-        here = [number for number in numbers if number in said[view.name]]
+        here = [number for number in numbers if number in labels[view.name]]
         target = torch.stack(((kinds == 1) | (kinds == 2), *(kinds == k for k in here)), dim=-1).float()
         columns = [0, *(1 + numbers.index(number) for number in here)]
         for some, part in zip(_batched(columns), target.split(MAX_CHANNELS, dim=-1), strict=True):
             weights[:, some] += shares(gaussians, view, part.contiguous(), rasterize)
     offsets = means.new_tensor([0.0, *(indices[number] - refractive_index for number in numbers)])
     most, chosen = weights.max(dim=1)
-    given = torch.where(most > LEAST_SEEN, offsets[chosen], torch.zeros_like(most))
+    specified = torch.where(most > LEAST_SEEN, offsets[chosen], torch.zeros_like(most))
     metalness = gaussians.get("metalness")
-    return given if metalness is None else given * (metalness == 0)
+    return specified if metalness is None else specified * (metalness == 0)
 
 
 def numbers_in(view: View) -> set[int]:

@@ -31,7 +31,7 @@ from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import TrainingState
 
 
-def decide(found: Evidence, was: Tensor, allowed: Tensor, rules: MetalRules) -> Tensor:
+def decide(measured: Evidence, was: Tensor, allowed: Tensor, rules: MetalRules) -> Tensor:
     """Which Gaussians are metals, [N] bool: hysteresis thresholding on the graph of neighbors.
 
     Seeds have evidence above ``begin``, or above ``stay`` if they were metals before; the others of those have to join
@@ -41,46 +41,52 @@ def decide(found: Evidence, was: Tensor, allowed: Tensor, rules: MetalRules) -> 
     Args:
         was: [N] bool, metals until now. allowed: [N] bool, those that may be.
     """
-    labeled = found.said.sum(dim=1) > rules.least_weight
-    labeled_metal = labeled & (found.said[:, 1] > found.said[:, 0])
-    allowed = allowed & ~labeled & (found.tint > rules.least_tint)
-    able = allowed & (found.misfit > rules.proceed_misfit) & (found.support > rules.least_support)
-    no_dielectric = found.misfit > rules.begin_misfit
-    surely = labeled_metal | (able & no_dielectric & (found.ratio > rules.begin))
-    begun = surely | (able & was & (found.ratio > rules.stay))
-    metal = _regions(found, surely, begun, able & (found.ratio > rules.proceed), rules)
-    surely = able & no_dielectric & _obliquely(found, rules.begin_oblique)
-    likely = able & _obliquely(found, rules.proceed_oblique)
-    metal |= _regions(found, surely, surely | (was & likely), likely, rules)
+    labeled = measured.said.sum(dim=1) > rules.least_weight
+    labeled_metal = labeled & (measured.said[:, 1] > measured.said[:, 0])
+    allowed = allowed & ~labeled & (measured.tint > rules.least_tint)
+    able = allowed & (measured.misfit > rules.proceed_misfit) & (measured.support > rules.least_support)
+    no_dielectric = measured.misfit > rules.begin_misfit
+    surely = labeled_metal | (able & no_dielectric & (measured.ratio > rules.begin))
+    begun = surely | (able & was & (measured.ratio > rules.stay))
+    metal = _regions(measured, surely, begun, able & (measured.ratio > rules.proceed), rules)
+    surely = able & no_dielectric & _obliquely(measured, rules.begin_oblique)
+    likely = able & _obliquely(measured, rules.proceed_oblique)
+    metal |= _regions(measured, surely, surely | (was & likely), likely, rules)
     # Nothing is known of what hardly any view shows, and its evidence is 0: among metals, it is one.
-    among = allowed & (found.ratio > rules.among)
-    return labeled_metal | _grown(found, metal, among, rules.majority, rules.filling, rules.nearest)
+    among = allowed & (measured.ratio > rules.among)
+    return labeled_metal | _grown(measured, metal, among, rules.majority, rules.filling, rules.nearest)
 
 
-def _obliquely(found: Evidence, limits: Limits) -> Tensor:
+def _obliquely(measured: Evidence, limits: Limits) -> Tensor:
     """Whether so much is polarized at 45 degrees that it tells of metal, and explains the metal's misfit."""
-    much = (found.oblique > limits.oblique) & (found.oblique * found.brightness > limits.light)
-    return much & (found.metal_misfit**2 < limits.times * found.oblique**2) & (found.ratio > limits.ratio)
+    much = (measured.oblique > limits.oblique) & (measured.oblique * measured.brightness > limits.light)
+    return (
+        much
+        & (measured.metal_misfit**2 < limits.times * measured.oblique**2)
+        & (measured.ratio > limits.ratio)
+    )
 
 
-def _regions(found: Evidence, surely: Tensor, metal: Tensor, likely: Tensor, rules: MetalRules) -> Tensor:
+def _regions(measured: Evidence, surely: Tensor, metal: Tensor, likely: Tensor, rules: MetalRules) -> Tensor:
     """Metals [N]: ``metal`` grown over ``likely``, in connected regions with enough seeds that are sure."""
-    metal = _grown(found, metal, likely, rules.crowd, rules.rounds, rules.nearest)
-    metal = metal & (_share_of_nearest(found, metal, rules.nearest) > rules.alone)
-    touching = found.alike[:, : rules.nearest] > rules.touching
-    return metal & _sure_enough(found.near[:, : rules.nearest], touching, metal, surely, rules)
+    metal = _grown(measured, metal, likely, rules.crowd, rules.rounds, rules.nearest)
+    metal = metal & (_share_of_nearest(measured, metal, rules.nearest) > rules.alone)
+    touching = measured.alike[:, : rules.nearest] > rules.touching
+    return metal & _sure_enough(measured.near[:, : rules.nearest], touching, metal, surely, rules)
 
 
-def _share_of_nearest(found: Evidence, metal: Tensor, nearest: int) -> Tensor:
+def _share_of_nearest(measured: Evidence, metal: Tensor, nearest: int) -> Tensor:
     """Share [N] of metals among the nearest of each, by how alike they are."""
-    counts = found.alike[:, :nearest]
-    return (metal[found.near[:, :nearest]] * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1e-6)
+    counts = measured.alike[:, :nearest]
+    return (metal[measured.near[:, :nearest]] * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1e-6)
 
 
-def _grown(found: Evidence, metal: Tensor, likely: Tensor, share: float, rounds: int, nearest: int) -> Tensor:
+def _grown(
+    measured: Evidence, metal: Tensor, likely: Tensor, share: float, rounds: int, nearest: int
+) -> Tensor:
     """``metal`` [N], and what is ``likely`` and has more than this share of metals among its nearest, over and over."""
     for _ in range(rounds):
-        grown = metal | (likely & (_share_of_nearest(found, metal, nearest) > share))
+        grown = metal | (likely & (_share_of_nearest(measured, metal, nearest) > share))
         if bool((grown == metal).all()):
             break
         metal = grown
@@ -122,24 +128,24 @@ def light_gain(
     """
     ratios, pixels = [], 0
     for view in memory.between(evenly(views, rules.gain_views)):
-        shown = view.photograph().to(gaussians["means"].device).flatten(0, 1)
+        photograph = view.photograph().to(gaussians["means"].device).flatten(0, 1)
         metal = render(gaussians, view.camera, rasterize, shading=shading, light=light).metal
-        pixels += len(shown)
+        pixels += len(photograph)
         if metal is None:
             continue
         clear = (metal.share > rules.gain_share) & ~(view.saturated | view.invalid).to(
-            shown.device
+            photograph.device
         ).flatten()[metal.pixels]
         rendered = metal.specular[clear].mean(dim=1) / metal.share[clear]
-        ratios.append(((shown[metal.pixels[clear]].mean(dim=1) + 1e-3) / (rendered + 1e-3)).log())
-    found = torch.cat(ratios) if ratios else gaussians["means"].new_zeros(0)
-    if not len(found) or len(found) < rules.gain_pixels * pixels:
+        ratios.append(((photograph[metal.pixels[clear]].mean(dim=1) + 1e-3) / (rendered + 1e-3)).log())
+    ratio = torch.cat(ratios) if ratios else gaussians["means"].new_zeros(0)
+    if not len(ratio) or len(ratio) < rules.gain_pixels * pixels:
         return 1.0
     body = gaussians["metalness"] == 0
     least = (
-        torch.quantile(shading.strength(gaussians)[body], 0.9) if bool(body.any()) else found.new_tensor(0.1)
+        torch.quantile(shading.strength(gaussians)[body], 0.9) if bool(body.any()) else ratio.new_tensor(0.1)
     )
-    return float(found.median().exp().clamp(min=float(least), max=rules.most_gain))
+    return float(ratio.median().exp().clamp(min=float(least), max=rules.most_gain))
 
 
 class MetalSearch:
@@ -196,9 +202,9 @@ class MetalSearch:
         if not any(view.is_determined or view.materials is not None for view in views):
             return
         gaussians, rasterize = state.gaussians, self._backend.rasterize
-        found = evidence(gaussians, views, rasterize, self._index, self._rules, self._memory)
+        measured = evidence(gaussians, views, rasterize, self._index, self._rules, self._memory)
         if not self._told and (
-            wrong := contradicted(gaussians, views, rasterize, found.said, self._rules, self._memory)
+            wrong := contradicted(gaussians, views, rasterize, measured.said, self._rules, self._memory)
         ):
             self._told = True
             names = listed([f"materials/{name}.png" for name in wrong])
@@ -209,16 +215,23 @@ class MetalSearch:
         centers = torch.stack([view.camera.center for view in self._scene.train_views])
         near = ~far_away(gaussians["means"].detach().cpu(), self._scene.points, centers, self._rules.reach)
         was = gaussians["metalness"] > 0
-        metal = decide(found, was, near.to(was.device), self._rules).float()
-        reflectance = found.reflectance
+        metal = decide(measured, was, near.to(was.device), self._rules).float()
+        reflectance = measured.reflectance
         for values in (metal, reflectance):
             self._ranks.broadcast(values)
-        shown = [view for view in views if view.is_determined]
+        determined = [view for view in views if view.is_determined]
         gain = partial(
-            light_gain, gaussians, state.light, shown, rasterize, self._shading, self._rules, self._memory
+            light_gain,
+            gaussians,
+            state.light,
+            determined,
+            rasterize,
+            self._shading,
+            self._rules,
+            self._memory,
         )
         self._shading.become_metal(gaussians, state.light, metal > 0, reflectance, gain)
-        del found
+        del measured
         self._memory.clear()
 
 
