@@ -71,7 +71,7 @@ def search(scene: Scene, steps: int, first: int, folds: int, fold: int) -> dict[
     rows = [
         [j.view, true[j.view], round(j.angle, 1), round(j.spread, 1), j.doubtful]
         for j in found
-        if not j.said.known
+        if not j.specified.known
     ]
     return {"first": first, "folds": folds, "fold": fold, "seconds": round(time.perf_counter() - began),
             "pictures": rows}  # fmt: skip

@@ -15,7 +15,7 @@ from polarguide.raster.cpu import rasterize_cpu
 from polarguide.training import flat
 from polarguide.training.actions import outward_directions
 from polarguide.training.metals.evidence import evidence
-from polarguide.training.metals.observations import contradicted, said_by
+from polarguide.training.metals.observations import contradicted, label_weights
 from polarguide.training.rules import MetalRules
 from tests.helpers.metal_balls import gaussians_of_the_ball, views_of
 
@@ -52,7 +52,7 @@ def of_metals(views: list[View], memory: Held) -> None:
 
 
 def of_words(views: list[View], memory: Held) -> None:
-    said_by(GAUSSIANS, views, memory.works(rasterize_cpu), memory)
+    label_weights(GAUSSIANS, views, memory.works(rasterize_cpu), memory)
 
 
 def of_contradictions(views: list[View], memory: Held) -> None:

@@ -16,7 +16,7 @@ from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.shading.metal import any_nonzero
 from polarguide.training.metals.evidence import evidence
-from polarguide.training.metals.observations import contradicted, said_by
+from polarguide.training.metals.observations import contradicted, label_weights
 from polarguide.training.metals.search import decide
 from polarguide.training.rules import MetalRules
 from polarguide.training.settings import TrainSettings
@@ -119,7 +119,9 @@ def test_who_contradicts_whom() -> None:
     half[:, half.shape[1] // 2 :][half[:, half.shape[1] // 2 :] == 2] = 1
     views[4] = dataclasses.replace(views[4], materials=None)
     of_the_ball = gaussians_of_the_ball()
-    found = contradicted(of_the_ball, views, rasterize_cpu, said_by(of_the_ball, views, rasterize_cpu), RULES)
+    found = contradicted(
+        of_the_ball, views, rasterize_cpu, label_weights(of_the_ball, views, rasterize_cpu), RULES
+    )
     assert list(found) == ["v03"]
     assert 0.35 < found["v03"] < 0.65
     # Of two that say opposite things, each is contradicted by the other wherever both see the ball.
@@ -128,7 +130,7 @@ def test_who_contradicts_whom() -> None:
         for k, kind in ((0, 1), (1, 2))
     ]
     found = contradicted(
-        of_the_ball, opposed, rasterize_cpu, said_by(of_the_ball, opposed, rasterize_cpu), RULES
+        of_the_ball, opposed, rasterize_cpu, label_weights(of_the_ball, opposed, rasterize_cpu), RULES
     )
     assert min(found["v00"], found["v01"]) > 0.99
 

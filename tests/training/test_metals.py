@@ -8,7 +8,7 @@ from torch import Tensor
 
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.training.metals.evidence import Evidence, evidence, residuals
-from polarguide.training.metals.observations import Seen
+from polarguide.training.metals.observations import ViewSamples
 from polarguide.training.metals.search import decide
 from polarguide.training.rules import MetalRules
 from tests.helpers.metal_balls import BODIES, METALS, gaussians_of_the_ball, measured, views_of
@@ -22,7 +22,7 @@ def test_the_right_explanation_leaves_less(material: str) -> None:
     cosine = 0.35 + 0.6 * torch.rand(24, 40, generator=generator)
     seen = 0.1 + torch.rand(24, 40, 1, generator=generator).expand(24, 40, 3)
     s0, across, _ = measured(material, cosine, seen)
-    found = residuals(Seen(torch.ones(24, 40), s0, across, torch.zeros_like(s0), cosine), 1.5, RULES)
+    found = residuals(ViewSamples(torch.ones(24, 40), s0, across, torch.zeros_like(s0), cosine), 1.5, RULES)
     dielectric, metal, reflectance = found
     if material in METALS:
         assert bool((metal < 0.1 * dielectric).all())
@@ -99,7 +99,7 @@ def said(count: int, **values: Tensor) -> Evidence:
         metal_misfit=torch.full((count,), 0.1),
         oblique=torch.zeros(count),
         support=torch.ones(count),
-        said=torch.zeros(count, 2),
+        labels=torch.zeros(count, 2),
     )
     return given._replace(**values)
 
@@ -108,7 +108,7 @@ def test_what_is_too_deeply_colored_is_no_metal_unless_the_user_says_so() -> Non
     ratio, tint, words = torch.full((60,), 3.0), torch.full((60,), 0.3), torch.zeros(60, 2)
     tint[20:] = 0.2
     words[50:, 1] = 5.0
-    found = said(60, ratio=ratio, tint=tint, said=words)
+    found = said(60, ratio=ratio, tint=tint, labels=words)
     nothing = torch.zeros(60, dtype=torch.bool)
     assert decide(found, nothing, ~nothing, RULES).nonzero()[:, 0].tolist() == [*range(20), *range(50, 60)]
     assert not bool(decide(found, ~nothing, ~nothing, RULES)[20:50].any())
@@ -188,6 +188,6 @@ def test_what_the_user_says_counts() -> None:
     ratio[5:35] = 3.0
     words[18:60, 0] = 5.0
     words[50:53] = torch.tensor([1.0, 5.0])
-    found = said(60, ratio=ratio, said=words)
+    found = said(60, ratio=ratio, labels=words)
     nothing = torch.zeros(60, dtype=torch.bool)
     assert decide(found, nothing, ~nothing, RULES).nonzero()[:, 0].tolist() == [*range(5, 18), 50, 51, 52]

@@ -23,7 +23,7 @@ BEHIND_SCALE = 8.0
 
 
 @dataclass(frozen=True, eq=False)
-class Marched:
+class RaySamples:
     """What N rays see, each with S samples.
 
     Attributes:
@@ -63,7 +63,7 @@ def march(
     *,
     generator: torch.Generator | None = None,
     kept: Callable[[Tensor], Tensor] | None = None,
-) -> Marched:
+) -> RaySamples:
     """Look along rays.
 
     Args:
@@ -96,7 +96,7 @@ def march(
     if kept is None:
         color = color + through[:, -1:] * _behind(field, origin, direction, sampling.background, generator)
     shape = (count, fine, 3)
-    return Marched(color, along, weights, places, geometry.slope.view(shape), normals.view(shape))
+    return RaySamples(color, along, weights, places, geometry.slope.view(shape), normals.view(shape))
 
 
 def trace(field: Field, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:

@@ -24,7 +24,7 @@ Kept = Callable[[Tensor], Tensor]
 """Which places [N, 3] of the scene are shown, [N] bool."""
 
 
-class _Seen(NamedTuple):
+class _RayPixels(NamedTuple):
     """Of N rays: shown color [N, 3], normal [N, 3], opacity [N], and distance [N]."""
 
     color: Tensor
@@ -92,7 +92,7 @@ class FieldModel:
             camera: any. normals: they come with the colors. surface: its depth is that of the surface in any case.
             kept: see ``Kept``; None: all, with what lies behind.
         """
-        batches = [self._seen(*rays, depth, kept) for rays in self._rays(camera)]
+        batches = [self._ray_pixels(*rays, depth, kept) for rays in self._rays(camera)]
         color, normal, opacity, distance = (torch.cat(parts) for parts in zip(*batches, strict=True))
         size = (camera.height, camera.width)
         final = srgb_decode(color).view(*size, 3)
@@ -152,7 +152,7 @@ class FieldModel:
         center = self.field.region.inner(camera.pose(directions.dtype, self.device).center)
         return [(center.expand(len(part), 3), part) for part in directions.split(CHUNK)]
 
-    def _seen(self, origin: Tensor, direction: Tensor, depth: bool, kept: Kept | None) -> _Seen:
+    def _ray_pixels(self, origin: Tensor, direction: Tensor, depth: bool, kept: Kept | None) -> _RayPixels:
         region = self.field.region
         inside = None if kept is None else lambda inner: kept(region.world(inner))
         marched = march(self.field, origin, direction, self.recipe.sampling, kept=inside)
@@ -160,4 +160,4 @@ class FieldModel:
         if depth:
             traced, hit = trace(self.field, origin, direction)
             distance = torch.where(hit & (kept is None), traced, distance)
-        return _Seen(marched.color, marched.normal, marched.opacity, distance)
+        return _RayPixels(marched.color, marched.normal, marched.opacity, distance)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from polarguide.capture import Scene, View
 from polarguide.fields import losses
-from polarguide.fields.march import Marched, march
+from polarguide.fields.march import RaySamples, march
 from polarguide.fields.recipe import NeuralRecipe
 from polarguide.fields.state import FieldState
 from polarguide.geometry.camera import Camera
@@ -161,7 +161,7 @@ class FieldTrainer:
     def _loss(
         self,
         color: Tensor,
-        marched: Marched,
+        marched: RaySamples,
         camera: Camera,
         rays: Tensor,
         pixels: Tensor,
@@ -180,7 +180,7 @@ class FieldTrainer:
         return loss
 
     def _guidance(
-        self, marched: Marched, camera: Camera, rays: Tensor, pixels: Tensor, target: Target
+        self, marched: RaySamples, camera: Camera, rays: Tensor, pixels: Tensor, target: Target
     ) -> Tensor:
         """The published Gaussians of normals, at the heaviest samples of each ray."""
         heaviest = marched.weights.detach().topk(self.recipe.sampling.neighbors, dim=1).indices
@@ -203,7 +203,7 @@ class FieldTrainer:
             circular=self.recipe.weights.circular,
         )
 
-    def _neighbors(self, marched: Marched, camera: Camera, rays: Tensor, chosen: Tensor) -> Tensor:
+    def _neighbors(self, marched: RaySamples, camera: Camera, rays: Tensor, chosen: Tensor) -> Tensor:
         """Places [N, K, 6, 3] around chosen samples [N, K]: four a pixel away both ways, two along the ray."""
         places = marched.places.gather(1, chosen[..., None].expand(-1, -1, 3))
         width = (marched.along.gather(1, chosen) / camera.fx)[..., None]

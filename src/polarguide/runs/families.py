@@ -57,14 +57,14 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
             if judged is None:
                 lines.append((file, view.name, exposure, None, ""))
                 continue
-            note = "doubtful" if judged.doubtful and not judged.said.known else ""
+            note = "doubtful" if judged.doubtful and not judged.specified.known else ""
             lines.append((file, view.name, judged.believed, judged.modulation, note))
     write_text(out / TABLE, table_text(lines))
 
     def named(chosen: Sequence[Judgment]) -> str:
         return f"{len(chosen)} of {len(judgments)} pictures ({listed([_name(names, j) for j in chosen])})"
 
-    sought = [judgment for judgment in judgments if not judgment.said.known]
+    sought = [judgment for judgment in judgments if not judgment.specified.known]
     if sought:
         fitted = sum(judgment.believed.angle is not None for judgment in sought)
         doubtful = sum(judgment.doubtful for judgment in sought)
@@ -92,7 +92,7 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
         reporter.warn(
             f"{named(plain)} look as if taken without a filter, or through a circular one mounted the wrong way round."
         )
-    specified = [judgment for judgment in judgments if judgment.said.angle is not None]
+    specified = [judgment for judgment in judgments if judgment.specified.angle is not None]
     if specified and all(judgment.limit >= ANY for judgment in specified):
         reporter.say(
             f"known angles were not checked: the model predicts polarization too poorly (pictures look "
@@ -103,7 +103,7 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
         first = wrong[0]
         reporter.warn(
             f"{named(wrong)} contradict their angles: {_name(names, first)} is specified at "
-            f"{first.said.words} degrees and looks as if at {first.angle:.0f}. Correct angles.csv."
+            f"{first.specified.words} degrees and looks as if at {first.angle:.0f}. Correct angles.csv."
         )
 
 

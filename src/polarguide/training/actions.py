@@ -101,7 +101,7 @@ def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: 
     return total
 
 
-class Touched(NamedTuple):
+class PixelCounts(NamedTuple):
     """What training pictures show of each Gaussian.
 
     Attributes:
@@ -114,7 +114,7 @@ class Touched(NamedTuple):
     most: Tensor
 
 
-def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: Rasterize) -> Touched:
+def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: Rasterize) -> PixelCounts:
     """What pictures from some cameras show of each Gaussian.
 
     Args:
@@ -133,7 +133,7 @@ def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: 
         pixels = features.grad[:, 0]
         views += (pixels >= LEAST_PIXELS).float()
         most = torch.maximum(most, pixels)
-    return Touched(views, most)
+    return PixelCounts(views, most)
 
 
 class DensityControl:

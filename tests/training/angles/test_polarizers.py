@@ -163,7 +163,7 @@ def test_a_guess_is_better_than_a_photograph(tmp_path: Path) -> None:
     found = polarizers.judgments()
     assert [found[k].vague for k in (sure, guessed, lost)] == [False, True, True]
     assert found[guessed].believed.angle == pytest.approx(found[guessed].angle)
-    assert found[lost].believed == found[lost].said
+    assert found[lost].believed == found[lost].specified
     # One that tells its angle now and then is not mixed with guesses.
     fits[0, guessed, 0] = (fits[0, guessed, 0] + 50.0) % 180.0
     fits[0, guessed, 3] = 4.0

@@ -38,7 +38,7 @@ class Judgment:
 
     Attributes:
         view, number: the view, and the place of the picture among its exposures.
-        said: what the capture says. believed: what the training goes by.
+        specified: what the capture says. believed: what the training goes by.
         angle: the mean of the fits that tell one, or else of those that guess one, degrees.
         gain, modulation, spread, doubt, misfit, misfit_across: of the last of these, see ``FittedAngle``.
         scatter: of the angles about their mean, degrees; 90 where less than half of the fits have one.
@@ -50,7 +50,7 @@ class Judgment:
 
     view: str
     number: int
-    said: Exposure
+    specified: Exposure
     believed: Exposure
     angle: float
     gain: float
@@ -97,7 +97,9 @@ class Judgment:
     @property
     def off(self) -> float:
         """Degrees from what is said to what was fitted, in [-90, 90); 0 where nothing is said."""
-        return 0.0 if self.said.angle is None else (self.angle - self.said.angle + 90.0) % 180.0 - 90.0
+        return (
+            0.0 if self.specified.angle is None else (self.angle - self.specified.angle + 90.0) % 180.0 - 90.0
+        )
 
     @property
     def limit(self) -> float:
@@ -114,7 +116,7 @@ class Judgment:
     @property
     def doubtful(self) -> bool:
         """Whether the angle that the training goes by may well be wrong."""
-        sought = not self.said.known and (not self.tells or self.unsettled or self.poorly_explained)
+        sought = not self.specified.known and (not self.tells or self.unsettled or self.poorly_explained)
         return sought or self.unfiltered or self.contradicts
 
 
@@ -234,7 +236,7 @@ class Polarizers:
         fits = [self._judged(fit) for fit in self._latest()]
         judgments = []
         for rows, poor in zip(zip(*fits, strict=True), self._unexplained(), strict=True):
-            specified = rows[0].said
+            specified = rows[0].specified
             telling = [row for row in rows if row.tells] or [row for row in rows if row.guesses]
             judgment = replace((telling or rows)[-1], unexplained=poor)
             if telling:
@@ -258,7 +260,7 @@ class Polarizers:
             )
             for (view, k), row in zip(self._places, fit.tolist(), strict=True)
         ]
-        offs = [abs(row.off) for row in rows if row.tells and row.said.angle is not None]
+        offs = [abs(row.off) for row in rows if row.tells and row.specified.angle is not None]
         usual = median(offs) if offs else 0.0
         return [replace(row, usual=usual) for row in rows]
 
@@ -311,7 +313,7 @@ def search_steps(recipe: Recipe, settings: ResolvedSettings) -> int:
 
 def _belief(judgment: Judgment, common: float | None) -> Exposure:
     """What is believed of a picture of which nothing is said: a photograph where there is no angle to believe."""
-    specified = judgment.said
+    specified = judgment.specified
     if judgment.unfiltered:
         return replace(specified, filtered=False)
     if not judgment.guesses:

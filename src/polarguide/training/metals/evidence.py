@@ -33,18 +33,20 @@ from polarguide.geometry.vectors import dot
 from polarguide.raster import Rasterize
 from polarguide.shading.metal import FIRST_REFLECTANCE
 from polarguide.shading.model import Parameters
-from polarguide.training.metals.observations import Seen, evenly, said_by, seen_by, seen_of
+from polarguide.training.metals.observations import ViewSamples, evenly, label_weights, samples_of, view_sums
 from polarguide.training.rules import MetalRules
 
 
-def _relative(samples: Seen, dark: float) -> tuple[Tensor, Tensor]:
+def _relative(samples: ViewSamples, dark: float) -> tuple[Tensor, Tensor]:
     """Weights [V, N, 3] of squares, and what their sums over the views are relative to [N, 3]."""
     above = samples.s0.clamp(min=0) + dark  # the variance of light that is counted grows with the light
     weight = samples.weight[..., None] / above
     return weight, (weight * above * above).sum(dim=0).clamp(min=1e-9)
 
 
-def residuals(samples: Seen, refractive_index: float, rules: MetalRules) -> tuple[Tensor, Tensor, Tensor]:
+def residuals(
+    samples: ViewSamples, refractive_index: float, rules: MetalRules
+) -> tuple[Tensor, Tensor, Tensor]:
     """Mean squares of the relative residuals of a dielectric and of a metal [N], and the metal's reflectance [N, 3]."""
     s0, across, cosine = samples.s0, samples.across, samples.cosine[..., None]
     sine2 = 1 - cosine * cosine
@@ -70,7 +72,7 @@ def residuals(samples: Seen, refractive_index: float, rules: MetalRules) -> tupl
     return misfit.mean(dim=1), best, fitted
 
 
-def oblique_light(samples: Seen, dark: float) -> Tensor:
+def oblique_light(samples: ViewSamples, dark: float) -> Tensor:
     """Mean squares [N] of the polarization at 45 degrees to the plane of incidence, relative like the residuals."""
     weight, scale = _relative(samples, dark)
     return ((weight * samples.oblique**2).sum(dim=0) / scale).mean(dim=1)
@@ -97,7 +99,7 @@ class Evidence(NamedTuple):
         oblique: [N] root of the mean square of what is polarized at 45 degrees to the plane of incidence, of the
             neighborhood, relative like the residuals.
         support: [N] share of the neighborhood that enough views show.
-        said: [N, 2] weight of pixels that the user calls dielectric and metal.
+        labels: [N, 2] weight of pixels that the user calls dielectric and metal.
     """
 
     ratio: Tensor
@@ -110,10 +112,10 @@ class Evidence(NamedTuple):
     metal_misfit: Tensor
     oblique: Tensor
     support: Tensor
-    said: Tensor
+    labels: Tensor
 
 
-class _Explained(NamedTuple):
+class _Explanations(NamedTuple):
     """How each of N Gaussians is explained by itself: mean squares of residuals as a dielectric and as a metal, that
     metal's reflectance [N, 3], the mean square at 45 degrees, how much is known of it, and its color [N, 3].
     """
@@ -139,10 +141,10 @@ def evidence(
 
     Views whose pictures do not determine the Stokes vector say what the user says of materials in them, no more.
     """
-    labels = said_by(gaussians, views, rasterize, memory)
+    labels = label_weights(gaussians, views, rasterize, memory)
     explained = None
     if measured := evenly([view for view in views if view.is_determined], rules.most_views):
-        looks = seen_by(gaussians, memory.between(measured), rasterize, rules)
+        looks = view_sums(gaussians, memory.between(measured), rasterize, rules)
         explained = _explained(looks, refractive_index, rules)
         del looks
     memory.clear()
@@ -184,22 +186,24 @@ def _nothing_measured(near: Tensor, alike: Tensor, labels: Tensor) -> Evidence:
     return Evidence(none, none, gray, near, alike, none, none, none, none, none, labels)
 
 
-def _explained(looks: Sequence[Tensor], refractive_index: float, rules: MetalRules) -> _Explained:
-    """Explanations of all Gaussians, of which ``looks`` are ``seen_by``."""
+def _explained(looks: Sequence[Tensor], refractive_index: float, rules: MetalRules) -> _Explanations:
+    """Explanations of all Gaussians, of which ``looks`` are ``view_sums``."""
     parts = []
     for chunk in _chunks(len(looks[0])):
-        samples = seen_of(looks, chunk, rules)
+        samples = samples_of(looks, chunk, rules)
         total = samples.weight.sum(dim=0)
         effective = total * total / (samples.weight**2).sum(dim=0).clamp(min=1e-9)
         color = (samples.weight[..., None] * samples.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
         certainty = total.clamp(max=20) * (effective > rules.least_views)
         fitted = residuals(samples, refractive_index, rules)
-        parts.append(_Explained(*fitted, oblique_light(samples, rules.dark), certainty, color.clamp(min=0)))
-    return _Explained(*(torch.cat(values) for values in zip(*parts, strict=True)))
+        parts.append(
+            _Explanations(*fitted, oblique_light(samples, rules.dark), certainty, color.clamp(min=0))
+        )
+    return _Explanations(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 def _of_neighbors(
-    explained: _Explained, near: Tensor, alike: Tensor, labels: Tensor, rules: MetalRules
+    explained: _Explanations, near: Tensor, alike: Tensor, labels: Tensor, rules: MetalRules
 ) -> Evidence:
     """Evidence of what was measured, over neighborhoods in which those of like color count."""
     certainty = explained.known
@@ -239,7 +243,7 @@ def _of_neighbors(
         metal_misfit=metal.sqrt(),
         oblique=oblique.sqrt(),
         support=torch.cat(support),
-        said=labels,
+        labels=labels,
     )
 
 

@@ -25,7 +25,7 @@ from polarguide.training.priors import guide_normals
 from polarguide.training.rules import MetalRules
 
 
-class Seen(NamedTuple):
+class ViewSamples(NamedTuple):
     """Means over what V views show of each Gaussian: weight [V, N], S0, P, the polarization at 45 degrees to both
     [V, N, 3], cosine of the zenith [V, N].
     """
@@ -37,11 +37,11 @@ class Seen(NamedTuple):
     cosine: Tensor
 
 
-def seen_by(
+def view_sums(
     gaussians: Parameters, views: Iterable[View], rasterize: Rasterize, rules: MetalRules
 ) -> list[Tensor]:
-    """Sums [N, 11] over the pixels of each view, all of which determine the Stokes vector. ``seen_of`` tells what they
-    say of some of the Gaussians.
+    """Sums [N, 11] over the pixels of each view; every view has to determine the Stokes vector. ``samples_of`` turns
+    them into means.
     """
     return [_look(gaussians, view, rasterize, rules.least_normal) for view in views]
 
@@ -82,7 +82,7 @@ def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal:
     return shares(gaussians, view, target.contiguous(), rasterize)
 
 
-def seen_of(looks: Sequence[Tensor], which: slice, rules: MetalRules) -> Seen:
+def samples_of(looks: Sequence[Tensor], which: slice, rules: MetalRules) -> ViewSamples:
     """Means of the sums of some Gaussians, with the weight of views that count."""
     sums = torch.stack([look[which] for look in looks])
     weight = sums[..., 0]
@@ -90,7 +90,7 @@ def seen_of(looks: Sequence[Tensor], which: slice, rules: MetalRules) -> Seen:
     cosine = means[..., 9].clamp(0, 1)
     counts = weight > rules.least_share * weight.amax(dim=0)
     counts &= (cosine > rules.cosines[0]) & (cosine < rules.cosines[1])
-    return Seen(weight * counts, means[..., :3], means[..., 3:6], means[..., 6:9], cosine)
+    return ViewSamples(weight * counts, means[..., :3], means[..., 3:6], means[..., 6:9], cosine)
 
 
 def metalness_share(gaussians: Parameters, camera: Camera, rasterize: Rasterize) -> Tensor | None:
@@ -102,19 +102,19 @@ def metalness_share(gaussians: Parameters, camera: Camera, rasterize: Rasterize)
         return rasterize(splats(gaussians, metalness[:, None]), camera).features[..., 0]
 
 
-def with_words(views: Iterable[View]) -> list[View]:
+def labeled_views(views: Iterable[View]) -> list[View]:
     """Those of the views in which the user names materials."""
     return [view for view in views if view.materials is not None]
 
 
-def said_by(
+def label_weights(
     gaussians: Parameters, views: Iterable[View], rasterize: Rasterize, memory: MemoryBound = UNBOUNDED
 ) -> Tensor:
     """Weight [N, 2] of the pixels that the user calls dielectric and metal, over the views."""
     means = gaussians["means"].detach()
     labels = means.new_zeros(len(means), 2)
-    for view in memory.between(with_words(views)):
-        labels += _said_in(gaussians, view, rasterize)
+    for view in memory.between(labeled_views(views)):
+        labels += _labels_in(gaussians, view, rasterize)
     return labels
 
 
@@ -130,11 +130,11 @@ def contradicted(
     which others say anything.
 
     Args:
-        labels: by all views, as of ``said_by``.
+        labels: by all views, as of ``label_weights``.
     """
     views_contradicted = {}
-    for view in memory.between(with_words(views)):
-        own = _said_in(gaussians, view, rasterize)
+    for view in memory.between(labeled_views(views)):
+        own = _labels_in(gaussians, view, rasterize)
         others = (labels - own).clamp(min=0)
         own = own * (others.sum(dim=1, keepdim=True) > rules.least_weight)
         opposed = (own * (others.flip(1) > others)).sum()
@@ -144,7 +144,7 @@ def contradicted(
     return dict(sorted(views_contradicted.items(), key=lambda item: -item[1]))
 
 
-def _said_in(gaussians: Parameters, view: View, rasterize: Rasterize) -> Tensor:
+def _labels_in(gaussians: Parameters, view: View, rasterize: Rasterize) -> Tensor:
     assert view.materials is not None
     kinds = view.materials.to(gaussians["means"].device)
     target = torch.stack(((kinds == 1) | (kinds > 2), kinds == 2), dim=-1).float()
@@ -176,7 +176,7 @@ def index_offsets(
     labels = {view.name: numbers_in(view) for view in views}
     numbers = sorted(set().union(*labels.values()) & indices.keys())
     weights = means.new_zeros(len(means), 1 + len(numbers))
-    for view in memory.between(with_words(views)):
+    for view in memory.between(labeled_views(views)):
         assert view.materials is not None
         kinds = view.materials.to(means.device)
         here = [number for number in numbers if number in labels[view.name]]

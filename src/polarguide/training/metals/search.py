@@ -41,8 +41,8 @@ def decide(measured: Evidence, was: Tensor, allowed: Tensor, rules: MetalRules) 
     Args:
         was: [N] bool, metals until now. allowed: [N] bool, those that may be.
     """
-    labeled = measured.said.sum(dim=1) > rules.least_weight
-    labeled_metal = labeled & (measured.said[:, 1] > measured.said[:, 0])
+    labeled = measured.labels.sum(dim=1) > rules.least_weight
+    labeled_metal = labeled & (measured.labels[:, 1] > measured.labels[:, 0])
     allowed = allowed & ~labeled & (measured.tint > rules.least_tint)
     able = allowed & (measured.misfit > rules.proceed_misfit) & (measured.support > rules.least_support)
     no_dielectric = measured.misfit > rules.begin_misfit
@@ -204,7 +204,7 @@ class MetalSearch:
         gaussians, rasterize = state.gaussians, self._backend.rasterize
         measured = evidence(gaussians, views, rasterize, self._index, self._rules, self._memory)
         if not self._told and (
-            wrong := contradicted(gaussians, views, rasterize, measured.said, self._rules, self._memory)
+            wrong := contradicted(gaussians, views, rasterize, measured.labels, self._rules, self._memory)
         ):
             self._told = True
             names = listed([f"materials/{name}.png" for name in wrong])
