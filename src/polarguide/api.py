@@ -147,7 +147,7 @@ def priors(
     shots: ShotOptions = ShotOptions(),
     reporter: Reporter = SILENT,
 ) -> Path:
-    """What polarization says about views of a scene: pictures and a contact sheet, and maps if ``formats`` are given.
+    """Polarization priors of views of a scene: pictures and a contact sheet, and maps if ``formats`` are given.
 
     All of it is of the scene's views as they are: with their masks, exposures and size. ``shot_priors`` is the same for
     files of a camera.
@@ -194,7 +194,7 @@ def shot_priors(
     intrinsics: str | None = None,
     reporter: Reporter = SILENT,
 ) -> WrittenShots:
-    """What polarization says about single shots, without poses: all maps of every shot (``shots.write.write_shots``).
+    """Polarization maps of single shots, without poses: all maps of every shot (``shots.write.write_shots``).
 
     Args:
         paths: files and folders of shots as ``find_shots`` takes them.
@@ -252,7 +252,7 @@ def inspect(
         out: folder to write; SCENE-inspection beside the scene by default.
         settings: how to inspect.
         device: what its short training computes on.
-        reporter: told how far it is.
+        reporter: receives progress.
 
     Raises:
         PolarguideError: the scene cannot be read.

@@ -94,7 +94,7 @@ class Exposure:
 
     @property
     def words(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return "no filter" if not self.filtered else "unknown" if self.angle is None else f"{self.angle:g}"
 
 

@@ -51,7 +51,7 @@ DESCRIPTION = (
 
 
 def function_of(verb: str) -> Callable[..., Any]:
-    """What a verb calls; its signature and docstring are the verb's options and help."""
+    """The function behind a verb; its signature and docstring are the verb's options and help."""
     module = importlib.import_module(f"polarguide.cli.{VERBS[verb]}")
     function: Callable[..., Any] = getattr(module, VERBS[verb])
     # Options that several verbs share are the fields of dataclasses, and are called as these are.

@@ -146,7 +146,7 @@ class Lines:
 
 
 class ConsoleReporter(Reporter):
-    """What work reports, printed. Bars disappear at the end, but for those with a note."""
+    """Prints what an operation reports. Bars disappear at the end, except those with a note."""
 
     def say(self, text: str) -> None:
         """Print a finding; brackets in it are shown as they are."""
@@ -233,7 +233,7 @@ RunFolder = Annotated[Path, tyro.conf.Positional]
 
 
 def opened(run: Path, compute: ThreadOptions) -> tuple[Run, ConsoleReporter]:
-    """A run with what it is to be computed on, the CPU where nothing else can be asked for; and the console."""
+    """The opened run, on the device of the options (the CPU without such an option), and the console."""
     use_threads(compute.threads)
     reporter = ConsoleReporter()
     device = compute.device if isinstance(compute, ComputeOptions) else "cpu"

@@ -25,7 +25,7 @@ def inspect(
     settings: Annotated[InspectSettings, tyro.conf.arg(name="")],
     compute: Annotated[ComputeOptions, tyro.conf.arg(name="")],
 ) -> None:
-    """What is right and wrong with a capture: a page, a JSON file, and the order of its angles by geometry.
+    """Check a capture: a page, a JSON file, and the order of its angles by geometry.
 
     Each check ends in ok, warning, wrong or n/a, and says what to do. Works without poses; order, sense and zero of the
     angles take poses. docs/how-to/inspect.md describes the checks and what they cannot decide.

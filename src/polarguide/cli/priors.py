@@ -35,7 +35,7 @@ def priors(
     angles: Annotated[CalibrationOptions, tyro.conf.arg(name="")],
     machine: Annotated[ThreadOptions, tyro.conf.arg(name="")],
 ) -> None:
-    """What polarization says about a shot, many shots or a scene: pictures, numbers and a page.
+    """Polarization maps of a shot, many shots or a scene: pictures, numbers and a page.
 
     S0, DoLP and AoLP with their standard deviations, both separations, polarization normals with the zeniths of their
     candidates, and the pixels that say nothing. A shot is a raw mosaic (with --sensor), four files of a rotating filter

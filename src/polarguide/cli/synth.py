@@ -35,7 +35,7 @@ def synth(
         scene: Name of a preset (docs/how-to/synthesize.md lists them), or path of a scene file in JSON.
         out: Scene folder to write.
         sweep: A family of scenes, such as views=9,18,36,63 or noise=0,1,2,4; also roughness, index and spacing.
-        yes: Do not ask before a rendering that takes more than an hour. Nothing is asked where there is no terminal.
+        yes: Start a rendering of more than an hour without a question. Without a terminal there is no question.
     """
     use_threads(compute.threads)
     spec, reporter = find_scene(scene), ConsoleReporter()

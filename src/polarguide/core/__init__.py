@@ -1,1 +1,1 @@
-"""What every room needs: errors, files, records, options, the machine, progress."""
+"""Shared by all packages: errors, files, records, options, the machine, progress."""

@@ -103,7 +103,7 @@ def _holds_project(folder: Path) -> bool:
 
 
 def _requirements() -> list[tuple[str, str]]:
-    """What the installed metadata requires: (such as ``viser==1.1.*``, the extra or empty); [] without metadata."""
+    """Requirements of the installed metadata: (such as ``viser==1.1.*``, the extra or empty); [] without metadata."""
     metadata = importlib.import_module("importlib.metadata")
     try:
         lines = metadata.requires("polarguide") or []

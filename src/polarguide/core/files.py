@@ -165,7 +165,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def _reason(error: OSError) -> str:
-    """What happened, in words; of a copied folder, what happened to its first file."""
+    """The text of an operating system error; for a copied folder that of its first file."""
     if isinstance(error, shutil.Error) and isinstance(error.args[0], list):
         return str(error.args[0][0][-1])
     return error.strerror or str(error)

@@ -14,7 +14,7 @@ def fits(*tensors: Tensor | None) -> bool:
 
 
 def applied(function: type[torch.autograd.Function], *arguments: Any) -> Any:
-    """What a function gives; its ``ctx.needs_input_grad`` is true only where a gradient can be asked for.
+    """The outputs of an autograd function; its ``ctx.needs_input_grad`` is true only where a gradient can be needed.
 
     Under ``torch.no_grad`` it is true all the same for parameters, for which much would be kept that nobody reads.
     """

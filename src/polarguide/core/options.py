@@ -1,4 +1,4 @@
-"""What commands ask for: how a scene is read, what to compute on. Nothing here imports torch.
+"""Options that commands share: how a scene is read, and the device. Nothing here imports torch.
 
 The command line reads names, types, defaults and texts from these classes.
 """
@@ -90,7 +90,7 @@ def gibibytes(text: str) -> float | None:
 
 
 def index_of(specified: float | None, scene: float | None = None) -> float:
-    """The refractive index that was asked for, else that of ``scene.json``, else ``INDEX``."""
+    """The specified refractive index, else that of ``scene.json``, else ``INDEX``."""
     return next((index for index in (specified, scene) if index is not None), INDEX)
 
 
@@ -134,7 +134,7 @@ class ThreadOptions:
 
 @dataclass(frozen=True)
 class ComputeOptions(ThreadOptions):
-    """What to compute on.
+    """The device and the threads of a computation.
 
     Attributes:
         device: What to compute on; auto takes the GPU where there is one and gsplat is installed.
@@ -148,7 +148,8 @@ class VisitorOptions:
     """Which web pages may talk to the viewer, besides those that it sends itself to an address of its machine.
 
     Attributes:
-        allow_host: Names, such as a tunnel's, by which the viewer may be asked for, besides addresses and localhost.
+        allow_host: Host names, such as a tunnel's, under which the viewer may be opened, besides addresses and
+            localhost.
         allow_origin: Names of sites, such as a proxy, whose pages may talk to the viewer.
     """
 
@@ -158,7 +159,7 @@ class VisitorOptions:
 
 @dataclass(frozen=True)
 class SessionOptions(VisitorOptions, ComputeOptions):
-    """What a training's result does not depend on.
+    """Options of a training on which its result does not depend.
 
     Attributes:
         checkpoint_every: Steps between two checkpoints: a kill loses at most as many.

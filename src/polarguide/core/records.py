@@ -215,7 +215,7 @@ def _kinds(form: Any) -> Any:
 
 
 def _limits(form: Any) -> str:
-    """The range of a number in words; empty where there is none."""
+    """The range of a number as text; empty without a range."""
     for option in _kinds(form):
         least, above, most, below = (getattr(option, name, None) for name in ("ge", "gt", "le", "lt"))
         if least is not None and most is not None:
@@ -229,7 +229,7 @@ def _limits(form: Any) -> str:
 
 
 def _plain(text: str) -> str:
-    """msgspec's names of types in words: `float | null` -> a number or null."""
+    """msgspec's names of types as text: `float | null` -> a number or null."""
 
     def words(match: re.Match[str]) -> str:
         return " or ".join(_WORDS.get(word, word) for word in match[1].split(" | "))

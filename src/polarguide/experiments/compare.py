@@ -277,7 +277,7 @@ def collect(
     """The results of a comparison as far as its runs are.
 
     Args:
-        comparison, scenes, plan: what was asked for.
+        comparison, scenes, plan: the requested comparison.
         failures: last words of runs that failed, by their folders.
     """
     options, settings = comparison.options, comparison.settings

@@ -124,7 +124,7 @@ class Child:
 
 
 class _Progress:
-    """What a reporter is told of many jobs: one piece of work for all, and one for each at work."""
+    """Progress of many jobs: one bar for all, and one for each running job."""
 
     def __init__(self, jobs: Sequence[Job], reporter: Reporter, stack: contextlib.ExitStack) -> None:
         self._reporter, self._total, self._ended = reporter, len(jobs), 0

@@ -1,4 +1,4 @@
-"""What a comparison and a bench are asked for, and the bench as data. Does not import torch."""
+"""Options of a comparison and of the bench, and the bench as data. Does not import torch."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class CompareOptions(SceneOptions):
         threads: Threads of each run.
         speed: At the end time pictures, one run after the other, where that was not done alone before.
         report_views: Test views of each scene in the report; 0 leaves the pictures out.
-        device: What to compute on.
+        device: The device of trainings and renderings.
         against: One of the recipes: tables have the difference of every other one to it.
         exposures: A row for each: as if a scene with four pictures of each view had been captured with four; three (0,
             60, 120 degrees); two at right angles; one; one at an unknown angle; mixed, four of every fourth view and
@@ -133,7 +133,7 @@ class BenchOptions:
         scenes: Some scenes of the half; all if none is given.
         jobs: Runs at a time; 0 takes as many as there are cores for their threads.
         threads: Threads of each run. Rendering takes those of all runs together.
-        device: What to compute on.
+        device: The device of trainings and renderings.
     """
 
     held_back: bool = False
@@ -148,7 +148,7 @@ class BenchOptions:
 
     @property
     def half(self) -> Half:
-        """The half that is asked for."""
+        """The requested half."""
         return "held-back" if self.held_back else "development"
 
     def comparing(self, seeds: int) -> CompareOptions:
@@ -156,7 +156,7 @@ class BenchOptions:
         return CompareOptions(seeds=seeds, jobs=self.jobs, threads=self.threads, device=self.device)
 
     def chosen(self, bench: Bench) -> tuple[str, ...]:
-        """The scenes that are asked for, in the order of the bench.
+        """The requested scenes, in the order of the bench.
 
         Raises:
             PolarguideError: a scene of the other half, or none of the bench.

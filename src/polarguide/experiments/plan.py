@@ -39,7 +39,7 @@ KEY_DIGITS = 10
 
 @dataclass(frozen=True)
 class TableRow:
-    """What a row of the tables is: a recipe, and the pictures that it gets.
+    """A row of the tables: a recipe, and the pictures that it trains on.
 
     Attributes:
         name: as the tables and the run folders call it. steps: where that is not the others' number.
@@ -60,11 +60,11 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What was asked for.
+    """A requested comparison.
 
     Attributes:
         scenes: folders. recipes: the methods, in the order of the tables.
-        settings: of each training, as asked for; the first seed, from which others count up.
+        settings: of each training, as specified; the first seed, from which others count up.
         options: how runs are trained, timed and shown.
         out: folder to write.
         seeds_of: by the name of a recipe, how many seeds where that is not ``options.seeds``.
@@ -88,7 +88,7 @@ class Comparison:
 
     @property
     def rows(self) -> tuple[TableRow, ...]:
-        """What the tables compare, in their order."""
+        """The rows of the tables, in their order."""
         rows = []
         for recipe in self.recipes:
             steps, unpolarized = self.steps_of.get(recipe.name), f"{recipe.name}:unpolarized"
@@ -107,7 +107,7 @@ class Comparison:
         return range(first, first + self.seeds_of.get(recipe.name, self.options.seeds))
 
     def index_of(self, scene: SceneEntry) -> float:
-        """The refractive index of a scene's runs: the one that is asked for, or the scene's own."""
+        """The refractive index of a scene's runs: the specified one, or the scene's own."""
         return index_of(self.settings.refractive_index, scene.refractive_index)
 
     @property
@@ -168,7 +168,7 @@ class PlannedRun:
 
     @property
     def label(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return f"{self.scene.name}, {self.row.name}, seed {self.settings.seed}"
 
     @property

@@ -23,7 +23,7 @@ Scores = dict[str, float | None]
 
 
 class Provenance(msgspec.Struct):
-    """What made the record. ``sources``: digest of the code that trains and scores; ``date``: ISO 8601, UTC."""
+    """How the record was made. ``sources``: digest of the code that trains and scores; ``date``: ISO 8601, UTC."""
 
     version: str
     commit: str | None
@@ -33,7 +33,7 @@ class Provenance(msgspec.Struct):
 
 
 class Settings(msgspec.Struct):
-    """What all runs have in common; ``jobs`` of them worked at a time. ``against``: what others are compared with.
+    """Settings that all runs share; ``jobs`` of them worked at a time. ``against``: what others are compared with.
 
     The first records lack the last ones: surroundings were taken to be there, and metals not sought.
     """
@@ -81,7 +81,7 @@ class RecipeRecord(msgspec.Struct):
 
 
 class PartScores(msgspec.Struct):
-    """What a run scores on an object, or on all objects of a material.
+    """Scores of a run on an object, or on all objects of a material.
 
     ``pixels`` counts those of all test views, ``views`` the test views that show it. ``material`` is the class of
     material, None where it is not known.
@@ -117,7 +117,7 @@ class RunRecord(msgspec.Struct, kw_only=True):
 
 
 class Record(msgspec.Struct):
-    """A comparison: what was asked for, and what every run scores. Tables and differences follow from it.
+    """A comparison: its request, and the scores of every run. Tables and differences follow from it.
 
     Raises:
         PolarguideError: names that occur twice, or runs of other scenes and recipes.

@@ -98,7 +98,7 @@ def write_report(
 
 
 def _health(runs: Sequence[PlannedRun]) -> list[str]:
-    """What trainings say of themselves: what layers rest on, runs alike in a line, and a line for each warning."""
+    """Health of the trainings: the evidence behind the layers (equal runs in one line), and a line for each warning."""
     alike: dict[str, list[str]] = {}
     warnings = []
     for run in runs:
@@ -135,7 +135,7 @@ def _ground_truth_tile(scene: Scene, view: View) -> Tile:
 
 
 def _tile(name: str, run: OpenedRun, view: View, scores: Mapping[str, float | None]) -> Tile:
-    """What a run, called ``name``, shows of one view."""
+    """The pictures of one view by a run called ``name``."""
     result = run.model.render(view.camera, surface=True).to("cpu")
     pictures: dict[str, Picture] = {}
     for layer in ("final", "diffuse", "specular", "normal"):
@@ -224,7 +224,7 @@ def _summary(results: Results) -> str:
 
 
 def _facts(results: Results) -> dict[str, str]:
-    """What stands below the report, by its heading."""
+    """The facts at the end of the report, by heading."""
     record = results.record
     facts = msgspec.to_builtins(record.provenance) | msgspec.to_builtins(record.settings)
     if facts["refractive_index"] is None:

@@ -1,4 +1,4 @@
-"""What a comparison found: its record, and the data frames that follow from it."""
+"""Results of a comparison: its record, and the data frames that follow from it."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class Results:
         return rows
 
     def content(self) -> dict[str, Any]:
-        """What ``results.json`` holds."""
+        """The content of ``results.json``."""
         table = [row._asdict() for row in self.table]
         tables = msgspec.to_builtins({"table": table, "differences": self.compared})
         return {**msgspec.to_builtins(self.record), **tables}

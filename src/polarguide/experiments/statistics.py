@@ -66,7 +66,7 @@ def known_scatter(key: str, black_share: float | None) -> float | None:
 def values_of(
     record: Record, value: Callable[[RunRecord], Mapping[str, float | None]], scenes: Iterable[str] = ()
 ) -> Values:
-    """What ``value`` gives of every run by unit, of the scenes that have any (all, or those that are named)."""
+    """``value`` of every run by unit, of the scenes that have any (all, or those that are named)."""
     recipes = {recipe.name: index for index, recipe in enumerate(record.recipes)}
     seeds = {seed: index for index, seed in enumerate(sorted({run.seed for run in record.runs}))}
     values: Values = {}
@@ -93,7 +93,7 @@ def metric_of_views(metric: Metric) -> Callable[[RunRecord], dict[str, float | N
 
 
 def shared(values: Numbers) -> Numbers:
-    """What several recipes [recipes, seeds, units] all have, of the units that they have with every shared seed.
+    """Values [recipes, seeds, units] that several recipes share: units that all have with every shared seed.
 
     Rows of other seeds are NaN. Without anything in common, no unit is left.
     """

@@ -124,10 +124,11 @@ def scores_section(results: Results) -> Section:
 def leaders(
     means: Mapping[int, float], values: Values, column: Metric, scatter: Sequence[float | None]
 ) -> set[int]:
-    """Which of several recipes have the best mean of a metric, or one that is not told from it.
+    """The recipes whose mean of a metric is the best, or cannot be distinguished from the best.
 
-    A recipe is told from the best by the differences at the same seeds, if they exceed ``training_noise``; where that
-    is not known, by the digits shown. None are where fewer than two have a value, or the metric has no better side.
+    A recipe is distinguished from the best by the differences at the same seeds, if they exceed
+    ``training_noise``; where that is not known, by the displayed digits. There are no
+    leaders where fewer than two recipes have a value, or the metric has no better side.
 
     Args:
         means: shown values, by the place of the recipe. values: what these are means of.
@@ -157,7 +158,7 @@ def _score(row: Row, column: Metric, bold: bool, results: Results) -> TableCell:
 
 
 def seed_counts(results: Results) -> list[int]:
-    """How many seeds were asked for: one number, or several where recipes or scenes differ in it; ascending."""
+    """The requested number of seeds: one number, or several where recipes or scenes differ in it; ascending."""
     return sorted(set(Counter((run.scene, run.recipe) for run in results.record.runs).values()))
 
 
@@ -176,7 +177,7 @@ def _remark(row: Row, results: Results) -> str:
 
 
 def notes(results: Results) -> list[str]:
-    """What a reader of the scores has to know, a sentence each."""
+    """Notes that a reader of the scores needs, a sentence each."""
     counts, record = seed_counts(results), results.record
     number = f"{counts[0]} " if len(counts) == 1 else ""
     stated = {
@@ -206,7 +207,7 @@ def notes(results: Results) -> list[str]:
 
 
 def control_section(results: Results) -> Section:
-    """What polarization buys: a block for every recipe with controls, a row for every scene and one over scenes."""
+    """The gain by polarization: a block for every recipe with controls, a row for every scene and one over scenes."""
     compared = [d for d in results.compared if d["why"] == "control"]
     columns = _columns(compared)
     blocks, stated = [], []
@@ -235,7 +236,7 @@ def control_section(results: Results) -> Section:
 
 
 def against_section(results: Results) -> Section:
-    """Differences to a recipe that was asked for: a block for every scene, a row for every other recipe."""
+    """Differences to a chosen recipe: a block for every scene, a row for every other recipe."""
     against = results.record.settings.against
     compared = [d for d in results.compared if d["why"] == "against"]
     columns = _columns(compared)
@@ -269,7 +270,7 @@ def _row(
     columns: Sequence[Metric],
     letters: Mapping[str, str],
 ) -> TableRow:
-    """The differences of one row; what most of its intervals are over is said once, the others in their cells."""
+    """The differences of one row; the unit of most of its intervals stands once, other units in their cells."""
     by_key = {difference["metric"]: difference for difference in compared}
     units = [_unit(by_key[column.key]) for column in columns if column.key in by_key]
     usual = max(dict.fromkeys(units), key=units.count, default="")
@@ -288,7 +289,7 @@ def _row(
 
 
 def _unit(difference: Mapping[str, Any]) -> str:
-    """What the interval is over; without one, the number of seeds."""
+    """The unit of the interval; without an interval, the number of seeds."""
     seeds = f"{difference['seeds']} seed{'' if difference['seeds'] == 1 else 's'}"
     if difference["over"] is None:
         return f"none, {seeds}"
@@ -359,7 +360,7 @@ def _means(values: Values, column: Metric) -> Iterator[TableCell]:
 def _gains(
     results: Results, values: Values, recipes: Mapping[str, Sequence[str]], column: Metric
 ) -> Iterator[TableCell]:
-    """What polarization buys of every recipe with controls."""
+    """The gain by polarization of every recipe with controls."""
     for recipe, controls in recipes.items():
         gain = None
         if column.better is not None:

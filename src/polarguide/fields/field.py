@@ -54,7 +54,7 @@ class Region:
         return cls((x, y, z), unit, max(1.0, MARGIN * farthest / unit))
 
     def first_radius(self, radius: float) -> float:
-        """Of the sphere that a surface starts as: what is wanted, but no camera stands near it or in it."""
+        """Radius of the initial sphere, clamped so that it stays clear of all cameras."""
         return min(radius, 0.5 * self.radius)
 
     def inner(self, points: Tensor) -> Tensor:
@@ -115,7 +115,7 @@ class Geometry(NamedTuple):
 
 
 class Field(nn.Module):
-    """What rays see, in the coordinates of a ``Region``: lengths in its unit, the origin in its middle.
+    """A field that rays sample, in the coordinates of a ``Region``: lengths in its unit, the origin in its middle.
 
     Attributes:
         region: where it lies. log_sharpness: ln(s) / 10 of the density's logistic function, which is learned.
@@ -218,7 +218,7 @@ class GridField(Field):
 
 
 class Background(nn.Module):
-    """What lies behind the cameras' sphere: density and color in grids, by direction and inverse distance.
+    """The background beyond the cameras' sphere: density and color in grids, by direction and inverse distance.
 
     Args:
         shape: of what it is made. generator: first values are drawn from.

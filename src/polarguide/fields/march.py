@@ -1,4 +1,4 @@
-"""Rays through a field: where to look, and what is seen there (NeuS, Wang et al. 2021)."""
+"""Rays through a field: sample positions, and their colors and weights (NeuS, Wang et al. 2021)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BEHIND_SCALE = 8.0
 
 @dataclass(frozen=True, eq=False)
 class RaySamples:
-    """What N rays see, each with S samples.
+    """Samples of N rays, S each.
 
     Attributes:
         color: shown colors [N, 3] with what lies behind.
@@ -149,7 +149,7 @@ def _samples(
 
 
 def _map_weights(along: Tensor, distance: Tensor, sharpness: float) -> Tensor:
-    """What sections between samples [N, C] weigh in the picture, and a share for what the map may have missed."""
+    """Weights of the sections between samples [N, C], with a share for surfaces that the map may have missed."""
     step = (along[:, 1:] - along[:, :-1]).clamp(min=1e-6)
     middle = 0.5 * (distance[:, 1:] + distance[:, :-1])
     half = 0.5 * (distance[:, 1:] - distance[:, :-1]).minimum(torch.zeros_like(step)).maximum(-10 * step)

@@ -34,7 +34,7 @@ class _RayPixels(NamedTuple):
 
 
 class FieldModel:
-    """What was learned: a signed distance and colors.
+    """A trained field: a signed distance and colors.
 
     Args:
         state: of the training. recipe: the method. device: where layers are rendered.
@@ -86,7 +86,7 @@ class FieldModel:
         surface: bool = False,
         kept: Kept | None = None,
     ) -> RenderResult:
-        """All layers; ``depth`` only if asked for.
+        """All layers; ``depth`` only on request.
 
         Args:
             camera: any. normals: they come with the colors. surface: its depth is that of the surface in any case.

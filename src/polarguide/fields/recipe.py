@@ -1,4 +1,4 @@
-"""What distinguishes one neural recipe from another, as data."""
+"""Neural recipes as data."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class FieldShape:
 
 @dataclass(frozen=True)
 class Sampling:
-    """What a step looks at.
+    """The rays and samples of a step.
 
     Attributes:
         rays: of one view. coarse: samples of a ray, without a gradient, that find the surface; as many again find it
@@ -104,7 +104,7 @@ class NeuralRecipe(Method):
     """A method that learns a field.
 
     Attributes:
-        name: as given to ``--recipe``. about: one line. steps: where nobody says how many.
+        name: as given to ``--recipe``. about: one line. steps: the default number.
     """
 
     name: str

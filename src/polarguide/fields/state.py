@@ -95,7 +95,7 @@ def _given(tensors: Mapping[str, Tensor], name: str) -> Tensor:
 
 
 def _like(own: Tensor, values: Tensor, name: str) -> Tensor:
-    """What was found, if it is finite and in the shape and type of what the recipe makes."""
+    """The values, checked to be finite and of the shape and type that the recipe has."""
     if values.shape != own.shape or values.dtype != own.dtype:
         expected = f"{list(own.shape)}, {own.dtype}"
         raise ValueError(f"{name} of shape {list(values.shape)}, {values.dtype}, not {expected}")

@@ -40,7 +40,7 @@ class Target:
 
 
 def target_of(view: View, store: ViewStore, device: torch.device) -> Target:
-    """What a view is compared with, made once and kept as two bytes a value."""
+    """The target of a view, computed once and stored as two bytes a value."""
 
     def make() -> Entry:
         entry = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(device))}
@@ -104,7 +104,7 @@ class FieldTrainer:
         self.whole = True
 
     def exchange_statistics(self) -> None:
-        """There are none."""
+        """Fields have no statistics to exchange."""
 
     @property
     def total(self) -> int:
@@ -221,7 +221,7 @@ class FieldTrainer:
         return center.expand(len(rays), 3), rays
 
     def _view_of(self, place: int) -> View:
-        """The view at a place in the sequence of all views: every epoch visits each once, in an order of its own."""
+        """The view at a place in the sequence of all views: every epoch visits each once, in a new order."""
         views = self.scene.train_views
         epoch, place = divmod(place, len(views))
         order = torch.randperm(len(views), generator=seeded(self.settings.seed, 4, epoch))

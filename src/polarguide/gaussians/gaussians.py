@@ -94,7 +94,7 @@ class Trained:
 
     @staticmethod
     def _moments(name: str) -> str:
-        """What the names of a tensor's moments begin with."""
+        """The prefix of the names of a tensor's moments."""
         return f"adam.{name}."
 
 

@@ -1,4 +1,4 @@
-"""What the modules of this package share: NumPy arrays in and out, safe arithmetic, window means, argument checks.
+"""Shared by the modules of this package: NumPy arrays in and out, safe arithmetic, window means, argument checks.
 
 The safe functions stay finite, value and gradient, where the plain operation is singular: at the angle of an
 unpolarized pixel, the azimuth of a normal that points at the camera, the square root in a zenith at zero degree

@@ -33,7 +33,7 @@ def choose_backend(
         say: takes lines for the user, such as that kernels are being compiled.
 
     Raises:
-        PolarguideError: CUDA was asked for and there is no GPU, or gsplat or its kernels cannot be had.
+        PolarguideError: CUDA was specified and there is no GPU, or gsplat or its kernels are not available.
     """
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return Backend(torch.device("cpu"), rasterize_cpu)

@@ -23,7 +23,7 @@ WIDTH = 0.02
 
 
 class SurfacePicture(NamedTuple):
-    """What lies around the median depth of each pixel.
+    """The surface around the median depth of each pixel.
 
     Attributes:
         directions: [H, W, 3] mean of the Gaussians' directions, at most unit; zero where there is nothing.
@@ -104,10 +104,10 @@ def alpha_in_front(splats: Splats, camera: Camera, depth: Tensor, rasterize: Ras
 
     Args:
         splats: the Gaussians; features are not read. camera: the view.
-        depth: [H, W] camera depths; pixels with a depth of 0 or less are not asked for. rasterize: of the backend.
+        depth: [H, W] camera depths; pixels with a depth of 0 or less are skipped. rasterize: of the backend.
 
     Returns:
-        [H, W] in [0, 1]; 0 where nothing is blended, or nothing was asked for.
+        [H, W] in [0, 1]; 0 where nothing is blended, and in skipped pixels.
     """
     pose = camera.pose(splats.means.dtype, splats.means.device)
     places = ((splats.means - pose.center) @ pose.rotation[2])[:, None]

@@ -1,7 +1,7 @@
 """Recipes by name: the built-in ones and their ablations, and those of installed plug-ins.
 
 A plug-in is a package with entry points of the group ``polarguide.recipes``. Each names a ``Recipe``, a sequence of
-them, or a function without arguments that returns either. Plug-ins are loaded when a name is asked for that is not
+them, or a function without arguments that returns either. Plug-ins are loaded for a name that is not
 built in, never on import; a run's folder records the recipe's name, and never where its code lies.
 """
 
@@ -112,7 +112,7 @@ def _plugins() -> tuple[dict[str, dict[str, Method]], dict[str, PolarguideError]
 
 @lru_cache
 def _recipes_of(entry: EntryPoint) -> tuple[Method, ...]:
-    """What an entry point offers.
+    """The recipes of an entry point.
 
     Raises:
         PolarguideError: it cannot be loaded, is no recipe, or has the name of a built-in one.

@@ -1,1 +1,1 @@
-"""What is made of a run: pictures, scores and files for other programs."""
+"""Results of a run: pictures, scores and files for other programs."""

@@ -1,4 +1,4 @@
-"""Resolves what nobody specified of a training's settings: from the run to resume, the scene, or its size."""
+"""Resolves open settings of a training from the run to resume, the scene, or its size."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def resolve(
     """The settings of a training, with nothing left open.
 
     Args:
-        settings: as asked for. scene, method: of the training.
+        settings: as specified. scene, method: of the training.
         resumed: settings of the run that is resumed, whose values come before those of the scene and its size.
         processes: how many share the views of a step.
 
@@ -88,7 +88,7 @@ def resolve(
 
 
 def _recorded(resumed: ResolvedSettings) -> dict[str, Any]:
-    """What a run recorded of its settings; the first versions recorded 0, and "auto", for what was open."""
+    """Settings that a run recorded; the first versions recorded 0 and "auto" for open ones."""
     return {name: value for name, value in resumed.specified().items() if value != 0}
 
 
@@ -99,7 +99,7 @@ def _steps(sizes: Sequence[int], method: Method) -> int:
 
 
 def _background(scene: Scene, method: Method) -> Background:
-    """What is behind the subject, by the edges of the pictures; a field takes no notice of it."""
+    """The background behind the subject, by the edges of the pictures; fields ignore it."""
     if isinstance(method, NeuralRecipe):
         return "scene"
     return "black" if has_black_background(scene.train_views) else "scene"

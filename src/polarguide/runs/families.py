@@ -1,4 +1,4 @@
-"""What differs between trainings of Gaussians and of fields: memory, trainer, model, files, and what is examined."""
+"""Differences between trainings of Gaussians and of fields: memory, trainer, model, files, and examined evidence."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
 
     Args:
         out: the run folder. scene: the capture. polarizers: as the training leaves them.
-        reporter: told a summary, and warned of pictures that contradict what is said of them.
+        reporter: receives a summary, and a warning for pictures that contradict their specified angles.
     """
     judgments = polarizers.judgments()
     if not judgments:
@@ -126,7 +126,7 @@ def _name(names: dict[str, list[str]], judgment: Judgment) -> str:
 
 
 class AnyTrainer(Protocol):
-    """What the loop of a training asks for; see ``training.angles.trainer.AngleTrainer``."""
+    """The interface that the training loop uses; see ``training.angles.trainer.AngleTrainer``."""
 
     scene: Scene
     settings: ResolvedSettings
@@ -198,17 +198,17 @@ class Family(ABC):
         reporter: Reporter,
         memory: MemoryBound,
     ) -> AnyTrainer:
-        """What trains; it says what it takes for granted about the scene."""
+        """The trainer; it reports its assumptions about the scene."""
 
     def forecast(
         self, scene: Scene, method: Any, settings: ResolvedSettings, backend: Backend, peak: int
     ) -> Forecast | None:
-        """What the training will take; None: it is not estimated."""
+        """The expected time of the training; None: it is not estimated."""
         return None
 
     @abstractmethod
     def model(self, state: Any, method: Any, settings: ResolvedSettings, backend: Backend) -> Model:
-        """What was learned, for whoever scores or shows it."""
+        """The trained model, for scoring and viewing."""
 
     @abstractmethod
     def finish(self, out: Path, trainer: Any, model: Any, reporter: Reporter) -> None:
@@ -216,7 +216,7 @@ class Family(ABC):
 
     @abstractmethod
     def evidence(self, trainer: Any, method: Any) -> Evidence:
-        """What a finished training is examined by."""
+        """The evidence by which a finished training is examined."""
 
 
 class GaussianFamily(Family):

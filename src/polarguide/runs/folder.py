@@ -1,6 +1,6 @@
 """A run folder: the configuration, atomically written checkpoints, the log, and the exported PLY.
 
-RUN/run.json            what was asked for (scene, recipe, settings), plain JSON
+RUN/run.json            the request (scene, recipe, settings), plain JSON
 RUN/checkpoint.safetensors   everything training needs to go on; at the end, all that rendering needs
 RUN/log.jsonl           one line per logged step
 RUN/point_cloud.ply     for other viewers, at the end
@@ -49,7 +49,7 @@ FOR_STEPS = {"adam", "frozen"}
 
 @dataclass(frozen=True)
 class RunConfiguration:
-    """What defines a run.
+    """The record that defines a run.
 
     Attributes:
         scene: absolute path of the scene folder.

@@ -158,7 +158,7 @@ def too_little(least: int, allowed: int, what: str, less: str) -> PolarguideErro
 
 
 def in_gigabytes(count: int, *, up: bool = True) -> str:
-    """Bytes as gigabytes with one digit, rounded so that what is said to suffice does."""
+    """Bytes as gigabytes with one digit, rounded up, so that the stated number suffices."""
     tenths = count * 10 / GIGABYTE
     return f"{(math.ceil(tenths) if up else math.floor(tenths)) / 10:.1f} GB"
 
@@ -206,7 +206,7 @@ GROWTH = 16
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a training is expected to take.
+    """The expected time of a training.
 
     Attributes:
         seconds: as long as there are as many Gaussians as at the beginning. most_seconds: with ``most`` of them.
@@ -228,7 +228,7 @@ class Forecast:
         )
 
     def truth(self, seconds: float) -> str:
-        """What it took, beside what was expected."""
+        """The measured time, beside the expected one."""
         peak = peak_memory_mib()
         memory = "" if peak is None else f" and {in_gigabytes(int(peak * MEBIBYTE))} of memory"
         least, most = in_words(self.seconds), in_words(self.most_seconds)
@@ -262,7 +262,7 @@ def forecast(
 
 
 def _search_share(scene: Scene, recipe: Recipe, settings: ResolvedSettings) -> float:
-    """What the search for unknown angles adds, over the time of all steps: as many as there are pixels."""
+    """The time that the search for unknown angles adds, as a share of the time of all steps."""
     if not settings.begin_again:
         return 0.0
     steps = Polarizers(scene, recipe, settings.steps, search=search_steps(recipe, settings)).search

@@ -1,4 +1,4 @@
-"""What a finished training says of itself, from training views alone: ``health.json`` of the run folder.
+"""Health of a finished training, from training views alone: ``health.json`` of the run folder.
 
 A training can end normally with a result that nobody should use. Each fact here is a way in which that happens, has a
 limit with a meaning in ``Limits``, and leads to a warning that names views and says what to do.
@@ -77,7 +77,7 @@ class Polarization:
 
     @property
     def word(self) -> Word:
-        """What holds for most of the training views; of two that hold for as many, the one that promises less."""
+        """The evidence of most training views; of two with equally many, the weaker one."""
         counts: dict[Word, int] = {"none": self.none, "fitted": self.fitted, "measured": self.measured}
         return max(counts, key=lambda word: counts[word])
 
@@ -137,7 +137,7 @@ LIMITS = Limits()
 
 @dataclass(frozen=True)
 class ViewHealth:
-    """What a training view shows of the result.
+    """Facts of one training view.
 
     Attributes:
         psnr: of what was predicted of its pictures, as shown, in dB; None where no pixel counts.
@@ -156,7 +156,7 @@ class ViewHealth:
 
 @dataclass(frozen=True)
 class Health:
-    """What a training says of itself.
+    """Health of a training.
 
     Attributes:
         polarization: what layers and normals rest on.
@@ -204,7 +204,7 @@ class Health:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What a finished training is examined by.
+    """The evidence by which a finished training is examined.
 
     Attributes:
         views: all training views, with what is believed of their pictures. polarization: what it rests on.
@@ -230,7 +230,7 @@ def examine(model: Model, evidence: Evidence, points: Tensor, steps: int, report
 
     Args:
         model: what was learned. evidence: of its training. points: of the scene, [M, 3]. steps: it took.
-        reporter: told how far it is.
+        reporter: receives progress.
     """
     views = evidence.chosen(steps)
     if not views:
@@ -268,7 +268,7 @@ def _brightest(view: View) -> float:
 def _look(
     model: Model, view: View, limit: float, near: float, filters: bool
 ) -> tuple[ViewHealth, Tensor | None]:
-    """What a view shows, and the radii of the Gaussians in it.
+    """Facts of a view, and the radii of the Gaussians in it.
 
     Args:
         limit: intensity above which a pixel is burned. near: depth up to which there can be no surface; 0: unknown.
@@ -294,7 +294,7 @@ def _look(
 
 
 def _compared(view: View, final: Tensor, stokes: Tensor | None) -> tuple[Tensor, Tensor]:
-    """What was measured of a view, and what is predicted of it: [K, H, W, 3] linear each.
+    """Measured and predicted pictures of a view: [K, H, W, 3] linear each.
 
     That is each picture behind its filter, where that is predicted, and else the photograph.
     """
@@ -333,7 +333,7 @@ def _share(pixels: Tensor) -> float:
 
 
 def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: Limits = LIMITS) -> list[str]:
-    """What is to be warned of, the gravest first.
+    """Warnings, the gravest first.
 
     Args:
         views: those that were looked at. unseen: as of ``Health``. limits: from where on.

@@ -25,7 +25,7 @@ from polarguide.training.state import TrainingState
 
 
 class Model(Protocol):
-    """What every kind of model does: see ``GaussianModel`` and ``fields.model.FieldModel``."""
+    """The interface of every kind of model: see ``GaussianModel`` and ``fields.model.FieldModel``."""
 
     @property
     def shading(self) -> ShadingModel:
@@ -61,7 +61,7 @@ class Model(Protocol):
         """All layers.
 
         Args:
-            camera: any. normals: also where the model can do without them. depth: only if asked for.
+            camera: any. normals: also where the model can do without them. depth: whether to render it.
             surface: normals and depth are those of the surface at the pixel's median depth, see ``raster.surface``.
         """
 
@@ -74,7 +74,7 @@ class Model(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class GaussianModel:
-    """What was learned, for whoever scores or shows it: Gaussians, their light, and how they are shaded."""
+    """A trained model for scoring and viewing: Gaussians, their light, and their shading."""
 
     state: TrainingState
     shading: ShadingModel

@@ -1,4 +1,4 @@
-"""A run folder opened: its configuration, what it learned, its scene when that is asked for, and its layers."""
+"""An opened run folder: its configuration, its model, its scene (read on first use), and its layers."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class OpenedRun:
         configuration: what it was trained as. recipe: the method.
         model: what it learned.
         scene: the scene or its folder, where that is not the folder that the configuration names.
-        reporter: told how far the reading of the scene is.
+        reporter: receives the progress of reading the scene.
     """
 
     def __init__(
@@ -75,9 +75,9 @@ class OpenedRun:
         Args:
             folder: what a training wrote.
             recipe: the recipe it was trained with, or its name, where that is not one of ours.
-            scene: the scene or its folder, where that has moved since; read when it is first asked for.
+            scene: the scene or its folder, where that has moved since; read on first use.
             device: what to compute on.
-            reporter: told what takes long.
+            reporter: receives the progress of long operations.
 
         Raises:
             PolarguideError: it is no run folder, is damaged, or belongs to another version.
@@ -137,7 +137,7 @@ class OpenedRun:
 
     @property
     def health(self) -> Health | None:
-        """What its training says of itself; None where that has not ended, or was one of an earlier version.
+        """Health of its training; None where it has not ended, or was one of an earlier version.
 
         Raises:
             PolarguideError: ``health.json`` is not such a record.
@@ -146,8 +146,8 @@ class OpenedRun:
 
     @property
     def polarization(self) -> str:
-        """What layers and normals rest on, for people: ``measured``, ``fitted`` or ``none``, with what it does not hold
-        for. ``not recorded`` where there is no ``health``.
+        """The evidence behind layers and normals, for people: ``measured``, ``fitted`` or ``none``, with its
+        exceptions. ``not recorded`` where there is no ``health``.
         """
         health = self.health
         return "not recorded" if health is None else health.polarization.text
@@ -159,7 +159,7 @@ class OpenedRun:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene it was trained on, read when it is first asked for. Warns if it has changed since.
+        """The scene it was trained on, read on first use. Warns if it has changed since.
 
         Raises:
             PolarguideError: it is not there any more, cannot be read, or was read otherwise than for the training.
@@ -298,7 +298,7 @@ def read_scene(
     """Load a scene, with progress, and hand on its warnings.
 
     Args:
-        folder: of the scene. options: how it is read. reporter: told how far it is.
+        folder: of the scene. options: how it is read. reporter: receives progress.
         test_views, hold: as for ``load_scene``.
 
     Raises:

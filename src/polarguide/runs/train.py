@@ -88,13 +88,13 @@ def train(
         settings: steps, seed and what else decides the result; ``resolve`` says what is taken for None.
         session: device, threads, and how often the state is saved.
         resume: go on with the run in ``out``, to the same result.
-        reporter: told how far it is.
+        reporter: receives progress.
         should_stop: asked between steps.
         watch: gives, for the trainer, a context with what is to be called between steps.
 
     Raises:
         PolarguideError: wrong input, a folder that does not suit, or a loss that is not finite.
-        TrainingStopped: ``should_stop`` said so; the state is saved.
+        TrainingStopped: ``should_stop`` returned true; the state is saved.
     """
     out = Path(out)
     use_threads(session.threads)

@@ -226,7 +226,7 @@ class DeferredShading(ShadingModel):
         return further
 
     def channel_parameters(self, gaussians: Parameters) -> ChannelParameters | None:
-        """What ``channels`` reads; None for a class with other channels."""
+        """The parameters that ``channels`` reads; None for a class with other channels."""
         if type(self).channels is not DeferredShading.channels:
             return None
         return ChannelParameters(
@@ -243,7 +243,7 @@ class DeferredShading(ShadingModel):
         return self.indices
 
     def _has_indices(self, gaussians: Parameters) -> bool:
-        """Whether one of the Gaussians has a refractive index of its own."""
+        """Whether any Gaussian has a refractive index other than the run's."""
         return self.indices and any_nonzero(gaussians["index_offset"])
 
     @property

@@ -165,7 +165,7 @@ NO_LIGHT: Light = MappingProxyType({})
 
 @dataclass(frozen=True, eq=False)
 class RenderRequest:
-    """What is wanted of a rendering.
+    """The layers that a rendering has to have.
 
     Attributes:
         sh_degree: SH degree of the base color, 0 to 3.
@@ -248,7 +248,7 @@ Split = tuple[Tensor, Tensor | None, Tensor | None]
 
 
 def split(features: Tensor, alpha: Tensor, layout: Layout) -> Split:
-    """What a result holds of its G-buffer: ``split_reference``, on the CPU in float32 with one native gradient pass.
+    """The layers of a G-buffer: ``split_reference``, on the CPU in float32 with one native gradient pass.
 
     Without a gradient and a depth there is nothing to do natively: the normal is a part of the features.
     """

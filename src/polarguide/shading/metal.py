@@ -1,7 +1,7 @@
 """Metals beside dielectrics in the deferred shading model.
 
-A Gaussian is a metal or none (``metalness`` 1 or 0, found by ``training.metals`` or said by masks, never learned). A
-metal has no body that light comes back from: its base color and its strength do not count. What it reflects is
+A Gaussian is a metal or a dielectric (``metalness`` 1 or 0, decided by ``training.metals`` or by masks, never learned).
+A metal has no diffuse reflection: its base color and its strength do not count. What it reflects is
 
     specular = R(r, i) max(0, L(mirrored ray, roughness) + l)
 
@@ -46,7 +46,7 @@ MINIMUM_SHARE = 0.01
 def any_nonzero(values: Tensor) -> bool:
     """Whether a value of a tensor that is not trained is other than 0; False of a tensor without values.
 
-    The device is asked once for each state of the tensor, which keeps the answer: again after a change of its values.
+    The device is read once for each state of the tensor, which caches the answer until its values change.
     Tensors of ``torch.inference_mode`` do not count their changes: they are read each time.
     """
     if values.is_meta:
@@ -70,7 +70,7 @@ def reflectance_logits(values: Tensor) -> Tensor:
 
 
 def metal_channels(metalness: Tensor, reflectances: Tensor, roughness: Tensor) -> Tensor:
-    """What is blended of metals, [N, 5]: reflectance and roughness times metalness, and metalness between them."""
+    """Blended channels of metals, [N, 5]: reflectance and roughness times metalness, and metalness between them."""
     m = metalness[:, None]
     return torch.cat((m * reflectances, m, m * roughness[:, None]), dim=1)
 

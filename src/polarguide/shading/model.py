@@ -59,7 +59,7 @@ class Parameter(NamedTuple):
 
 
 class ChannelParameters(NamedTuple):
-    """What a shading model's channels are made of, for the native pass; all without what is None.
+    """The parameters behind a shading model's channels, for the native pass; None ones are absent.
 
     Attributes:
         strength_logits: [N] raw reflection strength.
@@ -84,7 +84,7 @@ class ChannelParameters(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GBuffer:
-    """What was splatted for a picture that is shaded afterwards; ``splatted["strength"]`` are channels by name.
+    """Splatted channels of a picture that is shaded afterwards; ``splatted["strength"]`` are channels by name.
 
     Attributes:
         features: [H, W, D] all channels, blended: ``color``, ``normal`` (world axes, not normalized), and others.
@@ -118,7 +118,7 @@ class RadianceCubemap(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PageShading:
-    """What an exported page needs in order to shade Gaussians as the model does.
+    """Data by which an exported page shades Gaussians as the model does.
 
     Attributes:
         kind: the page's shaders are compiled with its name, in capitals, defined.
@@ -243,7 +243,7 @@ class ShadingModel(ABC):
 
         Args:
             metal: [N] bool. reflectance: [N, 3] at normal incidence that new ones begin with.
-            gain: by how much all light should be brighter, asked for when the first metals are there.
+            gain: by how much all light should be brighter, called when the first metals appear.
         """
         raise NotImplementedError
 
@@ -328,7 +328,7 @@ class ShadingModel(ABC):
 
     @property
     def local_note(self) -> str:
-        """What does not follow when the light from afar is turned or replaced; empty: everything does."""
+        """Layers that do not follow when the distant light is turned or replaced; empty: all follow."""
         return ""
 
     @abstractmethod
@@ -340,11 +340,11 @@ class ShadingModel(ABC):
         return harmonic_colors(gaussians, rays)
 
     def fields(self, gaussians: Parameters) -> dict[str, Tensor]:
-        """What a PLY of the Gaussians keeps besides display colors, [N, ...] by name: linear harmonics."""
+        """Fields of a PLY of the Gaussians besides display colors, [N, ...] by name: linear harmonics."""
         return {"linear_dc": gaussians["sh_dc"], "linear_rest": gaussians["sh_rest"].flatten(1)}
 
     def page(self, gaussians: Parameters, light: Light) -> PageShading | None:
-        """What an exported page needs; None where it has no shaders for the model (colors are then baked)."""
+        """Data of an exported page; None where it has no shaders for the model (colors are then baked)."""
         return None
 
 

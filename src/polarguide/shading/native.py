@@ -22,7 +22,7 @@ from polarguide.shading.model import mirrored
 
 
 class MetalArguments(NamedTuple):
-    """What the native pass has to know of metals, see ``shading.metal``.
+    """Arguments of the native pass for metals, see ``shading.metal``.
 
     Attributes:
         pixels: [K] int64, those that show metal, ascending.
@@ -225,7 +225,7 @@ def split_native(features: Tensor, alpha: Tensor, *, depth: bool) -> tuple[Tenso
 
 
 class Reflecting(Protocol):
-    """What deferred reflection asks its shading model for; see ``DeferredShading``."""
+    """The interface between deferred reflection and its shading model; see ``DeferredShading``."""
 
     def radiance(self, texels: Tensor, /) -> Tensor:
         """Linear radiance of raw texels."""

@@ -67,7 +67,7 @@ LAYERS = (
 
 
 class MetalPixels(NamedTuple):
-    """What metals add to a picture of P pixels.
+    """Metals in a picture of P pixels.
 
     Attributes:
         pixels: [K] int64, those that show metal, ascending.
@@ -88,7 +88,7 @@ DetachedLayers = tuple[Tensor, Tensor, MetalPixels | None]
 
 @dataclass(frozen=True, eq=False)
 class RenderResult:
-    """All layers of one view. Radiance is linear, on the scale of S0/2; [H, W, 3] unless said otherwise.
+    """All layers of one view. Radiance is linear, on the scale of S0/2; [H, W, 3] unless stated otherwise.
 
     Attributes:
         final: the picture; ``specular + diffuse``.

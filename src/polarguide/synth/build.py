@@ -225,7 +225,7 @@ def _user_mesh(path: Path) -> Mesh:
 
 
 def _mesh_arrays(path: Path, kind: str, *, flat: bool) -> Any:
-    """What Mitsuba reads of a mesh, by its names; ``flat`` leaves normals at points out."""
+    """The arrays of a mesh as Mitsuba reads them; ``flat`` leaves normals at points out."""
     try:
         return mi.traverse(mi.load_dict({"type": kind, "filename": str(path), "face_normals": flat}))
     except (

@@ -32,7 +32,7 @@ TOP = 65535 // STEP
 
 
 def scene_request(spec: SceneSpec, settings: SynthSettings) -> dict[str, Any]:
-    """The content of ``request.json``: what a rendering was asked for."""
+    """The content of ``request.json``: the requested rendering."""
     return {"scene": spec.data(), "settings": settings.data()}
 
 
@@ -66,7 +66,7 @@ def folder_state(out: Path, request: dict[str, Any]) -> State:
 
 
 def _difference(before: Any, now: Any, place: str = "") -> str:
-    """Where two JSON values differ first, in words."""
+    """The first difference of two JSON values, as text."""
     if isinstance(before, dict) and isinstance(now, dict):
         none = "nothing"
         pairs = [(f"{place}.{key}", before.get(key, none), now.get(key, none)) for key in {**now, **before}]

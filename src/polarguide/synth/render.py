@@ -44,7 +44,7 @@ BRIGHT = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What is to be rendered: known before anything is loaded or written."""
+    """A planned rendering, complete before anything is loaded or written."""
 
     spec: SceneSpec
     settings: SynthSettings
@@ -114,7 +114,8 @@ def expected_time(plans: Sequence[Plan], reporter: Reporter, *, threads: int = 0
 
     Args:
         plans: the scenes.
-        reporter: warned where only Mitsuba's slow variant can be used; told the time then, or if it is long.
+        reporter: receives a warning where only Mitsuba's slow variant can be used, and the expected time then or if
+            it is long.
         threads: threads to use; 0 takes all cores.
 
     Raises:
@@ -148,7 +149,7 @@ def synthesize(
         spec: the scene.
         out: folder to write.
         settings: how.
-        reporter: told what is going on.
+        reporter: receives progress and messages.
         threads: threads to use; 0 takes all cores.
 
     Raises:

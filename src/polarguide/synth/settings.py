@@ -1,4 +1,4 @@
-"""What the user may ask for beyond the scene itself, and the scene with these wishes applied."""
+"""Options beyond the scene itself, and the scene with these applied."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def _missing_llvm() -> str:
 
 
 def rough_time(seconds: float) -> str:
-    """An estimated time in words."""
+    """An estimated time as text."""
     hours = seconds / 3600
     return f"about {hours:.0f} hours" if hours >= 2 else f"about {max(2.0, hours * 60):.0f} minutes"
 
@@ -145,7 +145,7 @@ class SynthSettings:
         size: Width and height of the pictures; a simulated polarization sensor has twice as many pixels each way.
         samples: Paths per pixel and lobe; test views take four times as many.
         seed: Seed of every random draw.
-        sensor: A sensor whose 12-bit raw mosaics are written, too, for polarguide prepare; filter: one 8-bit JPEG of
+        sensor: A sensor whose 12-bit raw mosaics are also written, for polarguide prepare; filter: one 8-bit JPEG of
             each view, through a filter before an ordinary camera.
         noise: Photon and read noise: 1 is a sensor exposed to full scale, 2 a quarter of that light, 0 none.
         color: Three channels with exact values, or a sampled spectrum.

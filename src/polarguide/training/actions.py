@@ -1,4 +1,4 @@
-"""What changes Gaussians between steps: density control, resets, normal propagation, and the search for outer sides."""
+"""Changes of Gaussians between steps: density control, resets, normal propagation, and the search for outer sides."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: 
 
 
 class PixelCounts(NamedTuple):
-    """What training pictures show of each Gaussian.
+    """Pixels of each Gaussian in training pictures.
 
     Attributes:
         views: [N] float32, to how many pictures it adds something: its blending weights there add up to
@@ -115,7 +115,7 @@ class PixelCounts(NamedTuple):
 
 
 def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: Rasterize) -> PixelCounts:
-    """What pictures from some cameras show of each Gaussian.
+    """Pixels of each Gaussian in pictures from some cameras.
 
     Args:
         gaussians: the Gaussians. cameras: of the pictures. rasterize: of the backend.
@@ -175,7 +175,7 @@ class DensityControl:
             self._ranks.exchange_slots(sums if sums.ndim == 2 else sums[None])
 
     def after_step(self, state: TrainingState, *, last: bool) -> None:
-        """What is due after a step of a stage with density control.
+        """Density control after a step of a stage that has it.
 
         Args:
             last: whether the next step has no density control; Gaussians that show too little are then removed.

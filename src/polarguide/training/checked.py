@@ -1,4 +1,4 @@
-"""What a checkpoint may hold: every tensor is checked here before anything computes with it.
+"""Checks of a checkpoint: every tensor is checked here before anything computes with it.
 
 The kernels and the fused optimizer take shapes at their word, so a tensor that does not fit would be read or written
 beyond its end; one that is not finite would show as a picture of nothing.
@@ -60,7 +60,7 @@ def refuse_foreign(tensors: Mapping[str, Tensor], recipe: Recipe) -> None:
 
 
 def _moments(kind: str, name: str) -> str:
-    """What the names of a tensor's moments begin with, as ``Trained`` and ``Environment`` write them."""
+    """The prefix of the names of a tensor's moments, as ``Trained`` and ``Environment`` write them."""
     if kind == "gaussians":
         return f"adam.{name}."
     return "environment.adam." if name == "texels" else f"environment.adam.{name}."

@@ -46,7 +46,7 @@ class LostRank(Exception):
 
 @contextlib.contextmanager
 def _collective() -> Iterator[None]:
-    """Inside, a failed collective raises LostRank; every backend has an exception of its own kind."""
+    """Turns a failed collective into LostRank; every backend raises another exception."""
     try:
         yield
     except RuntimeError as error:

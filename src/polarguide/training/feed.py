@@ -67,7 +67,7 @@ class Feed:
         self._partial: dict[tuple[str, str], PartialView] = {}
 
     def _size(self, step: int) -> str:
-        """Prefix of what is kept for a step."""
+        """Prefix of the keys of stored entries for a step."""
         return "small " if step < self._until else ""
 
     def views(self, step: int) -> Sequence[View]:
@@ -89,7 +89,7 @@ class Feed:
     def targets(
         self, step: int, view: View, weights: Weights, guide: Mapping[str, Tensor] | None
     ) -> StepTargets:
-        """What a step compares the rendering of one of its views with.
+        """Targets of the rendering of one of a step's views.
 
         Args:
             weights: of the stage, which say what its terms read.

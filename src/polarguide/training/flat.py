@@ -5,7 +5,7 @@ direction that its normal is perpendicular to, whatever is mirrored and however 
 pixels have one normal, and the directions of many of them leave one line for it, whose side faces the camera: neither
 of the ambiguities of pi and pi/2 is left. Still water, which shows the depth of what it mirrors, has no other anchor.
 
-The planes of incidence of a sphere meet in one line, too, the ray through its center. There Fresnel's equations allow
+The planes of incidence of a sphere also meet in one line, the ray through its center. There Fresnel's equations allow
 next to no polarization, so that what is measured contradicts it.
 """
 

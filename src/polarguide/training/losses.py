@@ -151,7 +151,7 @@ def consistency_loss(result: RenderResult, camera: Camera, weight: Tensor | None
 
 
 def nearest_target(normal: Tensor, priors: ViewPriors) -> Tensor:
-    """What the normal term compares with, [H, W, 3]: of a view with candidates the one nearest to the normals just
+    """Targets of the normal term, [H, W, 3]: of a view with candidates the one nearest to the normals just
     rendered, otherwise what the frozen Gaussians have chosen.
 
     Args:
@@ -257,7 +257,7 @@ def coverage_loss(alpha: Tensor, empty: Tensor) -> Tensor:
 
 
 class StepLoss(NamedTuple):
-    """What a step minimizes, and what it tells about itself.
+    """The loss of a step, and its report.
 
     Attributes:
         total: the weighted sum of a stage's terms. photometric: that term alone, for the display.

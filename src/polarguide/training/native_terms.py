@@ -68,7 +68,7 @@ class Consistency(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """What a step compares; at least one.
+    """The terms of a step; at least one.
 
     Attributes:
         polarization: needs both layers. directions: any number. consistency: needs the depth.
@@ -166,7 +166,7 @@ def pixel_terms(result: RenderResult, camera: Camera, terms: Terms) -> Tensor:
 
 
 def _field(result: RenderResult) -> Tensor | None:
-    """What metals add to the specular layer and to its polarization over ``sin^2(zenith)``, [P, 6]; None: no metal."""
+    """Metals' part of the specular layer and of its polarization over ``sin^2(zenith)``, [P, 6]; None: no metal."""
     if (metal := result.metal) is None:
         return None
     both = torch.cat((metal.specular, metal.slope * metal.specular), dim=1)

@@ -23,12 +23,12 @@ from polarguide.training.targets import ViewPriors, stokes_weight, surface_weigh
 
 
 class Unguided(NamedTuple):
-    """What of a view's priors no guide decides: it stays the same from refresh to refresh.
+    """The part of a view's priors that does not depend on the guide: it stays the same from refresh to refresh.
 
     Attributes:
         usable: [H, W] bool, where the polarization is above the threshold and its noise.
         degree: [H, W] DoLP, where the settings look at its noise without what that adds to it.
-        zenith, azimuth: [H, W] radians, of the normals of the color differences; None where these are not asked for.
+        zenith, azimuth: [H, W] radians, of the normals of the color differences; None where these are not requested.
         certainty: [H, W] weight of these normals, in [0, 1], 0 where color decides nothing; None likewise.
         colorful: [H, W] from 0 where the body is gray to 1 where it has a color; None likewise.
     """
@@ -43,7 +43,7 @@ class Unguided(NamedTuple):
 
 @torch.no_grad()
 def unguided(view: View, settings: Priors, refractive_index: float) -> Unguided:
-    """What can be said of a view's priors before there are Gaussians.
+    """The part of a view's priors that needs no Gaussians.
 
     Args:
         view: the capture; its device does the work. settings: of the priors. refractive_index: of all surfaces.

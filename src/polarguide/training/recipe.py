@@ -58,7 +58,7 @@ class Rounds:
     minimum: int = 1
 
     def turns(self, length: int, steps: int) -> dict[int, Action]:
-        """What is due when, in steps since the beginning of a stage of ``length`` steps, of ``steps`` in all."""
+        """The due actions by step, counted from the beginning of a stage of ``length`` of ``steps`` steps."""
         apart = max(1, self.minimum, round(self.fraction * steps))
         count = len(self.actions) * max(1, length // (apart * len(self.actions)))
         places = (round(turn * length / count) for turn in range(1, count))
@@ -178,7 +178,7 @@ class Propagation:
 
 
 class Method(ABC):
-    """What a run is trained as: a recipe, of Gaussians or of something else.
+    """The method of a run: a recipe, of Gaussians or of another kind.
 
     Attributes:
         name: as given to ``--recipe``. about: one line.

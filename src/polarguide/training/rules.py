@@ -64,7 +64,7 @@ class MetalRules:
         gain_share: share of metal above which a pixel counts for it.
         gain_pixels: least share of the pixels that have to count.
         most_gain: the largest gain.
-        contradicted: share of a view's labels from which on the user is told that other views contradict them.
+        contradicted: share of a view's labels from which on a warning says that other views contradict them.
     """
 
     most_views: int = 32

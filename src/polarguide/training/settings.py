@@ -1,4 +1,4 @@
-"""What decides a training's result, and what each of its steps reports. Nothing here imports torch."""
+"""Settings that decide a training's result, and the report of a step. Nothing here imports torch."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """What decides a training's result, beside the scene and the recipe.
+    """Settings that decide a training's result, besides the scene and the recipe.
 
     None means not specified: the value is that of the run to resume or, in a new run, the one named below. run.json
     records the value.
@@ -84,7 +84,7 @@ class TrainSettings:
             )
 
     def specified(self) -> dict[str, Any]:
-        """What is not left open, by name."""
+        """The specified settings by name."""
         open_values = (("background", "auto"), *((name, None) for name in vars(self)))
         return {name: value for name, value in vars(self).items() if (name, value) not in open_values}
 
@@ -111,13 +111,13 @@ class ResolvedSettings(TrainSettings):
                 raise PolarguideError(name, expected="a number", found="nothing", remedy=remedy)
 
     def fit(self, settings: TrainSettings) -> bool:
-        """Whether they are as was asked, whatever was left open."""
+        """Whether they agree with the specified settings; open ones agree with any value."""
         return settings.specified().items() <= vars(self).items()
 
 
 @dataclass(frozen=True, eq=False)
 class StepReport:
-    """What a step reports to the progress display.
+    """A step's report to the progress display.
 
     Attributes:
         step, stage, gaussians: plain values; None of what has no Gaussians. done: steps so far, with those before the

@@ -1,4 +1,4 @@
-"""What a step compares a rendering with: the data of one view, as objects."""
+"""Targets of a step's rendering: the data of one view, as objects."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def surface_weight(stokes: Tensor, weight: Tensor, bright: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class PartialView:
-    """What a view measured whose pictures do not determine the Stokes vector.
+    """Measurements of a view whose pictures do not determine the Stokes vector.
 
     Attributes:
         picture: [H, W, 3] linear: the mean of some of its exposures.
@@ -114,7 +114,7 @@ class PartialView:
 
     @classmethod
     def of(cls, view: View, device: torch.device) -> PartialView:
-        """What a view measured, on a device."""
+        """Measurements of a view, on a device."""
         view = view.to(device)
         values, exposures = view.intensities(), view.exposures
         rays = view.camera.rays(device=device)
@@ -138,7 +138,7 @@ class PartialView:
 
 @dataclass(frozen=True, eq=False)
 class StepTargets:
-    """What a step compares the rendering of one view with.
+    """Targets of the rendering of one view.
 
     Attributes:
         camera: of the view.
@@ -159,7 +159,7 @@ class StepTargets:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What the loss terms of one step read.
+    """The data that the loss terms of one step read.
 
     Attributes:
         result: the rendered layers. targets: what they are compared with.

@@ -45,7 +45,7 @@ class Trainer:
         state: where to go on from, on the backend's device; None: from the beginning.
         ranks: the processes that share the views of each step.
         store: keeps what is computed of the views; None: in memory.
-        warn: told what the user should know.
+        warn: receives messages for the user.
         memory: gives back what was freed where it would lie between what is kept.
 
     Attributes:
@@ -158,7 +158,7 @@ class Trainer:
         return torch.stack((loss.photometric.detach(), psnr, loss.total.detach()))
 
     def _targets(self, slot: int, stage: Stage) -> StepTargets:
-        """What the rendering of a slot's view is compared with."""
+        """Targets of the rendering of a slot's view."""
         state = self.state
         view = self._view_of(state.step * self.settings.views_per_step + slot)
         if stage.weights.priors and view.is_determined and state.frozen is None:
@@ -168,7 +168,7 @@ class Trainer:
     def _view_of(self, place: int) -> View:
         """The view at a place in the sequence of all views ever trained on.
 
-        Every epoch visits every training view once, in an order of its own.
+        Every epoch visits every training view once, in a new order.
         """
         views = self._feed.views(self.state.step)
         epoch, place = divmod(place, len(views))
@@ -191,7 +191,7 @@ class Trainer:
             torch._foreach_div_(gradients, float(views))
 
     def _use_batch_rates(self) -> None:
-        """What the optimizers need for more than one view a step; see ``TrainSettings``."""
+        """Settings of the optimizers for more than one view a step; see ``TrainSettings``."""
         views = self.settings.views_per_step
         if views == 1:
             return
@@ -245,7 +245,7 @@ class Trainer:
 
 
 def requested(stage: Stage, sh_degree: int, statistic: ScreenStatistic | None) -> RenderRequest:
-    """What a step of a stage needs of a rendering."""
+    """The layers that a step of a stage needs."""
     weights = stage.weights
     fades = stage.behind is not None and weights.normals
     return RenderRequest(

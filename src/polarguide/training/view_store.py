@@ -1,4 +1,4 @@
-"""What a training keeps of its views: two bytes a value, in memory up to a limit, beyond it in a file.
+"""Stored data of training views: two bytes a value, in memory up to a limit, beyond it in a file.
 
 Nobody has to clean up the file. Whatever is kept can be made again to the same bits, so that neither the limit nor a
 file that is gone changes a result.
@@ -73,7 +73,7 @@ def holds(entry: Entry, fields: frozenset[str]) -> bool:
 
 
 def pack_priors(priors: ViewPriors, fields: Collection[str]) -> Entry:
-    """What terms read of the priors, and whatever no term is known to read."""
+    """The priors that terms read, and all those of which no term is known to read."""
     entry = {}
     for name, values in vars(priors).items():
         if isinstance(values, Tensor) and (name in fields or name not in Weights.known_priors()):
@@ -129,7 +129,7 @@ class ViewStore:
         limit: bytes of entries in memory; None: all.
         folder: for the file of the others. It has no name there, and is gone with the process; None: entries over the
             limit are not kept but made again.
-        warn: told where the file cannot be written; entries over the limit are then made again.
+        warn: receives a message where the file cannot be written; entries over the limit are then computed again.
     """
 
     def __init__(

@@ -33,7 +33,7 @@ class Gate:
 
     Args:
         listening: the address that is listened at; where it is a name, requests may name it.
-        hosts: further names under which the viewer may be asked for.
+        hosts: further host names under which the viewer may be opened.
         origins: pages that may ask, as ``https://NAME`` or ``NAME``, besides those that the viewer itself sends.
 
     Raises:

@@ -69,7 +69,7 @@ class PresentingControls:
 
 
 class Presenting:
-    """What one session has chosen, and what it is about to pick.
+    """One session's presentation, and its pending pick.
 
     Callbacks only record; the rendering thread calls ``take_click`` and ``found``.
 
@@ -124,7 +124,7 @@ class Presenting:
         return None if self._clicked is None else self._clicked[1:]
 
     def found(self, place: SurfacePoint | None) -> None:
-        """What the picture shows where was clicked."""
+        """The surface at the clicked pixel."""
         if self._clicked is None:
             return
         what, self._clicked = self._clicked[0], None

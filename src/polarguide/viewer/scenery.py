@@ -37,7 +37,7 @@ FIELD_SHARE = 4
 
 
 class Scenery(Protocol):
-    """What a viewer asks for pictures."""
+    """The source of a viewer's pictures."""
 
     @property
     def status(self) -> str:
@@ -183,7 +183,7 @@ POLARIZED = ("DoLP", "AoLP")
 
 @dataclass(frozen=True)
 class Appearance:
-    """What a visitor has chosen.
+    """A visitor's choices.
 
     Attributes:
         layer: a name in ``LAYERS`` or ``MEASURED``.
@@ -255,7 +255,7 @@ class Painter:
         view: View | None,
         place: tuple[float, float],
     ) -> SurfacePoint | None:
-        """What is seen at a place of the picture that ``paint`` draws, in shares of its width and height."""
+        """The surface at a place of the picture that ``paint`` draws, in shares of its width and height."""
         if view is not None:
             camera = letterbox(view.camera, (camera.width, camera.height)).camera(view.camera)
         plain = Appearance(layer="depth", crop=appearance.crop)

@@ -150,7 +150,7 @@ class Viewer:
         self._wake.set()
 
     def _gray_world(self) -> Vector:
-        """Gains of the photographs' mean, computed when they are first asked for."""
+        """Gains of the photographs' mean, computed on first use."""
         if self._gray is None:
             photographs = self._photographs.values()
             views = [p.view for p in photographs if not p.held_out] or [p.view for p in photographs]
@@ -170,7 +170,7 @@ class Viewer:
         return text
 
     def _control(self, name: str) -> Accepts | None:
-        """What a control of any session takes; viser itself looks for it among those of the one that sends."""
+        """Applies a control of any session; viser itself searches only the sender's."""
         with self._lock:
             tables = [session.panel.accepts for session in self._sessions.values()]
         return next((table[name] for table in tables if name in table), None)
@@ -285,7 +285,7 @@ def view_run(
         run: the run; its scene is read.
         host: address to listen at. port: the next free one is taken if it is in use.
         visitors: who may look besides pages of this machine.
-        reporter: told the address.
+        reporter: receives the address.
 
     Raises:
         PolarguideError: the address cannot be listened at.

@@ -182,7 +182,7 @@ class Session:
         self._caught(self._changed)(None)  # the box that was saved
 
     def _caught(self, act: Callable[[], None]) -> Callable[[Any], None]:
-        """A callback whose faults cost this browser its connection, and nobody else anything."""
+        """A callback whose errors close this browser's connection and affect no other."""
 
         def called(_: Any) -> None:
             try:

@@ -1,4 +1,4 @@
-"""Layers of a rendering, and what is known of them, as 8-bit pictures."""
+"""Layers of a rendering and their ground truth as 8-bit pictures."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def true_depth_range(view: View) -> tuple[float, float] | None:
 
 
 def ground_truth_pictures(view: View, gains: Tensor | None = None) -> dict[str, Picture]:
-    """The photograph as ``final``, and what is known of the other layers, as 8-bit pictures; ``gains`` as above."""
+    """The photograph as ``final``, and the ground truth of the other layers, as 8-bit pictures; ``gains`` as above."""
     pictures = {"final": figures.radiance_to_rgb(balanced(view.photograph(), gains))}
     ground_truth = view.ground_truth
     if ground_truth is None:

@@ -85,9 +85,9 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
     """Score a run's test views and write ``metrics.json`` and ``errors.png`` into its folder.
 
     Args:
-        run: the run; it is asked for layers only.
+        run: the run; only its layers are used.
         speed: whether to measure frames a second, which makes sense only while nothing else runs.
-        reporter: told how far it is.
+        reporter: receives progress.
 
     Returns:
         The record as written: means over the views, ``views`` by name, ``objects``, ``materials`` and ``provenance``.
@@ -172,7 +172,7 @@ def _peak(before: float | None) -> dict[str, Any]:
 
 
 def _surface(run: OpenedRun) -> Surface:
-    """What the mesh scores look at: of a field its zero set, of Gaussians their depths fused."""
+    """The surface that mesh scores measure: the zero set of a field, the fused depths of Gaussians."""
     if isinstance(run.model, FieldModel):
         return implicit_surface(run.cameras, run.model, resolution=RESOLUTION)
     fused, _, _ = fused_surface(

@@ -21,7 +21,7 @@ _WRITE_AGAIN = "Score the run again with this version: polarguide eval."
 
 
 class Provenance(TypedDict):
-    """What has to be known to repeat a run. Others may stand beside it."""
+    """Facts that are needed to repeat a run. Other fields may stand beside it."""
 
     recipe: str
     seed: int

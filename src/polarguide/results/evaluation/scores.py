@@ -64,7 +64,7 @@ def _squared(pred: Tensor | None, true: Tensor | None, keep: Selection | None) -
 class ErrorsByObject:
     """Sums of errors over the pixels of each object, and of each class of material, in all views.
 
-    They stay on the views' device until they are asked for.
+    They stay on the views' device until they are read.
 
     Args:
         objects: in the order of ``ViewTarget.owner``.
@@ -231,7 +231,7 @@ def summarize(per_view: Mapping[str, ViewScores]) -> dict[str, float | str | Non
 
 
 def _numbers(measures: Mapping[str, Tensor | None]) -> dict[str, float]:
-    """What tensors [] hold; the only place where scoring waits for their device."""
+    """The values of tensors []; the only place where scoring waits for their device."""
     present = {key: value.to(torch.float64) for key, value in measures.items() if value is not None}
     values: list[float] = torch.stack(list(present.values())).cpu().tolist()
     return dict(zip(present, values, strict=True))

@@ -37,7 +37,7 @@ def _digest(folder: Path, files: Sequence[Path]) -> str:
 
 
 def commit(package: Path = PACKAGE) -> str | None:
-    """The commit that the program was built from, or runs from if it was not built: its own, nobody else's.
+    """The commit that the program was built from, or runs from if it was not built; never an outer repository's.
 
     Args:
         package: folder of the package.

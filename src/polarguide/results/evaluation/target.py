@@ -1,4 +1,4 @@
-"""What the views of a scene are scored against: facts of the scene as a whole, and the target of each view."""
+"""Targets of scoring: facts of the scene as a whole, and the target of each view."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ KNOWN = {
 
 @dataclass(frozen=True, eq=False)
 class SceneFacts:
-    """What holds for all test views of a scene.
+    """Facts of all test views of a scene.
 
     Attributes:
         extent: 1.1 times the largest distance between two cameras, in world units.

@@ -68,7 +68,7 @@ def export(
         out: folder to write; ``export`` in the run's folder by default.
         resolution: voxels of the mesh along its longest side, 16 to 1024.
         spz_version: of the SPZ file, 3 or 4; readers are split between them.
-        reporter: told how far it is.
+        reporter: receives progress.
 
     Returns:
         The files and folders written.

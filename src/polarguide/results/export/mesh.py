@@ -82,7 +82,7 @@ def write_mesh(
 
 
 def _asset(placement: Placement, origin: Origin) -> dict[str, Any]:
-    """What a glTF file says of itself. Its unit is the meter; where the scale is not known, ``units`` says so."""
+    """The asset record of a glTF file. Its unit is the meter; where the scale is not known, ``units`` says so."""
     units = "meters" if placement.metric else "units of the scene; how long one is, is not known"
     credit = origin.presentation.credit
     return {

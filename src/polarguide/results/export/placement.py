@@ -85,7 +85,7 @@ class Placement:
         )  # fmt: skip
 
     def harmonics(self) -> NDArray[np.float64]:
-        """What turns coefficients of degree 1 to 3 with the scene, [15, 15]: new = matrix @ old.
+        """Rotation of coefficients of degree 1 to 3 with the scene, [15, 15]: new = matrix @ old.
 
         Functions of each degree turn into functions of the same degree, so that a fit to samples is exact.
         """
@@ -124,7 +124,7 @@ class Placement:
                     table[name] = column
 
     def record(self) -> dict[str, Any]:
-        """What files say of it: ``units``, ``up_axis``, and how the scene was turned and scaled."""
+        """The record in exported files: ``units``, ``up_axis``, and how the scene was turned and scaled."""
         record: dict[str, Any] = {"units": "meters" if self.metric else "units of the scene"}
         if self.upright:
             record["up_axis"] = "-y"
@@ -165,7 +165,7 @@ GENERATOR = f"polarguide {__version__}"
 
 
 def comments(origin: Origin, placement: Placement) -> list[str]:
-    """What a PLY or a COLMAP file says of itself, a line each, in ASCII."""
+    """The comments of a PLY or COLMAP file, a line each, in ASCII."""
     about = {"generator": GENERATOR, **origin.record(), **placement.record()}
     return [f"{name} {_ascii(value)}" for name, value in about.items()]
 

@@ -1,1 +1,1 @@
-"""What a trained run shows: pictures, films, other light, and polarization priors."""
+"""Pictures of a trained run: layers, films, other light, and polarization priors."""

@@ -74,7 +74,7 @@ def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: f
 
 
 def _require_whole(encoder: Any, path: Path, count: int) -> None:
-    """Count the pictures of a video: the encoder is another program, whose end on a full disk nobody reports.
+    """Check the number of frames of a video: the encoder is another program, and does not report a full disk.
 
     Raises:
         OSError: there are fewer than were written.

@@ -1,4 +1,4 @@
-"""What somebody points at: a place on the surface, its normal, its color; and gains that make a color gray."""
+"""Picking: a place on the surface, its normal, its color; and gains that make a color gray."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class SurfacePoint:
 
 
 def surface_at(result: RenderResult, camera: Camera, x: float, y: float) -> SurfacePoint | None:
-    """What a rendering with depth shows at a place of its picture; None outside, or where there is no surface.
+    """The surface at a place of a rendering with depth; None outside the picture, or where there is no surface.
 
     Args:
         result: with the size of the camera. camera: it was rendered with.

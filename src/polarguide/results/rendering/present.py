@@ -68,7 +68,7 @@ def present(
         crop: ``none``, or left,right,down,up,front,back in percent of the cameras' distance, as the viewer counts.
         title, author, license, provenance: one line of text each; ``none`` or nothing removes it.
         device: what surfaces are rendered on.
-        reporter: told what takes long.
+        reporter: receives the progress of long operations.
 
     Returns:
         The presentation of the folder: for a run, its own over its scene's.
@@ -101,7 +101,7 @@ def present(
 
 
 class _Place:
-    """A scene's or a run's folder, of which only what is asked for is read."""
+    """A scene's or a run's folder, read as far as needed."""
 
     def __init__(self, folder: Path, device: DeviceName, reporter: Reporter) -> None:
         require_folder(
@@ -126,7 +126,7 @@ class _Place:
         return self._run.scene if self._is_run else load_scene(self.folder, reporter=self._reporter)
 
     def shown(self, own: Presentation) -> Presentation:
-        """What applies, where the folder's own says this."""
+        """The presentation that applies, with these values of the folder's own."""
         return own.over(read_presentation(self._scene_folder)) if self._is_run else own
 
     def refuse_inherited(self, names: Any) -> None:

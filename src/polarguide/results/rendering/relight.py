@@ -40,7 +40,7 @@ def relight(
         run: the run; its scene is read.
         panorama: file of linear radiance (.hdr, .exr), to be reflected in place of the learned environment.
         degrees: by which to turn the environment, counter-clockwise seen from above.
-        reporter: told what stays as it was learned.
+        reporter: receives a note of each layer that stays as it was learned.
 
     Raises:
         PolarguideError: the recipe learns no radiance, or the file cannot be read.

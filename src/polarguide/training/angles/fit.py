@@ -23,7 +23,7 @@ BLOCK = 16
 
 @dataclass(frozen=True)
 class FittedAngle:
-    """What a picture says about its polarizer.
+    """The polarizer angle that fits a picture.
 
     Attributes:
         angle: degrees in [0, 180), as ``Exposure.angle``.

@@ -1,4 +1,4 @@
-"""What a training finds out about the polarizers of its pictures: unknown angles, and known ones that contradict."""
+"""Polarizer angles as a training estimates them: unknown angles, and contradicted known ones."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Predict = Callable[[View], Tensor]
 
 @dataclass(frozen=True)
 class Judgment:
-    """What the training says of a picture.
+    """The training's judgment of a picture's angle.
 
     Attributes:
         view, number: the view, and the place of the picture among its exposures.
@@ -96,21 +96,21 @@ class Judgment:
 
     @property
     def off(self) -> float:
-        """Degrees from what is said to what was fitted, in [-90, 90); 0 where nothing is said."""
+        """Degrees from the specified to the fitted angle, in [-90, 90); 0 without a specified angle."""
         return (
             0.0 if self.specified.angle is None else (self.angle - self.specified.angle + 90.0) % 180.0 - 90.0
         )
 
     @property
     def limit(self) -> float:
-        """Degrees that a picture has to be ``off`` to contradict what is said: more than others are, since where all
-        are off, the model is what is wrong. From 90 on, nothing contradicts.
+        """Degrees that a picture has to be ``off`` to contradict its specified angle: more than others are,
+        since where all are off, the model is wrong. From 90 on, nothing contradicts.
         """
         return max(self.rules.contradicts, 3 * self.spread, 3 * TO_DEVIATION * self.usual)
 
     @property
     def contradicts(self) -> bool:
-        """Whether the picture contradicts what is said: also one that hardly tells its angle, whose limit is wide."""
+        """Whether the picture contradicts its specified angle, by more than its ``limit``."""
         return not self.unfiltered and abs(self.off) > self.limit
 
     @property
@@ -183,7 +183,7 @@ class Polarizers:
 
     @property
     def search(self) -> int:
-        """Steps until unknown angles are found; 0 where there are none."""
+        """Steps until unknown angles are found; 0 without unknown angles."""
         return sum(times[-1] for times in self._rounds) if self._unknown else 0
 
     @property
@@ -229,7 +229,7 @@ class Polarizers:
         return {name for name, exposures in self.beliefs.items() if before.get(name) != exposures}
 
     def judgments(self) -> list[Judgment]:
-        """What is said and believed of each picture; empty before the first fit."""
+        """Specified and assumed angles of each picture; empty before the first fit."""
         if self.table is None:
             return []
         common = self._common_gain()
@@ -252,7 +252,7 @@ class Polarizers:
         return judgments
 
     def _judged(self, fit: Tensor) -> list[Judgment]:
-        """What one fit [P, 8] says of each picture."""
+        """The judgment of each picture by one fit [P, 8]."""
         rows = [
             replace(
                 Judgment(view.name, k, view.exposures[k], view.exposures[k], *row[: ANGLE_COLUMNS - 1]),
@@ -281,7 +281,7 @@ class Polarizers:
         return values
 
     def _common_gain(self) -> float | None:
-        """What gains are relative to; None where they differ no more than those of locked exposures, as fitted."""
+        """The gain that others are relative to; None where gains differ as little as those of locked exposures."""
         assert self.table is not None
         last = zip(self._places, self.table[-1], strict=True)
         rows = [row for (view, k), row in last if not view.exposures[k].known]
@@ -312,7 +312,7 @@ def search_steps(recipe: Recipe, settings: ResolvedSettings) -> int:
 
 
 def _belief(judgment: Judgment, common: float | None) -> Exposure:
-    """What is believed of a picture of which nothing is said: a photograph where there is no angle to believe."""
+    """The exposure assumed for a picture without a specified angle: a photograph where no angle was fitted."""
     specified = judgment.specified
     if judgment.unfiltered:
         return replace(specified, filtered=False)

@@ -83,7 +83,7 @@ CHUNK = 1 << 14
 
 
 class Evidence(NamedTuple):
-    """What the views say of N Gaussians.
+    """Evidence of the views for N Gaussians.
 
     Attributes:
         ratio: [N] log(E_dielectric / E_metal), over the neighborhood, in which those of like brightness count.
@@ -137,7 +137,7 @@ def evidence(
     rules: MetalRules,
     memory: MemoryBound = UNBOUNDED,
 ) -> Evidence:
-    """What views say of each Gaussian; see ``training.metals.evidence``.
+    """Evidence of the views for each Gaussian; see ``training.metals.evidence``.
 
     Views whose pictures do not determine the Stokes vector say what the user says of materials in them, no more.
     """

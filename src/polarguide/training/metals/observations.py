@@ -1,4 +1,4 @@
-"""What views measured of each Gaussian, and what the user's labels in ``materials/`` say of it.
+"""Measurements of each Gaussian by the views, and its labels in ``materials/``.
 
 Pixels count by what the Gaussian has in them.
 """
@@ -164,7 +164,7 @@ def index_offsets(
     rasterize: Rasterize,
     memory: MemoryBound = UNBOUNDED,
 ) -> Tensor:
-    """What each Gaussian adds to the run's refractive index, [N].
+    """Offset of each Gaussian from the run's refractive index, [N].
 
     It is that of the material that most of its pixels in all views have; 0 where these say another one than the table
     lists, or nothing, and of metals.

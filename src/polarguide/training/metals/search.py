@@ -155,7 +155,7 @@ class MetalSearch:
         scene: the capture. recipe: says between which shares of the steps metals are looked for.
         settings: the user's choices. shading: the recipe's, for the run's refractive index.
         backend: device and rasterizer. ranks: the processes that share the work.
-        warn: told what the user should know. memory: gives back what was freed of each view that is looked at.
+        warn: receives messages for the user. memory: gives back what was freed of each view that is looked at.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ class MetalSearch:
     def warn_if_never(self, refreshes: Iterable[float]) -> None:
         """Say so where the user names materials and no refresh is due, of those after these shares of the steps.
 
-        Nothing is said of recipes that never refresh their priors, such as controls: they look for no metal.
+        Recipes that never refresh their priors, such as controls, do not look for metals and get no warning.
         """
         if not self._on or not any(_names_metals(view) for view in self._scene.train_views):
             return
