@@ -88,7 +88,7 @@ def test_too_few_steps_to_heed_materials_are_told_of(tiny_scene: Scene, minimum:
     else:
         (words,) = heard
         assert words.startswith(
-            "materials/ is heeded at refreshes of the priors between 40 and 72 % of the steps"
+            "materials/ is read at refreshes of the priors between 40 and 72 % of the steps"
         )
 
 

@@ -118,12 +118,12 @@ _COMMON = (
     ("without-consistency", "Normals need not agree with the depth.", off("consistency")),
     (
         "consistency-by-dolp",
-        "Normals agree with the depth where polarization says something, and nowhere else.",
+        "Normals agree with the depth only where the light is polarized.",
         priors(bright=0.0),
     ),
     (
         "normals-move-all",
-        "Terms on normals move what lies behind the subject, too.",
+        "Terms on normals also move Gaussians behind the subject.",
         staged(lambda stage: replace(stage, behind=None)),
     ),
     (
@@ -133,7 +133,7 @@ _COMMON = (
     ),
     (
         "layers-turn-normals",
-        "The terms on the layers reach the normals through what the layers mirror, too, from the beginning.",
+        "Gradients of the layer terms reach the normals through the reflection from the beginning.",
         staged(lambda stage: replace(stage, hold_normals=False)),
     ),
     (
@@ -143,7 +143,7 @@ _COMMON = (
     ),
     (
         "few-pixels-pull",
-        "The terms on directions are averaged over what is polarized, however few pixels that are.",
+        "The terms on directions are averaged over polarized pixels alone, however few.",
         priors(azimuth_share=0.0, chromatic_share=0.0),
     ),
     (
@@ -228,7 +228,7 @@ ABLATIONS_STOKES = varied(
     RECIPE_POLARGUIDE_STOKES,
     ("without-stokes", "S1 and S2 are not rendered.", off("stokes")),
     ("without-separation", "No term on the separated layers.", off("specular", "diffuse")),
-    ("without-normals", "No term on the normals but what S1 and S2 say.", _NORMAL_TERMS_OFF),
+    ("without-normals", "No term on the normals except that on S1 and S2.", _NORMAL_TERMS_OFF),
     (
         "without-fresnel",
         "Strength does not depend on the angle: the lerp of 3DGS-DR.",

@@ -76,9 +76,9 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
             reporter.warn(f"Most angles are doubtful, and so are the layers and normals. {REMEDY}")
     vague = [judgment for judgment in sought if judgment.vague]
     if guessed := [judgment for judgment in vague if judgment.guesses]:
-        reporter.warn(f"{named(guessed)} hardly tell their angle: the likeliest one is taken.")
+        reporter.warn(f"{named(guessed)} hardly determine their angle; the most likely one is used.")
     if lost := [judgment for judgment in vague if not judgment.guesses]:
-        reporter.warn(f"{named(lost)} do not tell their angle and are taken for photographs.")
+        reporter.warn(f"{named(lost)} do not determine their angle and are used as photographs.")
     if unsettled := [judgment for judgment in sought if judgment.unsettled]:
         reporter.warn(
             f"{named(unsettled)} may be at another angle: the fits of the training do not agree on it."

@@ -271,7 +271,7 @@ class OpenedRun:
                 "layers",
                 expected=f"layers of the recipe {self.recipe.name}",
                 found=f"{', '.join(absent)}, which it has not",
-                remedy="Leave out what it has not.",
+                remedy="Leave out the layers that it does not have.",
             )
         return layers
 

@@ -174,8 +174,8 @@ def test_a_guess_is_better_than_a_photograph(tmp_path: Path) -> None:
     heard = Heard()
     report_polarizers(tmp_path, scene, polarizers, heard)
     names = [scene.train_views[k].name for k in (guessed, lost)]
-    assert any(names[0] in text and "the likeliest one is taken" in text for text in heard.said)
-    assert any(names[1] in text and "taken for photographs" in text for text in heard.said)
+    assert any(names[0] in text and "the most likely one is used" in text for text in heard.said)
+    assert any(names[1] in text and "used as photographs" in text for text in heard.said)
 
 
 def test_swapped_pictures_and_missing_filters_are_named(tmp_path: Path) -> None:

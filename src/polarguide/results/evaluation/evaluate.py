@@ -129,7 +129,7 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
         views=views,
         run={
             "fps": fps,
-            "fps_reason": None if fps is not None else NOT_ALONE if speed else "not asked for",
+            "fps_reason": None if fps is not None else NOT_ALONE if speed else "not requested",
             "fps_layers": _speed(run, depth=True) if speed else None,
             "train_seconds": seconds if alone and seconds > 0 else None,
             "train_seconds_reason": None if alone and seconds > 0 else "no log of it" if alone else NOT_ALONE,

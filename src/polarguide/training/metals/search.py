@@ -192,7 +192,7 @@ class MetalSearch:
         if shares and not any(map(self.is_due, shares)):
             first, last = (100 * share for share in self._between)
             self._warn(
-                f"materials/ is heeded at refreshes of the priors between {first:.0f} and {last:.0f} % of the steps. "
+                f"materials/ is read at refreshes of the priors between {first:.0f} and {last:.0f} % of the steps. "
                 "A training this short has none there, and takes everything for dielectric. Take more steps."
             )
 
