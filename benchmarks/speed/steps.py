@@ -22,10 +22,11 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does,
 
 from polarguide import _native, open_run
 from polarguide.capture import load_scene
+from polarguide.core.errors import PolarguideError
 from polarguide.core.system import keep_freed_memory
 from polarguide.gaussians.gaussians import Trained
 from polarguide.raster import choose_backend, use_threads
-from polarguide.recipes import RECIPES
+from polarguide.recipes import recipe_named
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CONFIGURATION, load_checkpoint
 from polarguide.training.feed import Feed
@@ -140,7 +141,7 @@ def main() -> None:
         columns = []
         for count in threads:
             use_threads(count)
-            recipe = run.recipe if run is not None else RECIPES[name]
+            recipe = run.recipe if run is not None else recipe_named(name)
             state = load_checkpoint(options.source, recipe) if run is not None else None
             if state is not None:
                 state.frozen = None
@@ -161,4 +162,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except PolarguideError as error:
+        raise SystemExit(f"error: {error}") from None

@@ -143,7 +143,7 @@ def test_another_scene_recipe_value_or_program_has_another_key(monkeypatch: pyte
     assert len(set(keys)) == len(keys)
     assert key() == key()
     before = folders()
-    monkeypatch.setattr(plans, "code_digest", lambda: "other")
+    monkeypatch.setattr(plans, "code_digest", lambda training: "other")
     assert not set(before) & set(folders())
 
 

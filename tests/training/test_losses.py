@@ -247,8 +247,8 @@ def test_every_term_reads_targets_and_layers_that_there_are() -> None:
         assert alone.fields_read <= known, weight.name
         assert {*weight.metadata["rendered"]} <= {"normal", "depth", "layers"}, weight.name
         assert alone.normals == ("normal" in weight.metadata["rendered"]), weight.name
-        # Priors are made for whoever needs them, and the agreement with the depth does without.
-        assert alone.priors == (weight.name not in ("photometric", "flatness", "consistency", "coverage")), (
+        # Priors are computed for the terms that need them; a term that can do without them is marked as optional.
+        assert alone.priors == (bool(weight.metadata["priors"]) and not weight.metadata["optional"]), (
             weight.name
         )
 

@@ -1,11 +1,19 @@
-"""The learned environment in a checkpoint: names of one and of several parameters, and moments."""
+"""The state of a training: the learned light in a checkpoint, and first values of a shading model."""
 
 from __future__ import annotations
 
+import dataclasses
+from pathlib import Path
+
 import pytest
 import torch
+from toy_shading import TOY, SkyShading
 
-from polarguide.training.state import Environment
+import polarguide
+from polarguide.core.errors import PolarguideError
+from polarguide.runs.defaults import resolve
+from polarguide.training.settings import TrainSettings
+from polarguide.training.state import Environment, first_state
 
 RATES = {"texels": 0.1, "mlp_bias_0": 0.01}
 
@@ -60,3 +68,30 @@ def test_a_parameter_without_a_gradient_rests() -> None:
 def test_a_parameter_without_a_rate_is_refused() -> None:
     with pytest.raises(KeyError):
         Environment({"texels": torch.ones(2)}, {})
+
+
+@dataclasses.dataclass(frozen=True)
+class _Undeclared(SkyShading):
+    def initial_parameters(self, colors: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
+        return super().initial_parameters(colors, generator) | {"tint": torch.ones(len(colors))}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Dark(SkyShading):
+    def initial_light(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
+        return {}
+
+
+@pytest.mark.parametrize(
+    ("shading", "where", "values"),
+    [(_Undeclared(), "_Undeclared, tint", "["), (_Dark(), "_Dark, sky", "no values")],
+)
+def test_first_values_have_the_declared_shapes(
+    demo_scene: Path, shading: SkyShading, where: str, values: str
+) -> None:
+    scene = polarguide.load_scene(demo_scene, downscale=8)
+    recipe = dataclasses.replace(TOY, shading=shading)
+    with pytest.raises(PolarguideError) as refusal:
+        first_state(scene, recipe, resolve(TrainSettings(4), scene, recipe))
+    assert refusal.value.where == where
+    assert refusal.value.found.startswith(values)

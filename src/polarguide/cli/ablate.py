@@ -18,7 +18,7 @@ def ablate(
     steps: int | None = None,
     settings: Settings,
     options: Options,
-    base: str = "polarguide",
+    base: str = "polarguide-stokes",
     only: tuple[str, ...] = (),
     reference: tuple[str, ...] = (),
 ) -> None:

@@ -275,7 +275,7 @@ def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int
     )
     reading = SceneOptions(options.downscale, options.transfer, split=options.split)
     plugin = model_digest(type(recipe.shading)) if isinstance(recipe, Recipe) else ""
-    code = f"{__version__} {code_digest()}{plugin}"
+    code = f"{__version__} {code_digest(training=True)}{plugin}"
     key = run_key(scene.digest, recipe.data(), settings, reading, code=code)
     name = row.name.replace(":", "__").replace(" ", "-")
     folder = comparison.out / RUNS / scene.name / name / f"{seed}-{key}"

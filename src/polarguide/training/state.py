@@ -9,11 +9,13 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene
+from polarguide.core.errors import PolarguideError
 from polarguide.gaussians.densify import DensityStatistics
 from polarguide.gaussians.gaussians import ORIENTED_SHAPES, Gaussians, Trained
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.initialize import far_away, initial_parameters
 from polarguide.optics.color import srgb_decode
+from polarguide.shading.model import Parameter, ShadingModel
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import ResolvedSettings
 
@@ -112,6 +114,24 @@ def seeded(*numbers: int) -> torch.Generator:
     return torch.Generator().manual_seed(value)
 
 
+def _check_first_values(
+    shading: ShadingModel,
+    declared: Mapping[str, Parameter],
+    first: Mapping[str, Tensor],
+    leading: tuple[int, ...],
+) -> None:
+    """Refuse first values of a shading model that differ from the parameters that it declares."""
+    for name, parameter in declared.items():
+        shape = (*leading, *parameter.shape)
+        if name not in first or tuple(first[name].shape) != shape:
+            raise PolarguideError(
+                f"{type(shading).__name__}, {name}",
+                expected=f"first values of the declared shape {list(shape)}",
+                found=f"{list(first[name].shape)}" if name in first else "no values",
+                remedy="Declare the parameter in that shape, or return such values.",
+            )
+
+
 def first_state(
     scene: Scene,
     recipe: Recipe,
@@ -138,6 +158,11 @@ def first_state(
     tensors |= recipe.shading.initial_parameters(tensors["sh_dc"] * SH_C0 + 0.5, generator)
     tensors |= recipe.shading.placed_parameters(far_away(tensors["means"], scene.points, centers))
     light = {name: t.to(device) for name, t in recipe.shading.initial_light(generator).items()}
+    for declared, first, leading in (
+        (recipe.shading.parameters, tensors, (count,)),
+        (recipe.shading.light_parameters, light, ()),
+    ):
+        _check_first_values(recipe.shading, declared, first, leading)
     environment = Environment(light, recipe.light_rates) if light else None
     gaussians = Gaussians({name: t.to(device) for name, t in tensors.items()}, recipe.learning_rates)
     statistics = DensityStatistics(count, settings.views_per_step, gaussians["means"].device)

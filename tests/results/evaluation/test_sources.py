@@ -4,35 +4,51 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from polarguide.results.evaluation.sources import COMMIT, code_digest, commit
+from polarguide.results.evaluation.sources import COMMIT, NOT_TRAINING, code_digest, commit
 
 ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.mark.parametrize(
-    ("name", "counts"),
+    ("name", "text", "changes"),
     [
-        ("optics/a.py", True),
-        ("_native.so", True),
-        ("new.py", True),
-        ("_native.pyi", False),
-        ("data/picture.png", False),
+        ("optics/a.py", "second = 2", (True, True)),
+        ("optics/a.py", '"""Other words."""\nfirst = 1  # and a comment', (False, False)),
+        ("results/a.py", "second = 2", (True, False)),
+        ("_native.so", "second", (True, True)),
+        ("new.py", "", (True, True)),
+        ("_native.pyi", "second", (False, False)),
+        ("data/picture.png", "second", (False, False)),
     ],
 )
-def test_code_counts_and_other_files_do_not(tmp_path: Path, name: str, counts: bool) -> None:
-    for file in ("optics/a.py", "_native.so", "_native.pyi", "data/picture.png"):
+def test_code_counts_and_scoring_repeats_no_training(
+    tmp_path: Path, name: str, text: str, changes: tuple[bool, bool]
+) -> None:
+    for file in ("optics/a.py", "results/a.py", "_native.so", "_native.pyi", "data/picture.png"):
         (tmp_path / file).parent.mkdir(exist_ok=True)
-        (tmp_path / file).write_text("first")
-    code_digest.cache_clear()
-    before = code_digest(tmp_path)
-    (tmp_path / name).write_text("second")
-    code_digest.cache_clear()
-    assert (code_digest(tmp_path) != before) == counts
-    assert len(before) == 16
+        (tmp_path / file).write_text("first = 1")
+
+    def digests() -> list[str]:
+        code_digest.cache_clear()
+        return [code_digest(tmp_path, training=training) for training in (False, True)]
+
+    before = digests()
+    (tmp_path / name).write_text(text)
+    assert tuple(now != then for now, then in zip(digests(), before, strict=True)) == changes
+    assert {len(digest) for digest in before} == {16}
+
+
+def test_a_training_reaches_none_of_the_rooms_that_its_digest_leaves_out() -> None:
+    left_out = {f"polarguide.{name.removesuffix('.py')}" for name in NOT_TRAINING}
+    code = "import sys, polarguide.runs.train; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "polarguide.training.trainer" in loaded.split()
+    assert not {".".join(name.split(".")[:2]) for name in loaded.split()} & left_out
 
 
 def git(folder: Path, *words: str) -> str:

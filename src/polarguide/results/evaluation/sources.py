@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import inspect
 import subprocess
@@ -13,13 +14,24 @@ PACKAGE = Path(__file__).parents[2]
 COMMIT = "_commit.txt"
 """Beside the package's modules in a wheel: the commit it was built from, empty where that was not known."""
 DIGITS = 16
+NOT_TRAINING = ("results", "inspection", "viewer", "synth", "experiments", "api.py", "cli", "__main__.py")
+"""Rooms below ``runs`` in the order of imports: no training can reach them."""
 
 
 @lru_cache
-def code_digest(package: Path = PACKAGE) -> str:
-    """Sixteen hexadecimal digits that change with every Python file of the package and with the compiled library."""
+def code_digest(package: Path = PACKAGE, *, training: bool = False) -> str:
+    """Sixteen hexadecimal digits that change with the code of the package and with the compiled library.
+
+    Comments and docstrings do not count, so that editing them invalidates no result.
+
+    Args:
+        package: folder of the package.
+        training: only the code that a training can reach, so that a change of scoring repeats no training.
+    """
     compiled = [path for path in package.glob("_native.*") if path.suffix != ".pyi"]
-    return _digest(package, [*package.rglob("*.py"), *compiled])
+    left_out = NOT_TRAINING if training else ()
+    code = [path for path in package.rglob("*.py") if path.relative_to(package).parts[0] not in left_out]
+    return _digest(package, [*code, *compiled])
 
 
 def model_digest(kind: type) -> str:
@@ -31,9 +43,23 @@ def model_digest(kind: type) -> str:
 def _digest(folder: Path, files: Sequence[Path]) -> str:
     whole = hashlib.sha256()
     for path in sorted(files):
-        content = hashlib.sha256(path.read_bytes()).hexdigest()
+        content = hashlib.sha256(_code_of(path)).hexdigest()
         whole.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
     return whole.hexdigest()[:DIGITS]
+
+
+def _code_of(path: Path) -> bytes:
+    """The syntax tree of a Python file without docstrings; other files as they are."""
+    if path.suffix != ".py":
+        return path.read_bytes()
+    tree = ast.parse(path.read_bytes())
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):  # a text by itself is a docstring
+            node.body = [
+                s for s in body if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))
+            ]  # type: ignore[attr-defined]
+    return ast.dump(tree).encode()
 
 
 def commit(package: Path = PACKAGE) -> str | None:

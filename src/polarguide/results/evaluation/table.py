@@ -78,8 +78,8 @@ class Metric:
 
     def text(self, value: float) -> str:
         """A recorded value as the console shows it."""
-        number = f"{value:,}" if isinstance(value, int) else f"{value:.3f}"
-        return f"{number} {self.unit if self.factor == 1.0 else ''}".rstrip()
+        number = f"{value:,}" if isinstance(value, int) else f"{self.factor * value:.3f}"
+        return f"{number} {self.unit}".rstrip()
 
 
 def _compared(compare: Callable[..., Tensor], layer: str, *known: str) -> Measure:
