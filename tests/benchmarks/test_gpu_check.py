@@ -1,7 +1,5 @@
 """``make gpu-check`` without a GPU: scenes survive packing, the table, and the script itself with tiny sizes."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

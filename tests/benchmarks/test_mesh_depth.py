@@ -1,7 +1,5 @@
 """``benchmarks/accuracy/mesh_depth.py`` takes meshes back to the axes of their scene."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """For tests of the command line: refused command lines, and runs that may be changed."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

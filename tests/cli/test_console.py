@@ -1,17 +1,20 @@
-"""What the console shows of messages, warnings and progress."""
+"""What the console shows: messages, warnings, progress and help."""
 
-from __future__ import annotations
-
+import dataclasses
+import inspect
 import io
+import subprocess
 import sys
 import warnings
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 from rich.console import Console
 
+from polarguide import __version__
 from polarguide.cli import console
-from polarguide.cli.app import run
+from polarguide.cli.app import VERBS, function_of, options_of, run
 from polarguide.cli.console import ConsoleReporter, JobReporter, Lines, bars, say, size_text, warnings_printed
 from polarguide.cli.evaluate import _errors, print_scores
 from polarguide.core.errors import PolarguideWarning
@@ -119,8 +122,7 @@ def test_the_console_shows_brackets_as_they_are(capsys: pytest.CaptureFixture[st
     with reporter.track("[y]") as advance:
         advance(1)
         advance(2, total=2, note="[z]")
-    out = capsys.readouterr().out
-    assert "[bold]view[/] 1\nwarning: [x] is odd\n" in out
+    assert "[bold]view[/] 1\nwarning: [x] is odd\n" in capsys.readouterr().out
 
 
 def test_eighty_columns_hold_step_total_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,3 +163,97 @@ def test_the_time_left_follows_from_the_last_minutes(capsys: pytest.CaptureFixtu
     said = capsys.readouterr().out.splitlines()
     assert "training 900/2000, 0:01:50 left" in said
     assert said[-1] == "training 1490/2000, 0:08:30 left"
+
+
+# Fields that a verb sets by other options of its own.
+ELSEWHERE = {
+    *(
+        (verb, name)
+        for verb in ("compare", "ablate")
+        for name in ("seed", "views_per_step", "gaussians", "begin_again", "materials")
+    ),
+    ("prepare", "calibration"),
+    ("prepare", "analyzers"),
+    ("measure", "calibration"),
+    *((verb, "analyzers") for verb in ("measure", "priors")),
+}
+HEAVY = ("torch", "scipy", "pycolmap", "cv2", "viser")
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_of_every_verb_names_and_explains_every_flag(
+    verb: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as stop:
+        run([verb, "--help"])
+    assert not stop.value.code
+    text = capsys.readouterr().out
+    function = function_of(verb)
+    about = inspect.getdoc(function) or ""
+    assert about.splitlines()[0] in text
+    kinds = get_type_hints(function)
+    for parameter in inspect.signature(function).parameters.values():
+        kind, fields, explained = kinds[parameter.name], [parameter.name], about
+        if dataclasses.is_dataclass(kind):
+            fields = [field.name for field in dataclasses.fields(kind)]
+            explained = "\n".join(base.__doc__ or "" for base in kind.__mro__)
+            fields = [name for name in fields if (verb, name) not in ELSEWHERE]
+        for name in fields:
+            if parameter.kind is parameter.KEYWORD_ONLY:
+                flag = f"--{name.replace('_', '-')}"
+                assert f"{flag} " in text or f"{flag}, --no-" in text, name
+            assert f"{name}:" in explained, f"{name} is not explained"
+        assert set(fields) <= set(options_of(function))
+
+
+LOADED = """
+import contextlib, sys
+from polarguide.__main__ import main
+for line in sys.argv[1:]:
+    sys.argv[1:] = line.split()
+    with contextlib.suppress(SystemExit):
+        main()
+    print("loaded by", line, *[name for name in HEAVY if name in sys.modules])
+"""
+
+
+def test_help_loads_nothing_heavy() -> None:
+    lines = ["--help", "--version", "trian", "", *(f"{verb} --help" for verb in VERBS)]
+    command = [sys.executable, "-c", f"HEAVY = {HEAVY}{LOADED}", *lines]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    loaded = [line for line in done.stdout.splitlines() if line.startswith("loaded by")]
+    assert loaded == [f"loaded by {line}" for line in lines]
+
+
+def test_help_names_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run(["--help"])
+    text = capsys.readouterr().out
+    assert all(verb in text for verb in VERBS)
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["train"], ["eval", "run", "--wings", "2"], ["demo", "--steps", "many"]]
+)
+def test_what_cannot_be_parsed_exits_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        run(arguments)
+    assert stop.value.code == 2
+    printed = capsys.readouterr()
+    assert not printed.out
+    assert "Traceback" not in printed.err
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--version"]) == 0
+    assert capsys.readouterr().out == f"polarguide {__version__}\n"
+
+
+def test_python_m_and_its_exit_status() -> None:
+    command = [sys.executable, "-m", "polarguide", "eval", "no-such-run"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1
+    assert done.stderr.startswith("error: no-such-run: expected a run folder")

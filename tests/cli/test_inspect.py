@@ -1,7 +1,5 @@
 """``polarguide inspect`` from the command line: page, record, --fix, and wrong input."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -120,34 +118,6 @@ def test_fix_refuses_what_is_not_decided(
     assert run(arguments) == 2
     assert "geometry does not decide" in capsys.readouterr().err
     assert not fixed.exists()
-
-
-@pytest.mark.parametrize(
-    ("more", "named"),
-    [
-        (["--steps", "0"], "--steps"),
-        (["--downscale", "-1"], "--downscale"),
-        (["--refractive-index", "0.9"], "--refractive-index"),
-        (["--threads", "-1"], "threads"),
-        (["--downscale", "5000"], "downscale"),
-    ],
-)
-def test_wrong_flags(
-    unposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], named: str
-) -> None:
-    assert run(["inspect", str(unposed), "--out", str(tmp_path / "out"), *more]) == 2
-    assert named in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_wrong_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["inspect", str(tmp_path / "nowhere")]) == 2
-    assert "expected a capture folder" in capsys.readouterr().err
-    (tmp_path / "file").write_text("")
-    (tmp_path / "scene").mkdir()
-    assert run(["inspect", str(tmp_path / "scene"), "--out", str(tmp_path / "file")]) == 2
-    assert "expected a folder to write" in capsys.readouterr().err
-    assert list((tmp_path / "scene").iterdir()) == []
 
 
 def test_fixing_needs_four_pictures(

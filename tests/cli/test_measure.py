@@ -1,7 +1,5 @@
 """``polarguide measure``: its exit status, its lines, and what it writes."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path
@@ -98,13 +96,6 @@ def test_a_golden_part(shots: Path, tmp_path: Path) -> None:
     ]
 
 
-def test_a_reference_of_another_size(shots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cv2.imwrite(str(tmp_path / "small.png"), np.full((32, 32), 900, np.uint16))
-    assert measure(shots / "v000.png", "--out", tmp_path / "out", "--reference", tmp_path / "small.png") == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "expected 32x32 pixels like the reference small, found 64x48" in line
-
-
 def test_colors_of_differences() -> None:
     picture = diverging(np.array([[-1.0, -0.5, 0.0, 0.5, 1.0, 9.0, np.nan]], np.float32), 1.0)[0].astype(int)
     assert picture[0, 2] > picture[0, 0]
@@ -113,40 +104,6 @@ def test_colors_of_differences() -> None:
     assert (picture[4] == picture[5]).all()
     assert len(set(picture[6])) == 1
     assert picture[6, 0] < picture[2, 0]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("--roi", f"1,2,3,{'9' * 5000}"), "--roi: expected x,y,width,height"),
-        (("--roi", "1,2,3"), "--roi: expected x,y,width,height"),
-        (("--roi", "a=0,0,1,1", "--roi", "a=0,0,2,2"), "a twice"),
-        (("--roi", "60,40,10,10"), "the region roi1 within 64x48 pixels"),
-        (("--threshold", "2"), "--threshold: expected 0 to 1"),
-        (("--limits", "none.json"), "none.json: expected a readable file"),
-        (("--reference", "none.png"), "none.png: expected a file or folder of shots"),
-        (
-            ("--dark-frame", "none.png"),
-            "none.png: expected a dark frame, found nothing. Check --dark-frame.",
-        ),
-        (("--watch", "."), "--watch: expected shots to measure, or a folder to watch"),
-        (("--settle", "-1"), "--settle"),
-    ],
-)
-def test_one_line_for_a_mistake(
-    arguments: tuple[str, ...], said: str, shots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert measure(shots / "v000.png", "--out", tmp_path / "out", *arguments) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("error: ")
-    assert said in line
-
-
-def test_nothing_to_measure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert measure("--out", tmp_path / "out") == 2
-    assert "found neither" in capsys.readouterr().err
-    assert measure("--watch", tmp_path / "none", "--out", tmp_path / "out") == 2
-    assert "expected a folder to watch" in capsys.readouterr().err
 
 
 def test_ambiguous_and_incomplete_shots_are_lines_of_their_own(
@@ -196,9 +153,17 @@ def test_a_watch_says_at_its_end_what_never_came(tmp_path: Path, capsys: pytest.
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize("option", ["--settle", "--patience", "--idle"])
-def test_options_of_a_watch_need_one(
-    shots: Path, tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("options", "found"), [(("--roi", "60,40,10,10"), "64x48"), (("--reference", "small.png"), "64x48")]
+)
+def test_pictures_that_options_do_not_fit(
+    shots: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    refused,
+    options: tuple[str, ...],
+    found: str,
 ) -> None:
-    assert run(["measure", str(shots), "--out", str(tmp_path / "out"), *SENSOR, option, "7"]) == 2
-    assert f"{option}: expected --watch" in capsys.readouterr().err
+    monkeypatch.chdir(tmp_path)
+    cv2.imwrite("small.png", np.full((32, 32), 900, np.uint16))
+    assert found in refused("measure", shots / "v000.png", "--out", "out", *options, *SENSOR)

@@ -1,7 +1,5 @@
 """The verbs one after another on the demo scene: what they write is whole, valid and of the right size."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

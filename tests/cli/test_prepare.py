@@ -1,7 +1,5 @@
 """``polarguide prepare``: from camera files and datasets to a scene that trains."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import pytest
 from dataset_files import write_nersp
 
 from polarguide.cli.app import run
+from tests.shots.test_read import CUP, write_four, write_mosaic
 
 CELL = ((90, 45), (135, 0))
 
@@ -56,28 +55,6 @@ def test_mosaics_to_a_trained_scene(
     assert run(["train", scene, "--out", out, "--steps", "4", "--downscale", "4", "--threads", "1"]) == 0
 
 
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        ([], "raw mosaics with --sensor, or a published dataset"),
-        (["--sensor", "IMX250MYR", "--order", "0,90"], "--order: expected four angles such as 90,45,0,135"),
-        (["--sensor", "IMX250MYR", "--calibration", "none.json"], "none.json: expected a readable file"),
-        (["--sensor", "IMX250MYR", "--zero", "nan"], "calibration (zero): expected a finite number"),
-        (["--sensor", "IMX250MYR", "--poses", "none", "--threads", "-1"], "threads"),
-    ],
-)
-def test_one_line_for_a_mistake(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], message: str
-) -> None:
-    (tmp_path / "in").mkdir()
-    assert cv2.imwrite(str(tmp_path / "in" / "a.png"), np.full((32, 32), 90, np.uint8))
-    assert run(["prepare", str(tmp_path / "in"), "--out", str(tmp_path / "out"), *flags]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert message in lines[0]
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_dataset_becomes_a_scene_that_trains(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_nersp(tmp_path / "in")
     source, scene, out = (str(tmp_path / name) for name in ("in", "scene", "run"))
@@ -90,15 +67,47 @@ def test_a_dataset_becomes_a_scene_that_trains(tmp_path: Path, capsys: pytest.Ca
     assert run(["train", scene, "--out", out, "--steps", "2", "--threads", "1"]) == 0
 
 
-def test_one_line_for_a_link_that_goes_nowhere(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_nersp(tmp_path / "in")
-    loop = tmp_path / "loop"
-    loop.symlink_to(loop)
-    for flags in (
-        ["--poses", str(loop)],
-        ["--format", "mosaic", "--sensor", "IMX250MZR", "--dark-frame", str(loop)],
-    ):
-        assert run(["prepare", str(tmp_path / "in"), "--out", str(tmp_path / "out"), *flags]) == 2
-        lines = capsys.readouterr().err.splitlines()
-        assert len(lines) == 1, lines
-        assert not (tmp_path / "out").exists()
+def test_a_folder_of_mosaics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "in").mkdir()
+    for name in "ab":
+        write_mosaic(tmp_path / "in" / f"{name}.png")
+    arguments = ["--sensor", "IMX250MZR", "--out", str(tmp_path / "out"), "--formats", "png,page"]
+    assert run(["priors", str(tmp_path / "in"), *arguments]) == 0
+    assert "12 bits" in capsys.readouterr().out
+    for name in "ab":
+        assert (tmp_path / "out" / name / "AoLP.png").is_file()
+        assert (tmp_path / "out" / name / "shot.html").is_file()
+
+
+def test_four_files_and_a_calibration(tmp_path: Path) -> None:
+    paths = [str(path) for path in write_four(tmp_path / "in", CUP)]
+    arguments = ["--out", str(tmp_path / "out"), "--formats", "npy", "--transfer", "linear", "--sense", "cw"]
+    assert run(["priors", *paths, *arguments]) == 0
+    assert (tmp_path / "out" / "cup" / "DoLP.npy").is_file()
+
+
+def test_one_of_a_folder_that_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "in").mkdir()
+    for name in "ab":
+        write_mosaic(tmp_path / "in" / f"{name}.png")
+    (tmp_path / "in" / "b.png").write_bytes(b"no picture")
+    arguments = ["--sensor", "IMX250MZR", "--out", str(tmp_path / "out"), "--formats", "npy"]
+    assert run(["priors", str(tmp_path / "in"), *arguments]) == 2
+    found = capsys.readouterr()
+    assert "expected 2 shots, found 1 that failed (b)" in found.err
+    assert "b.png: expected a complete PNG" in found.out
+    assert (tmp_path / "out" / "a" / "DoLP.npy").is_file()
+
+
+def test_a_folder_with_ambiguous_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_four(tmp_path / "in", CUP)
+    write_four(tmp_path / "in", tuple(name.replace("cup", "jar") for name in CUP))
+    (tmp_path / "in" / "cup_45.tif").write_bytes((tmp_path / "in" / "cup_45.png").read_bytes())
+    assert run(["priors", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--formats", "npy"]) == 2
+    printed = capsys.readouterr()
+    assert "one picture of cup at 45 degrees, found cup_45.png and cup_45.tif" in " ".join(
+        printed.out.split()
+    )
+    assert "expected 2 shots, found 1 that failed (cup)" in printed.err
+    assert (tmp_path / "out" / "jar" / "DoLP.npy").is_file()
+    assert not (tmp_path / "out" / "cup").exists()

@@ -1,78 +1,42 @@
 """Verbs that write one thing: scale, tables, bench, synth, calibrate."""
 
-from __future__ import annotations
-
+import csv
 import io
 import json
+import os
 import re
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from comparison_records import content
-from comparison_records import run as run_record
 from made_sensor import made_sensor, write_codes, write_polarizer_shots
 
 from polarguide.capture.filter.ring_scale import ring_scale
 from polarguide.cli.app import run
 from polarguide.core.errors import install_extra
+from polarguide.experiments.options import CompareOptions
+from polarguide.experiments.plan import Comparison, plan_runs, scene_entries
+from polarguide.experiments.record import read_results
+from polarguide.recipes import recipe_named
+from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide.synth.schema import SceneSpec
 from polarguide.synth.settings import Variant, choose_variant
+from polarguide.training.settings import TrainSettings
 
 
 def test_the_command_writes_it_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "a.svg"
+    """And makes the folder."""
+    out = tmp_path / "some" / "folder" / "a.svg"
     assert run(["scale", "--diameter", "70", "--out", str(out)]) == 0
     assert out.read_text() == ring_scale(70.0)
     assert run(["scale", "--diameter", "70", "--out", str(out)]) == 0
     assert run(["scale", "--diameter", "60", "--out", str(out)]) == 2
     assert "Give another --out" in capsys.readouterr().err
     assert out.read_text() == ring_scale(70.0)
-    for wrong in ("nan", "3", "1000"):
-        assert run(["scale", "--diameter", wrong, "--out", str(tmp_path / "b.svg")]) == 2
-    assert "--diameter: expected 20 to 160" in capsys.readouterr().err
-
-
-def test_the_folder_is_made(tmp_path: Path) -> None:
-    out = tmp_path / "some" / "folder" / "a.svg"
-    assert run(["scale", "--diameter", "70", "--out", str(out)]) == 0
-    assert out.read_text() == ring_scale(70.0)
-
-
-def test_wrong_input_of_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "x.json").write_text(json.dumps(content([run_record("x", "3dgs", 0, psnr=30.0)])))
-    (tmp_path / "y.json").write_text(json.dumps({"format": "polarguide-results-2"}))
-    for arguments, said in (
-        ([str(tmp_path / "none.json")], "none.json"),
-        ([str(tmp_path)], "results.json"),
-        ([str(tmp_path / "x.json"), str(tmp_path / "y.json")], "y.json"),
-        ([str(tmp_path / "x.json"), "--against", "ref-gs"], "--against: expected one of 3dgs"),
-        ([], "expected a record"),
-    ):
-        assert run(["tables", *arguments, "--out", str(tmp_path / "all")]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert said in line
-        assert not (tmp_path / "all").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--scenes", "rough"], "--scenes: expected scenes of the development half"),
-        (["--scenes", "cat"], "--scenes: expected one of figure, kit, car, water"),
-        (["--held-back", "--scenes", "kit"], "--scenes: expected one of metals-b, ceramic-b"),
-        (["--threads", "0"], "--threads: expected 1 or more"),
-        (["--jobs", "-1"], "--jobs: expected 0 or more"),
-    ],
-)
-def test_refusals(
-    arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(["bench", "--out", str(tmp_path / "x"), *arguments]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert said in line
-    assert not (tmp_path / "x").exists()
 
 
 @pytest.mark.parametrize("words", [["bench", "--render-only"], ["synth", "proof"]])
@@ -127,7 +91,6 @@ def test_a_long_rendering_is_announced_and_asked_for_before_there_is_a_folder(
     said = capsys.readouterr()
     assert "LLVM" in said.out
     told = re.search(r"Rendering will take about \d+ (\w+)", said.out)
-    assert told is not None
     assert told[1] == ("minutes" if "--size" in options else "hours")
     assert status == (130 if begun else 2)
     assert (bool(started), out.exists()) == (begun, begun)
@@ -170,39 +133,78 @@ def test_from_shots_to_a_corrected_scene(
     assert found["corrected"] == pytest.approx(true, abs=0.002)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["calibrate", "nowhere", "--out", "c.safetensors", "--sensor", "IMX250MZR"], "nowhere"),
-        (["calibrate", ".", "--out", "../c.safetensors", "--sensor", "IMX250MZR"], "at least 5 shots"),
-        (
-            ["calibrate", ".", "--out", "c.png", "--sensor", "IMX250MZR"],
-            "--out: expected a file name that ends in",
-        ),
-        (
-            ["inspect", ".", "--fix", "new", "--calibration", "c.safetensors"],
-            "--fix: expected no --calibration",
-        ),
-        (
-            ["prepare", ".", "--out", "new", "--sensor", "IMX250MZR", "--calibration", "no.safetensors"],
-            "found No such file",
-        ),
-        (["synth", "cat", "--out", "new"], "cat"),
-        (["synth", "proof", "--size", "big", "--out", "new"], "--size"),
-        (["synth", "proof", "--sweep", "size=1", "--out", "new"], "--sweep"),
-    ],
-)
-def test_wrong_input_is_one_line(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    expected: str,
+PATIENCE = 120.0
+FLAGS = ("--steps", "200", "--downscale", "8", "--jobs", "1", "--recipes", "3dgs-dr")
+
+
+def planned_folders(scene: Path, out: Path) -> list[Path]:
+    """The run folders of the comparison of ``FLAGS`` and 3dgs."""
+    question = Comparison(
+        scenes=(scene,),
+        recipes=(recipe_named("3dgs-dr"), recipe_named("3dgs")),
+        settings=TrainSettings(200, 0),
+        options=CompareOptions(downscale=8),
+        out=out,
+    )
+    return [planned.folder for planned in plan_runs(question, scene_entries(question))]
+
+
+@pytest.mark.slow
+def test_interrupted_failed_and_finished(
+    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_codes(tmp_path / "v0.png", np.full((64, 64), 0.5))
-    assert run(arguments) == 2
-    error = capsys.readouterr().err
-    assert expected in error
-    assert len(error.splitlines()) == 1
-    assert not (tmp_path / "new").exists()
+    out = tmp_path / "out"
+    alone = ["compare", str(demo_scene), "--out", str(out), *FLAGS]
+    command = [*alone, "3dgs"]
+
+    # Ctrl-C while the first run trains: its state is saved, and nobody is left at work.
+    process = subprocess.Popen(
+        [sys.executable, "-m", "polarguide", *command],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    give_up = time.monotonic() + PATIENCE
+    while not list(out.rglob(LOG)) and time.monotonic() < give_up:
+        assert process.poll() is None
+        time.sleep(0.01)
+    # Another comparison in the same folder is turned away meanwhile.
+    assert run(command) == 2
+    assert "another comparison at work in it" in capsys.readouterr().err
+    process.send_signal(signal.SIGINT)
+    assert process.wait(PATIENCE) == 130
+    (first,) = (path.parent for path in out.rglob(CHECKPOINT))
+    assert not (first / "metrics.json").exists()
+    before = [json.loads(line) for line in (first / LOG).read_text().splitlines()]
+
+    # The same command goes on with it. The second run cannot work: its folder holds something else.
+    (second,) = (folder for folder in planned_folders(demo_scene, out) if folder != first)
+    second.mkdir(parents=True)
+    (second / "run.json").write_text("{}")
+    assert run(command) == 2
+    said = capsys.readouterr()
+    assert "expected 2 finished runs, found that 1 failed (demo, 3dgs, seed 0: " in said.err
+    assert f"{second}/run.json: expected " in said.err
+    assert len(said.err.splitlines()) == 1
+    assert "done  demo, 3dgs-dr, seed 0" in said.out
+    assert [r.state for r in read_results(out / "results.json").runs] == ["done", "failed"]
+    lines = [json.loads(line) for line in (first / LOG).read_text().splitlines()]
+    assert [line["step"] for line in lines] == list(range(9, 200, 10))
+    assert lines[: len(before)] == before, "it went on instead of starting over"
+    assert "| `3dgs` (failed) |  |" in (out / "results.md").read_text()
+
+    # What is finished is not done again, in a comparison with other recipes neither.
+    stamp = (first / "metrics.json").stat().st_mtime_ns
+    assert run(alone) == 0
+    assert "runs: 1, of them finished before: 1" in capsys.readouterr().out
+    assert (first / "metrics.json").stat().st_mtime_ns == stamp
+    record = json.loads((out / "results.json").read_text())
+    assert [r["state"] for r in record["runs"]] == ["done"]
+    with open(out / "results.csv") as file:
+        (row,) = csv.DictReader(file)
+    assert float(row["specular_psnr"]) == record["runs"][0]["metrics"]["specular_psnr"]
+    assert "\\toprule" in (out / "results.tex").read_text()
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png") == 3 * 2  # the true and the rendered normals of three views
+    assert page.count("data:image/jpeg") == 3 * (3 + 5)
+    assert not list(out.glob(".*.tmp"))

@@ -1,7 +1,5 @@
 """The command under a shell: closed or full streams, folders that go away, kills, limits of memory, empty names."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import json
@@ -205,8 +203,7 @@ def test_killed_and_resumed_is_uninterrupted(
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert process.returncode == -signal.SIGKILL, "it ended before it could be killed"
-    step = int(load_file(killed / CHECKPOINT)["scalars"][0])
-    assert 0 < step < steps
+    assert 0 < int(load_file(killed / CHECKPOINT)["scalars"][0]) < steps
     for out, flags in ((killed, ("--resume",)), (whole, ())):
         process = launch(demo_scene, out, recipe, steps, *flags)
         _, errors = process.communicate(timeout=PATIENCE)

@@ -1,7 +1,5 @@
 """Verbs on a device that is not the CPU, with values; and verbs on a field in place of Gaussians."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
@@ -10,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from faults import Fault
 from other_device import BACKEND, OtherDevice
 
 from polarguide.api import Run, open_run
@@ -18,7 +17,6 @@ from polarguide.capture.presentation import Crop
 from polarguide.cli.app import run
 from polarguide.cli.compare import chosen_steps
 from polarguide.cli.render import render
-from polarguide.core.errors import PolarguideError
 from polarguide.core.options import ComputeOptions
 from polarguide.experiments.record import read_results
 from polarguide.geometry.scene_frame import scene_frame
@@ -27,6 +25,7 @@ from polarguide.results.evaluation.metrics import HAZE_DEPTH
 from polarguide.results.evaluation.perceptual import load_package
 from polarguide.results.evaluation.scores import ErrorsByObject, score_view
 from polarguide.results.evaluation.target import SceneFacts, ViewTarget
+from polarguide.runs import opened as opening
 from polarguide.viewer import run_scenery
 from polarguide.viewer.scenery import Appearance, Painter
 
@@ -34,8 +33,6 @@ from polarguide.viewer.scenery import Appearance, Painter
 @pytest.fixture
 def elsewhere(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run folder, which is opened on the other device unless the CPU is asked for."""
-    from polarguide.runs import opened as opening
-
     choose = opening.choose_backend
     monkeypatch.setattr(
         opening, "choose_backend", lambda name, **more: choose(name, **more) if name == "cpu" else BACKEND
@@ -144,18 +141,7 @@ def test_steps_of_recipes() -> None:
 
 @pytest.mark.parametrize("words", [("5000", "3000"), ("gnerp=",), ("gnerp=1", "gnerp=2"), ("many",), ("-5",)])
 def test_steps_that_cannot_be_read(words: tuple[str, ...]) -> None:
-    with pytest.raises(PolarguideError, match="--steps"):
-        chosen_steps(words)
-
-
-def test_steps_of_a_recipe_that_is_not_compared(
-    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    command = ["compare", str(demo_scene), "--recipes", "3dgs", "--steps", "5", "gnerp=9", "--out", str(out)]
-    assert run(command) == 2
-    assert "gnerp" in capsys.readouterr().err
-    assert not out.exists()
+    Fault("--steps").raised_by(chosen_steps, words)
 
 
 @pytest.mark.slow

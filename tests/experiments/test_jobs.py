@@ -1,23 +1,27 @@
-"""Child processes, with a stand-in for the worker that starts fast: failures stay alone, Ctrl-C loses nothing."""
-
-from __future__ import annotations
+"""Child processes: failures stay alone, Ctrl-C loses nothing, and the worker does what it is sent."""
 
 import contextlib
+import json
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
-from polarguide.core.options import ComputeOptions
+from polarguide.core.options import ComputeOptions, SceneOptions
 from polarguide.core.progress import Advance, Reporter
+from polarguide.core.records import decode
 from polarguide.core.system import interrupt
 from polarguide.experiments.jobs import Job, last_row, run_jobs
-from polarguide.experiments.worker import Scoring
+from polarguide.experiments.worker import COMMAND, Scoring, Training, encoded
+from polarguide.runs.folder import CHECKPOINT, LOG
+from polarguide.training.settings import TrainSettings
 
 # Reads its task, writes down that it begins, does what the name of the device asks for, and writes down the end.
 PROGRAM = """
@@ -47,7 +51,7 @@ if verb in ("wait", "deaf"):
     sys.exit(130)
 time.sleep(0.2)
 """
-COMMAND = (sys.executable, "-S", "-c", PROGRAM)
+STAND_IN = (sys.executable, "-S", "-c", PROGRAM)
 
 
 @pytest.fixture
@@ -97,7 +101,7 @@ class Watch(Reporter):
 def test_a_failure_takes_no_other_job_down(job: Callable[..., Job]) -> None:
     watch = Watch()
     todo = [job("a", "train", "eval"), job("b", "fail", "eval"), job("c", "quiet")]
-    run_jobs(todo, parallel=2, reporter=watch, on_end=watch.end, command=COMMAND)
+    run_jobs(todo, parallel=2, reporter=watch, on_end=watch.end, command=STAND_IN)
     assert watch.ended == {"a": None, "b": "b is broken.", "c": "the process ended with status 3"}
     assert set(watch.said) == {"done  a", "failed  b: b is broken.", f"failed  c: {watch.ended['c']}"}
     assert watch.most == 2
@@ -126,7 +130,7 @@ def test_ctrl_c_asks_every_child_once_and_waits(job: Callable[..., Job]) -> None
     watch, todo = Watch(), [job("a", "wait"), job("b", "wait"), job("c", "wait")]
     thread = interrupt_when(lambda: all((j.folder / "ready").exists() for j in todo[:2]))
     with pytest.raises(KeyboardInterrupt):
-        run_jobs(todo, parallel=2, reporter=watch, on_end=watch.end, command=COMMAND)
+        run_jobs(todo, parallel=2, reporter=watch, on_end=watch.end, command=STAND_IN)
     assert [(j.folder / "asked").read_text() for j in todo[:2]] == ["1", "1"]
     assert not todo[2].folder.exists()
     assert watch.ended == {}
@@ -138,7 +142,7 @@ def test_a_second_ctrl_c_does_not_wait(job: Callable[..., Job]) -> None:
     begin = time.monotonic()
     thread = interrupt_when((deaf.folder / "ready").exists, (deaf.folder / "heard").exists)
     with pytest.raises(KeyboardInterrupt):
-        run_jobs([deaf], parallel=1, reporter=Watch(), command=COMMAND)
+        run_jobs([deaf], parallel=1, reporter=Watch(), command=STAND_IN)
     assert time.monotonic() - begin < 20
     assert not (deaf.folder / "asked").exists()
     thread.join()
@@ -152,7 +156,7 @@ def test_an_error_of_the_reporter_leaves_no_child_at_work(job: Callable[..., Job
             raise RuntimeError("no display")
 
     with pytest.raises(RuntimeError, match="no display"):
-        run_jobs([waiting], parallel=1, reporter=Watch(fail), command=COMMAND)
+        run_jobs([waiting], parallel=1, reporter=Watch(fail), command=STAND_IN)
     assert (waiting.folder / "asked").read_text() == "1"
 
 
@@ -166,7 +170,7 @@ def test_sigterm_acts_like_ctrl_c(job: Callable[..., Job]) -> None:
     before = signal.signal(signal.SIGTERM, interrupt)
     try:
         with pytest.raises(KeyboardInterrupt):
-            run_jobs([waiting], parallel=1, reporter=Watch(terminate), command=COMMAND)
+            run_jobs([waiting], parallel=1, reporter=Watch(terminate), command=STAND_IN)
     finally:
         signal.signal(signal.SIGTERM, before)
     assert (waiting.folder / "asked").read_text() == "1"
@@ -177,7 +181,7 @@ def test_the_library_installs_no_signal_handlers(job: Callable[..., Job]) -> Non
     before = [signal.getsignal(number) for number in numbers]
     during = []
     watch = Watch(lambda: during.append([signal.getsignal(number) for number in numbers]))
-    run_jobs([job("a", "eval")], parallel=1, reporter=watch, command=COMMAND)
+    run_jobs([job("a", "eval")], parallel=1, reporter=watch, command=STAND_IN)
     assert during
     assert all(handlers == before for handlers in during)
 
@@ -187,7 +191,6 @@ def test_the_last_row_of_a_log(tmp_path: Path) -> None:
     assert last_row(log) is None
     log.write_text('{"step": 9}\n' * 1000 + '{"step": 19}\n{"st')
     row = last_row(log)
-    assert row is not None
     assert row.step == 19
     log.write_text("nonsense\n")
     assert last_row(log) is None
@@ -210,7 +213,7 @@ def test_nothing_is_written_through_a_link(job: Callable[..., Job], tmp_path: Pa
     victim.write_text("mine")
     made.folder.mkdir()
     (made.folder / name).symlink_to(victim)
-    run_jobs([made], parallel=1, reporter=Watch(), command=COMMAND)
+    run_jobs([made], parallel=1, reporter=Watch(), command=STAND_IN)
     assert victim.read_text() == "mine"
 
 
@@ -219,5 +222,89 @@ def test_pipes_in_a_runs_folder_end_nothing(job: Callable[..., Job]) -> None:
     made.folder.mkdir()
     for name in ("stderr.txt", "log.jsonl"):
         os.mkfifo(made.folder / name)
-    run_jobs([made], parallel=1, reporter=Watch(), command=COMMAND)
+    run_jobs([made], parallel=1, reporter=Watch(), command=STAND_IN)
     assert (made.folder / "did").read_text().startswith("eval")
+
+
+PATIENCE = 120.0
+
+
+def training(scene: Path, folder: Path, steps: int = 20) -> Training:
+    return Training(
+        scene=str(scene),
+        folder=str(folder),
+        recipe="3dgs",
+        settings=TrainSettings(steps, 0),
+        reading=SceneOptions(8),
+        compute=ComputeOptions(1, "cpu"),
+        resume=False,
+    )
+
+
+def work(data: bytes, folder: Path) -> subprocess.CompletedProcess[bytes]:
+    return subprocess.run(COMMAND, input=data, cwd=folder, capture_output=True, timeout=PATIENCE)
+
+
+def test_a_task_survives_its_way(tmp_path: Path) -> None:
+    for task in (training(tmp_path, tmp_path / "out"), Scoring("run", True, ComputeOptions(2, "cpu"))):
+        assert decode(encoded(task), Training | Scoring, "task") == task  # type: ignore[arg-type]
+
+
+def test_nothing_is_imported_from_the_current_folder(demo_scene: Path, tmp_path: Path) -> None:
+    names = ("json", "torch", "safetensors", "msgspec", "numpy", "random", "polarguide", "sitecustomize")
+    for name in names:
+        (tmp_path / f"{name}.py").write_text(
+            "open('imported', 'a').write(__name__ + '\\n')\nraise SystemExit(9)"
+        )
+    done = work(encoded(training(demo_scene, tmp_path / "run")), tmp_path)
+    assert done.stderr.decode() == ""
+    assert done.returncode == 0
+    assert not (tmp_path / "imported").exists()
+    assert (tmp_path / "run" / CHECKPOINT).exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"settings": {"steps": "many", "seed": 0}}, "task (settings.steps): expected a whole number"),
+        ({"reading": {"transfer": "gamma"}}, "task (reading.transfer): expected"),
+        ({"surprise": 1}, "task"),
+        ({"type": "dance"}, "task"),
+        ({"scene": "no-such-scene"}, "no-such-scene: expected"),
+        ({"recipe": "magic"}, "recipe: expected one of"),
+    ],
+)
+def test_a_wrong_task_is_refused_in_one_line(
+    demo_scene: Path, tmp_path: Path, change: dict[str, object], said: str
+) -> None:
+    data = msgspec.to_builtins(training(demo_scene, tmp_path / "run")) | change
+    done = work(json.dumps(data).encode(), tmp_path)
+    assert done.returncode == 2
+    (line,) = done.stderr.decode().splitlines()
+    assert said in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_is_no_task_is_refused(tmp_path: Path) -> None:
+    done = work(b"\xff{", tmp_path)
+    assert done.returncode == 2
+    assert len(done.stderr.decode().splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_a_stopped_training_saves_its_state(demo_scene: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    process = subprocess.Popen(COMMAND, stdin=subprocess.PIPE, cwd=tmp_path, stderr=subprocess.PIPE)
+    assert process.stdin is not None
+    assert process.stderr is not None
+    with process.stdin as stdin:
+        stdin.write(encoded(training(demo_scene, run, steps=5000)))
+    give_up = time.monotonic() + PATIENCE
+    while not (run / LOG).exists() and time.monotonic() < give_up:
+        assert process.poll() is None
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(PATIENCE) == 130
+    with process.stderr as stderr:
+        assert stderr.read() == b""
+    assert (run / CHECKPOINT).exists()

@@ -1,7 +1,5 @@
 """The report: whole in one file, safe with any name, and within its size."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import hashlib
@@ -193,18 +191,15 @@ def test_normals_are_lossless_and_photographs_are_not() -> None:
         head, data = data_uri(picture, layer, 100).split(",")
         assert head == f"data:image/{kind};base64"
         decoded = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
-        assert decoded is not None
         assert np.array_equal(decoded[..., ::-1], picture) is (layer == "normal")
 
 
 def test_pictures_shrink_until_they_fit_and_are_left_out_if_nothing_helps() -> None:
     tiles = [Tile("a", pictures((300, 400)), {})]
     whole, note = embed("s", "v", tiles, 10**7)
-    assert whole is not None
     assert note is None
     size = sum(map(len, whole.tiles[0][1].values()))
     less, note = embed("s", "v", tiles, size // 2)
-    assert less is not None
     assert (less.width, less.height) == (400, 300)
     assert sum(map(len, less.tiles[0][1].values())) <= size // 2
     assert note == "s, v: pictures reduced from 400 to 200 pixels."

@@ -1,7 +1,5 @@
 """Paired differences, their intervals and what is noise: against scipy, by simulation, and the docs' page on them."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import random

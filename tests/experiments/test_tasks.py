@@ -1,7 +1,5 @@
 """What is done for a run by how far it is, and which of its speeds count."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shutil
@@ -99,7 +97,6 @@ def test_seconds_count_only_alone(planned: Planned, trained: Path) -> None:
     assert runs[names].iloc[0].tolist() == ["done", 12.5, 60.0]
     (only.folder / BESIDE_OTHERS).touch()
     (run,) = collect(question, scenes, [only], {only.folder: "an old error"}).record.runs
-    assert run.metrics is not None
     assert (run.metrics["train_seconds"], run.metrics["fps"], run.error) == (None, 60.0, None)
 
 

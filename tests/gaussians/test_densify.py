@@ -1,7 +1,5 @@
 """Clone, split and prune; no threshold of a recipe appears here."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -193,8 +191,7 @@ def test_the_mean_gradient_is_over_the_pictures_in_which_it_was_seen() -> None:
         torch.tensor([[3.0, 4.0], [0.0, 0.0], [0.0, 0.0]]), torch.tensor([seen, unseen, unseen]), 20, 40
     )
     # In units of half a picture: x counts 10-fold and y 20-fold.
-    expected = torch.tensor([math.hypot(30, 80), 10.0, 0.0])
-    torch.testing.assert_close(statistics.mean(), expected)
+    torch.testing.assert_close(statistics.mean(), torch.tensor([math.hypot(30, 80), 10.0, 0.0]))
 
 
 def test_huge_ones_are_pruned_from_a_share_of_the_steps_on_and_not_before_the_least() -> None:

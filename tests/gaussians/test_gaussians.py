@@ -1,13 +1,12 @@
 """Adam's moments follow their rows through every edit; the state survives its tensors bit by bit."""
 
-from __future__ import annotations
-
 import pytest
 import torch
+from faults import Fault
 from torch import Tensor
 
-from polarguide.core.errors import PolarguideError
 from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
+from polarguide.gaussians.geometry import quaternions_to_rotations, shortest_axis_normals
 
 COUNT = 9
 RATES = {name: 0.01 * (index + 1) for index, name in enumerate(CORE_SHAPES)} | {"side": 0.3}
@@ -178,5 +177,65 @@ def test_rows_stay_leaves_that_train_after_every_edit() -> None:
 
 def test_tensors_of_different_length_are_refused() -> None:
     uneven = {**tensors(), "side": torch.zeros(COUNT - 1, 2)}
-    with pytest.raises(PolarguideError, match="as many in every tensor"):
-        Gaussians(uneven, RATES)
+    Fault("Gaussians", "as many in every tensor").raised_by(Gaussians, uneven, RATES)
+
+
+ELLIPSOIDS = 50
+
+
+def shapes(dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    means, quaternions, log_scales = (
+        torch.randn(ELLIPSOIDS, size, generator=generator, dtype=dtype) for size in (3, 4, 3)
+    )
+    return means, quaternions, log_scales, torch.tensor([0.3, -2.0, 1.0], dtype=dtype)
+
+
+def test_the_normal_is_the_shortest_axis() -> None:
+    means, quaternions, log_scales, center = shapes()
+    normals = shortest_axis_normals(means, quaternions, log_scales, center)
+    axes = quaternions_to_rotations(quaternions)
+    shortest = axes[torch.arange(ELLIPSOIDS), :, log_scales.argmin(dim=1)]
+    torch.testing.assert_close((normals * shortest).sum(dim=1).abs(), torch.ones(ELLIPSOIDS))
+    torch.testing.assert_close(normals.norm(dim=1), torch.ones(ELLIPSOIDS))
+    assert set(log_scales.argmin(dim=1).tolist()) == {0, 1, 2}
+
+
+def test_the_normal_faces_the_camera() -> None:
+    means, quaternions, log_scales, center = shapes()
+    normals = shortest_axis_normals(means, quaternions, log_scales, center)
+    toward = torch.nn.functional.normalize(center - means, dim=1)
+    assert float((normals * toward).sum(dim=1).min()) >= -1e-6
+    opposite = shortest_axis_normals(means, quaternions, log_scales, 2 * means.mean(dim=0) - center)
+    assert float((opposite * normals).sum(dim=1).min()) == pytest.approx(-1.0, abs=1e-5), "some turn over"
+
+
+@pytest.mark.parametrize("factor", [0.01, -3.0])
+def test_length_and_sign_of_the_quaternion_do_not_matter(factor: float) -> None:
+    means, quaternions, log_scales, center = shapes()
+    torch.testing.assert_close(
+        shortest_axis_normals(means, factor * quaternions, log_scales, center),
+        shortest_axis_normals(means, quaternions, log_scales, center),
+    )
+
+
+def test_gradient_in_the_quaternions_against_finite_differences() -> None:
+    means, quaternions, log_scales, center = shapes(torch.float64)
+    facing = torch.randn(ELLIPSOIDS, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    away = ((center - means) * shortest_axis_normals(means, quaternions, log_scales, center)).sum(1) > 0.1
+    few = away.nonzero()[:6, 0]
+    assert len(few) == 6
+
+    def normals(q: Tensor) -> Tensor:
+        return shortest_axis_normals(means[few], q, log_scales[few], center) * facing[few]
+
+    assert torch.autograd.gradcheck(normals, (quaternions[few].clone().requires_grad_(),), atol=1e-7)
+
+
+def test_means_and_scales_get_no_gradient() -> None:
+    means, quaternions, log_scales, center = shapes()
+    inputs = [t.clone().requires_grad_() for t in (means, quaternions, log_scales)]
+    shortest_axis_normals(*inputs, center).sum().backward()
+    assert inputs[0].grad is None
+    assert inputs[1].grad is not None
+    assert inputs[2].grad is None

@@ -1,7 +1,5 @@
 """The Gaussians to begin with."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from polarguide.gaussians.densify import free_space
 from polarguide.gaussians.gaussians import CORE_SHAPES
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.initialize import (
@@ -18,6 +17,7 @@ from polarguide.gaussians.initialize import (
     neighbor_distance,
     scene_extent,
 )
+from polarguide.geometry.camera import Camera
 
 SETTINGS = Initialization(shell=40, shell_radii=(3.0, 12.0), opacity=0.2)
 
@@ -52,13 +52,11 @@ def test_points_keep_their_place_and_color_and_all_have_the_first_opacity() -> N
 
 def test_round_at_first_and_as_wide_as_the_spacing() -> None:
     points, colors, centers = capture()
-    rows = initial_parameters(points, colors, centers, SETTINGS, seed=0)
-    scales = rows["log_scales"].exp()
+    scales = initial_parameters(points, colors, centers, SETTINGS, seed=0)["log_scales"].exp()
     assert torch.equal(scales[:, 0], scales[:, 1])
     assert torch.equal(scales[:, 0], scales[:, 2])
     distance = torch.cdist(points.double(), points.double()).sort(dim=1).values[:, 1:4]
-    expected = distance.square().mean(dim=1).sqrt().float()
-    torch.testing.assert_close(scales[:30, 0], expected)
+    torch.testing.assert_close(scales[:30, 0], distance.square().mean(dim=1).sqrt().float())
 
 
 def test_added_ones_lie_in_the_shell() -> None:
@@ -72,8 +70,7 @@ def test_added_ones_lie_in_the_shell() -> None:
 
 
 def test_none_are_added_if_none_are_asked_for() -> None:
-    rows = initial_parameters(*capture(), replace(SETTINGS, shell=0), seed=0)
-    assert len(rows["means"]) == 30
+    assert len(initial_parameters(*capture(), replace(SETTINGS, shell=0), seed=0)["means"]) == 30
 
 
 def test_the_seed_decides() -> None:
@@ -108,3 +105,29 @@ def test_far_away_is_what_lies_beyond_the_cameras() -> None:
     assert far_away((places - middle) / 4 + middle, points, centers, 0.5).tolist() == [False, False, False]
     rows = initial_parameters(points, colors, centers, SETTINGS, seed=0)
     assert far_away(rows["means"], points, centers).tolist() == [False] * 30 + [True] * 40
+
+
+def camera(z: float) -> Camera:
+    """Looks along +z from (0, 0, z)."""
+    shift = torch.tensor([0.0, 0.0, -z], dtype=torch.float64)
+    return Camera(40, 30, 30.0, 30.0, 20.0, 15.0, torch.eye(3, dtype=torch.float64), shift)
+
+
+def test_the_radius_is_a_share_of_the_depth_of_the_nearest_points() -> None:
+    points = torch.tensor([[0.1, 0.0, 4.0]] * 50 + [[0.0, 0.2, 9.0]] * 50)
+    empty = free_space(points, [camera(0.0), camera(2.0)], 0.4, 0.02)
+    assert empty.radii.tolist() == pytest.approx([4 * 0.4, 2 * 0.4])
+    inside = torch.tensor([[0.0, 0.0, 1.5], [0.0, 0.0, 2.7], [0.0, 0.0, 3.5], [1.7, 0.0, 0.0]])
+    assert empty.contains(inside).tolist() == [True, True, False, False]
+
+
+def test_one_gross_outlier_among_many_points_does_not_shrink_it() -> None:
+    points = torch.tensor([[0.0, 0.0, 4.0]] * 99 + [[0.0, 0.0, 0.01]])
+    assert free_space(points, [camera(0.0)], 0.4, 0.02).radii.item() == pytest.approx(4 * 0.4)
+
+
+def test_a_camera_that_sees_no_point_leaves_nothing_empty() -> None:
+    behind_and_beside = torch.tensor([[0.0, 0.0, -1.0], [50.0, 0.0, 1.0]])
+    empty = free_space(behind_and_beside, [camera(0.0)], 0.4, 0.02)
+    assert empty.radii.tolist() == [0.0]
+    assert not empty.contains(torch.zeros(1, 3)).any()

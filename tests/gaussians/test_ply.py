@@ -5,9 +5,9 @@ import struct
 
 import pytest
 import torch
+from faults import Fault
 from plyfile import PlyData
 
-from polarguide.core.errors import PolarguideError
 from polarguide.gaussians.ply import read_ply, refit_sh_to_display, write_ply
 from polarguide.geometry.vectors import spread_directions
 
@@ -125,48 +125,42 @@ def test_reads_files_of_lower_degree_and_unknown_fields(tmp_path, rest, coeffici
 
 
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("old", "new", "expected", "found"),
     [
-        (lambda text: text.replace(b"property float rot_3\n", b"property float rot_x\n"), "found no rot_3"),
-        (lambda text: text.replace(b"f_rest_44", b"f_more_44"), "found 44 fields f_rest_"),
-        (lambda text: text.replace(b"element vertex", b"element corner"), "expected a vertex element"),
-        (
-            lambda text: text.replace(b"comment extra strength", b"comment extra strength 3"),
-            "strength that a comment",
-        ),
-        (
-            lambda text: text.replace(b"property float x\n", b"property list uchar float x\n"),
-            "list property|a PLY file",
-        ),
-        (lambda text: text[:-1], "expected a PLY file"),
-        (lambda text: b"a picture, perhaps\n", "expected a PLY file"),
-        (lambda text: b"\xff\xfe\x00\n\x81", "expected a PLY file"),
-        (lambda text: b"", "expected a PLY file"),
+        (b"property float rot_3\n", b"property float rot_x\n", "", "no rot_3"),
+        (b"f_rest_44", b"f_more_44", "", "44 fields f_rest_"),
+        (b"element vertex", b"element corner", "a vertex element", ""),
+        (b"comment extra strength", b"comment extra strength 3", "strength", ""),
+        (b"property float x\n", b"property list uchar float x\n", "a PLY file", ""),
+        (None, -1, "a PLY file", ""),
+        (None, b"a picture, perhaps\n", "a PLY file", ""),
+        (None, b"\xff\xfe\x00\n\x81", "a PLY file", ""),
+        (None, b"", "a PLY file", ""),
+        (None, None, "a PLY file", "no file"),
     ],
 )
-def test_unreadable_files_are_named(tmp_path, spoil, message):
+def test_unreadable_files_are_named(tmp_path, old, new, expected, found):
+    """Something of the file is another, or the whole file is, or it is cut, or there is none."""
     path = tmp_path / "p.ply"
     write_ply(path, **gaussians(), extra={"strength": rand(1, COUNT)})
-    path.write_bytes(spoil(path.read_bytes()))
-    with pytest.raises(PolarguideError, match=message) as caught:
-        read_ply(path)
-    assert str(caught.value).startswith(f"{path}: ")
-
-
-def test_missing_file(tmp_path):
-    with pytest.raises(PolarguideError, match="found no file"):
-        read_ply(tmp_path / "p.ply")
+    whole = path.read_bytes()
+    path.unlink()
+    if old:
+        path.write_bytes(whole.replace(old, new))
+    elif new is not None:
+        path.write_bytes(whole[:new] if new == -1 else new)
+    Fault(str(path), expected, found).raised_by(read_ply, path)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"sh_rest": torch.zeros(COUNT, 8, 3)}, r"sh_rest: expected \[7, 15, 3\], found \[7, 8, 3\]"),
-        ({"opacity_logits": torch.zeros(COUNT + 1)}, r"opacity_logits: expected \[7\]"),
-        ({"extra": {"strength": torch.zeros(3)}}, r"extra 'strength': expected \[7, ...\], found \[3\]"),
-        ({"extra": {"two words": torch.zeros(COUNT)}}, "found 'two words'"),
-        ({"extra": {"opacity": torch.zeros(COUNT)}}, "in the file already"),
-        ({"extra": {"label": torch.zeros(COUNT, dtype=torch.long)}}, "expected floating-point numbers"),
+        ({"sh_rest": torch.zeros(COUNT, 8, 3)}, r"sh_rest: .*\[7, 15, 3\].*\[7, 8, 3\]"),
+        ({"opacity_logits": torch.zeros(COUNT + 1)}, r"opacity_logits: .*\[7\]"),
+        ({"extra": {"strength": torch.zeros(3)}}, r"'strength': .*\[7, ...\].*\[3\]"),
+        ({"extra": {"two words": torch.zeros(COUNT)}}, "'two words'"),
+        ({"extra": {"opacity": torch.zeros(COUNT)}}, "opacity"),
+        ({"extra": {"label": torch.zeros(COUNT, dtype=torch.long)}}, "label"),
     ],
 )
 def test_what_does_not_fit_is_refused(tmp_path, change, message):
@@ -232,7 +226,7 @@ def test_refit_in_small_pieces_is_the_same(monkeypatch):
 
 
 def test_refit_refuses_colors_of_another_shape():
-    with pytest.raises(ValueError, match=r"colors: expected \[6, 64, 3\], found \[5, 64, 3\]"):
+    with pytest.raises(ValueError, match=r"colors: .*\[6, 64, 3\].*\[5, 64, 3\]"):
         refit_sh_to_display(highlight, 6)
 
 

@@ -1,7 +1,5 @@
 """A Chromium of the system, driven by Playwright, where both are installed."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager

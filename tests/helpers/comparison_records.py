@@ -1,7 +1,5 @@
 """Hand-made records of comparisons, for tests of tables and reports."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from polarguide.core.records import decode

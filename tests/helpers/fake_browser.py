@@ -1,7 +1,5 @@
 """A fake of viser's client: what the viewer uses of it, kept in memory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import contextmanager
 from types import SimpleNamespace

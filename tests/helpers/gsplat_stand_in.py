@@ -4,8 +4,6 @@ Same arguments, shapes and refusals as 1.6.0 (which, unlike 1.5.3, pads no chann
 the "intersections" are the visible Gaussians by depth.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The variants of the kernels that this processor can run, and a test's choice among them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """A scene of two views of which everything is known, made of random numbers: for scores that loops can check."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -76,7 +74,6 @@ def rendered(view: View, seed: int) -> tuple[SimpleNamespace, Tensor, Tensor]:
     """A rendering that is wrong everywhere, its Stokes vectors, and the weight in front of the surface."""
     generator = torch.Generator().manual_seed(seed)
     truth = view.ground_truth
-    assert truth is not None
 
     def noisy(values: Tensor, size: float) -> Tensor:
         return values + size * (torch.rand(values.shape, generator=generator) - 0.5)

@@ -1,17 +1,15 @@
 """Balls of metals and of other materials in a room: what is measured of them, views, and Gaussians."""
 
-from __future__ import annotations
-
 import math
 
 import torch
+from glossy_ball import ball, camera_at
 from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import View
 from polarguide.geometry.polarizer import ANGLES
 from polarguide.geometry.vectors import spread_directions
-from tests.helpers.glossy_ball import ball, camera_at
 
 METALS = {"gold": (0.95, 0.78, 0.37), "aluminum": (0.91, 0.91, 0.92), "chromium": (0.55, 0.55, 0.54)}
 BODIES = {

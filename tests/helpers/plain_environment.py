@@ -4,8 +4,6 @@ Files of the distributions that polarguide declares, and of those that these dec
 their own: no extra, and nothing of what the tests use, can be imported there.
 """
 
-from __future__ import annotations
-
 import csv
 import venv
 from importlib import metadata

@@ -1,7 +1,5 @@
 """Installed packages that offer recipes, as far as ``importlib.metadata`` can tell."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Untrained states of every kind of shading, for tests: random Gaussians about the origin, and cameras around them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

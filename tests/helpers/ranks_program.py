@@ -3,8 +3,6 @@
 Arguments: OUT, STEPS, VIEWS, and where to stop and a folder with a checkpoint to go on from ("" for none).
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

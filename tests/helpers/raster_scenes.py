@@ -1,7 +1,5 @@
 """Gaussians to rasterize in tests, and one call that gives all that a backend computes from them."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

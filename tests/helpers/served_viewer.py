@@ -1,7 +1,5 @@
 """A viewer that is served by a thread, as a training does, and a client that speaks to it."""
 
-from __future__ import annotations
-
 import threading
 import time
 from typing import Any

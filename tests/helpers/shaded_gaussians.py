@@ -1,7 +1,5 @@
 """Thirty Gaussians of the deferred shading model before a small camera, some of them metals."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Neural recipes so small that a test can train them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from polarguide.fields.recipe import FieldShape, NeuralRecipe, Sampling

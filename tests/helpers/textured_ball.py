@@ -1,7 +1,5 @@
 """A textured ball off the center of its cameras, before a sky: pictures and normals from formulas."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A scene small enough to train on in a test: smooth polarized pictures of Gaussians, seen from a circle."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A shading model and a recipe as a plug-in has them: mirrors under a sky of two colors. No other file knows of it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """A small scene for the viewer: random Gaussians, and photographs rendered from them."""
 
-from __future__ import annotations
-
 import torch
 from random_runs import random_state, ring
 

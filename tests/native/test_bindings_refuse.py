@@ -1,7 +1,5 @@
 """What the rasterizer's binding refuses, before the kernels would read or write beyond the end of something."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

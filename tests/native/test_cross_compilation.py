@@ -1,7 +1,5 @@
 """The kernels compile for another processor family: nothing but the guarded variants is written for x86."""
 
-from __future__ import annotations
-
 import platform
 import shutil
 import subprocess

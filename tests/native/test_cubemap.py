@@ -190,9 +190,9 @@ def test_gradients_on_request_only(simd: str) -> None:
 
 
 def test_errors_name_what_was_expected() -> None:
-    with pytest.raises(ValueError, match=r"texture: expected shape \[6, R, R, C\], found \[6, 4, 5, 3\]"):
+    with pytest.raises(ValueError, match=r"texture: .*\[6, R, R, C\].*\[6, 4, 5, 3\]"):
         cubemap_lookup(torch.zeros(6, 4, 5, 3), torch.zeros(2, 3))
-    with pytest.raises(ValueError, match=r"directions: expected shape \[P, 3\], found \[2, 4\]"):
+    with pytest.raises(ValueError, match=r"directions: .*\[P, 3\].*\[2, 4\]"):
         cubemap_lookup(torch.zeros(6, 4, 4, 3), torch.zeros(2, 4))
-    with pytest.raises(ValueError, match=r"out: expected shape \[2, 3\], found \[3, 3\]"):
+    with pytest.raises(ValueError, match=r"out: .*\[2, 3\].*\[3, 3\]"):
         _native.cubemap_forward(torch.zeros(6, 4, 4, 3), torch.zeros(2, 3), torch.zeros(3, 3))

@@ -176,8 +176,7 @@ def test_values_out_of_range_are_led_back(simd: str, value: float, goal: float, 
 
 def test_the_same_picture_has_no_loss(simd: str) -> None:
     prediction, _ = pictures(20, 30)
-    shown = srgb_encode(prediction.clamp(0, 1))
-    assert abs(float(photometric_loss(prediction, shown))) < 1e-6
+    assert abs(float(photometric_loss(prediction, srgb_encode(prediction.clamp(0, 1))))) < 1e-6
 
 
 def test_threads_do_not_change_a_bit(simd: str) -> None:
@@ -226,11 +225,11 @@ def test_other_memory_layouts_and_types() -> None:
 
 def test_errors_name_what_was_expected() -> None:
     prediction, target = pictures(4, 5)
-    with pytest.raises(ValueError, match=r"target: expected shape \[4, 5, 3\], found \[3, 5, 3\]"):
+    with pytest.raises(ValueError, match=r"target: .*\[4, 5, 3\].*\[3, 5, 3\]"):
         photometric_loss(prediction, target[:3])
-    with pytest.raises(ValueError, match=r"weight: expected shape \[4, 5\], found \[5, 4\]"):
+    with pytest.raises(ValueError, match=r"weight: .*\[4, 5\].*\[5, 4\]"):
         photometric_loss(prediction, target, torch.ones(5, 4))
-    with pytest.raises(ValueError, match=r"prediction: expected shape \[H, W, 3\], found \[4, 5\]"):
+    with pytest.raises(ValueError, match=r"prediction: .*\[H, W, 3\].*\[4, 5\]"):
         photometric_loss(prediction[..., 0], target)
-    with pytest.raises(ValueError, match=r"target: expected shape \[4, 5, 3\], found \[60\]"):
+    with pytest.raises(ValueError, match=r"target: .*\[4, 5, 3\].*\[60\]"):
         _native.photometric(prediction, target.flatten(), None, 20.0, 0.2, None)

@@ -1,24 +1,29 @@
 """Native passes over Gaussians, what is splatted and how flat they are: against the reference, forward and gradient."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
 import pytest
 import torch
+from faults import Fault
 from torch import Tensor
 from torch.testing import assert_close
 
 from polarguide import _native
-from polarguide.core.errors import PolarguideError
+from polarguide.gaussians.geometry import (
+    mirrored_directions,
+    shortest_axis_normals,
+    shortest_axis_normals_reference,
+)
 from polarguide.gaussians.harmonics import SH_C0, evaluate_sh
 from polarguide.geometry.camera import Camera
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.interface import Splats
 from polarguide.shading.deferred import DeferredShading
-from polarguide.shading.gbuffer import splatting, splatting_reference
+from polarguide.shading.gbuffer import splatting, splatting_reference, split, split_reference
 from polarguide.shading.model import PLAIN, Parameters, ShadingModel, base_colors
+from polarguide.shading.native import split_native
+from polarguide.shading.result import Layout
 from polarguide.training.losses import flatness_loss, flatness_loss_reference
 
 TURN = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64))[0]
@@ -152,8 +157,8 @@ def test_not_a_number_and_too_much_are_not_hidden() -> None:
     ):
         given = gaussians(20)
         given[name].view(20, -1)[7, 0] = value
-        with pytest.raises(PolarguideError, match="Gaussian 7"):
-            rasterize_cpu(splatting(given, CAMERA, DeferredShading("fresnel", local=True), **how)[0], CAMERA)
+        broken, *_ = splatting(given, CAMERA, DeferredShading("fresnel", local=True), **how)
+        Fault("rasterize(", "finite", "Gaussian 7").raised_by(rasterize_cpu, broken, CAMERA)
 
 
 def test_a_model_with_channels_of_its_own_is_asked_for_them() -> None:
@@ -172,9 +177,9 @@ def test_a_model_with_channels_of_its_own_is_asked_for_them() -> None:
 def test_wrong_shapes_are_refused() -> None:
     given = gaussians(4)
     given["local_rest"] = given["local_rest"][:, :8]
-    with pytest.raises(ValueError, match=r"rest: expected shape \[4, 15, 3\], found \[4, 8, 3\]"):
+    with pytest.raises(ValueError, match=r"rest: .*\[4, 15, 3\].*\[4, 8, 3\]"):
         splatting(given, CAMERA, WHOLE, sh_degree=3, normals=True, depth=False)
-    with pytest.raises(ValueError, match="degree: expected 0 to 3, found 4"):
+    with pytest.raises(ValueError, match="degree"):
         splatting(gaussians(4), CAMERA, WHOLE, sh_degree=4, normals=True, depth=False)
 
 
@@ -189,5 +194,131 @@ def test_flatness_natively_is_that_of_the_reference(simd: str) -> None:
     (2 * expected).backward()
     assert type(found.grad_fn).__name__ == "_FlatnessBackward"
     assert float(found.detach()) == pytest.approx(float(expected.detach()), rel=1e-6)
-    assert mine.grad is not None
     assert_close(mine.grad.double(), theirs.grad, rtol=2e-6, atol=1e-12)
+
+
+HEIGHT, WIDTH, CHANNELS = 40, 61, 11
+SIZE = (HEIGHT, WIDTH)
+
+
+def layout(*, depth: bool) -> Layout:
+    return Layout({"color": 3, "normal": 3, "own": CHANNELS - 6 - depth, **({"depth": 1} if depth else {})})
+
+
+def buffers(dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    features = torch.randn(*SIZE, CHANNELS, generator=generator)
+    alpha = torch.rand(SIZE, generator=generator)
+    alpha[3], alpha[4], alpha[5] = 0.0, 1e-7, 2e-6
+    return features.to(dtype).requires_grad_(), alpha.to(dtype).requires_grad_()
+
+
+def split_gradients(function, dtype: torch.dtype, read: str, depth: bool) -> list[Tensor]:
+    features, alpha = buffers(dtype)
+    given = dict(zip("fnd", function(features, alpha, layout(depth=depth)), strict=True))
+    seed = torch.Generator().manual_seed(1)
+    sum((torch.randn(given[k].shape, generator=seed) * given[k]).sum() for k in read).backward()
+    gradients = [torch.zeros_like(t) if t.grad is None else t.grad for t in (features, alpha)]
+    return [t.detach() for t in given.values() if t is not None] + gradients
+
+
+@pytest.mark.parametrize("read", ["f", "n", "fn", "d", "fnd", "nd"])
+def test_native_agrees_with_the_slices(simd: str, read: str) -> None:
+    for depth in (True,) if "d" in read else (True, False):
+        found = split_gradients(split, torch.float32, read, depth)
+        exact = split_gradients(split_reference, torch.float64, read, depth)
+        assert len(found) == len(exact)
+        for mine, theirs in zip(found, exact, strict=True):
+            assert bool(torch.isfinite(mine).all())
+            assert_close(mine.double(), theirs, rtol=2e-6, atol=2e-6)
+
+
+def test_threads_do_not_change_the_split() -> None:
+    results = []
+    for threads in (1, 3):
+        _native.set_thread_count(threads)
+        results.append(split_gradients(split, torch.float32, "fnd", True))
+    for one, other in zip(*results, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_without_further_channels_the_slices_do() -> None:
+    features, alpha = torch.rand(*SIZE, 6), torch.rand(SIZE)
+    _, normal, depth = split(features, alpha, Layout({"color": 3, "normal": 3}))
+    assert torch.equal(normal, features[..., 3:6])
+    assert depth is None
+    assert split(features, alpha, Layout({"color": 3, "own": 3}))[1] is None
+    with pytest.raises(ValueError, match="features: "):
+        split_native(features, alpha, depth=True)
+
+
+CENTER = torch.tensor([0.3, -0.2, 1.1])
+
+
+def rotations_and_scales(count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(count)
+    means, quaternions, log_scales, outward = (
+        torch.randn(count, size, generator=generator) for size in (3, 4, 3, 3)
+    )
+    outward[::3] = 0  # not known
+    return means, quaternions, log_scales, outward
+
+
+def with_gradient(function, shape: tuple[Tensor, ...], center: Tensor) -> tuple[Tensor, Tensor]:
+    means, quaternions, *others = (t.detach().clone() for t in shape)
+    quaternions.requires_grad_()
+    out = function(means, quaternions, others[0], center, *others[1:])
+    weights = torch.linspace(-1, 1, out.numel(), dtype=out.dtype).reshape(out.shape)
+    (out * weights).sum().backward()
+    assert quaternions.grad is not None
+    return out.detach(), quaternions.grad
+
+
+@pytest.mark.parametrize("oriented", [False, True])
+@pytest.mark.parametrize("count", [1, 17, 10_000])
+def test_shortest_axes_agree_with_the_reference(simd: str, count: int, oriented: bool) -> None:
+    shape = rotations_and_scales(count)[: 4 if oriented else 3]
+    found = with_gradient(shortest_axis_normals, shape, CENTER)
+    exact = with_gradient(shortest_axis_normals_reference, tuple(t.double() for t in shape), CENTER.double())
+    for name, mine, reference in zip(("normals", "gradient"), found, exact, strict=True):
+        scale = 1 + float(reference.abs().max()) if name == "gradient" else 1.0
+        assert_close(mine.double(), reference, rtol=1e-5, atol=2e-6 * scale)
+
+
+def test_threads_do_not_change_the_axes() -> None:
+    shape = rotations_and_scales(20_000)
+    results = []
+    for threads in (1, 2):
+        _native.set_thread_count(threads)
+        results.append(with_gradient(shortest_axis_normals, shape, CENTER))
+    for one, other in zip(*results, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_no_gaussian_and_no_length_are_no_trouble() -> None:
+    none = shortest_axis_normals(torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), CENTER)
+    assert none.shape == (0, 3)
+    flat = (torch.zeros(1, 3), torch.zeros(1, 4), torch.tensor([[0.0, 0.0, -1.0]]))
+    normal, gradient = with_gradient(shortest_axis_normals, flat, CENTER)
+    assert_close(normal, torch.tensor([[0.0, 0.0, 1.0]]))
+    assert torch.isfinite(gradient).all()
+
+
+def test_mirrored_directions_agree_with_the_reference(simd: str) -> None:
+    means, quaternions, log_scales, _ = rotations_and_scales(1000)
+    means[5] = CENTER
+    normals = shortest_axis_normals(means, quaternions, log_scales, CENTER)
+    found = mirrored_directions(means, CENTER, normals)
+    reference = mirrored_directions(means.double(), CENTER.double(), normals.double())
+    assert_close(found.double(), reference, rtol=1e-5, atol=2e-6)
+    assert_close(found[5], torch.zeros(3))
+    others = torch.arange(1000) != 5
+    assert_close(found[others].norm(dim=1), torch.ones(999))
+    rays = torch.nn.functional.normalize(means - CENTER, dim=1)
+    assert_close((found * normals).sum(1)[others], -(rays * normals).sum(1)[others], atol=1e-5, rtol=1e-5)
+
+
+def test_wrong_shapes_of_axes_are_refused() -> None:
+    means, quaternions, log_scales, _ = rotations_and_scales(4)
+    with pytest.raises(ValueError, match=r"quaternions: .*\[4, 4\].*\[3, 4\]"):
+        shortest_axis_normals(means, quaternions[:3], log_scales, CENTER)

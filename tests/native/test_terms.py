@@ -1,7 +1,5 @@
 """Terms on pixels: the native pass against the plain functions in float64, value and gradient."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields, replace
 
@@ -160,7 +158,6 @@ def test_a_live_choice_takes_the_nearest_candidate_natively_and_not() -> None:
         return lambda result, priors: terms(result, replace(priors, candidates=candidates.to(priors.normal)))
 
     def plainly(result: RenderResult, priors: ViewPriors) -> Tensor:
-        assert result.normal is not None
         facing = result.normal / result.normal.norm(dim=-1, keepdim=True).clamp(min=1e-2)
         distances = torch.stack([1 - (facing * candidates[..., k, :]).sum(-1) for k in range(4)], dim=-1)
         weight = priors.weight
@@ -171,7 +168,6 @@ def test_a_live_choice_takes_the_nearest_candidate_natively_and_not() -> None:
     value, gradients = with_gradients(plainly, torch.float64)
     assert float(found[0]) == pytest.approx(float(value), rel=1e-4)
     normal = rendered().normal
-    assert normal is not None
     usual = normal.norm(dim=-1) > 0.05
     torch.testing.assert_close(
         found[1]["normal"].double()[usual], gradients["normal"][usual], atol=1e-7, rtol=1e-4
@@ -257,7 +253,6 @@ def test_no_weight_no_light_and_no_surface_cost_nothing() -> None:
     value.backward()
     assert float(value.detach()) == 0
     for leaf in (*nothing.values(), depth):
-        assert leaf.grad is not None
         assert not leaf.grad.any()
 
 
@@ -272,5 +267,5 @@ def test_not_a_number_is_not_hidden() -> None:
 
 def test_shapes_are_checked() -> None:
     result = replace(cast(rendered(), torch.float32), specular=torch.zeros(3, 3, 3))
-    with pytest.raises(ValueError, match="specular: expected shape"):
+    with pytest.raises(ValueError, match="specular: "):
         normal_terms(step(result, cast(measured(), torch.float32)), ALL)

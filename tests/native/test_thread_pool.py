@@ -1,7 +1,5 @@
 """Nothing but an exception ends a kernel: not a lack of memory or threads, not another number of threads meanwhile."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

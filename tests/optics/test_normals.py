@@ -1,7 +1,5 @@
 """Frames and normals: angles there and back, candidates, and the choice among them."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -225,9 +223,9 @@ def test_choice_does_not_change_when_the_camera_rolls(weight: float, turn: float
 
 def test_azimuth_weight_needs_rays_and_a_range() -> None:
     candidates = torch.eye(3, dtype=F64)
-    with pytest.raises(ValueError, match="camera rays"):
+    with pytest.raises(ValueError, match="rays"):
         optics.disambiguate(candidates, candidates[0], azimuth_weight=0.5)
-    with pytest.raises(ValueError, match=r"in \[0, 1\], found 1\.5"):
+    with pytest.raises(ValueError, match=r"1\.5"):
         optics.disambiguate(candidates, candidates[0], candidates[0], azimuth_weight=1.5)
 
 

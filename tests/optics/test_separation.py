@@ -1,7 +1,5 @@
 """The separation of layers, and circular polarizers, against forward models."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

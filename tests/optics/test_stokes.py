@@ -1,7 +1,5 @@
 """Stokes vectors, analyzers and uncertainties against textbook values, loops and simulated noise."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -156,7 +154,7 @@ def test_half_precision_runs(dtype: torch.dtype) -> None:
 
 
 def test_wrong_number_of_images_is_named() -> None:
-    with pytest.raises(ValueError, match=r"expected shape \[4, \.\.\.\], found \[3, 2\]"):
+    with pytest.raises(ValueError, match=r"\[4, \.\.\.\].*\[3, 2\]"):
         optics.stokes(torch.zeros(3, 2))
     with pytest.raises(ValueError, match="stokes"):
         optics.dolp(torch.zeros(4))
@@ -213,8 +211,7 @@ def test_least_squares_give_back_stokes_vectors(mount: optics.Mount, degrees: tu
     analyzers = torch.stack([optics.analyzer(math.radians(angle), RAYS, mount) for angle in degrees])
     spread = analyzers if mount == "filter" else analyzers[..., None, None]
     parts = [(stokes[0] + stokes[1] * c[..., None] + stokes[2] * s[..., None]) / 2 for c, s in spread]
-    found = optics.fitted_stokes(torch.stack(parts), analyzers)
-    assert torch.allclose(found, stokes, atol=1e-10)
+    assert torch.allclose(optics.fitted_stokes(torch.stack(parts), analyzers), stokes, atol=1e-10)
 
 
 def test_four_angles_give_what_the_closed_form_gives() -> None:
@@ -294,5 +291,5 @@ def test_no_noise_leaves_the_degree() -> None:
 
 
 def test_wrong_shapes() -> None:
-    with pytest.raises(ValueError, match="variances: expected shape"):
+    with pytest.raises(ValueError, match="variances: "):
         optics.polarization_uncertainty(torch.zeros(3, 2), torch.zeros(3, 2))

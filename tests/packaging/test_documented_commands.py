@@ -4,8 +4,6 @@ They run as they are written, page by page, on small inputs, with options behind
 that this file does not know how to shorten, or an input that it cannot make, is a failure.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex
@@ -218,7 +216,6 @@ class Reader:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
         ) as process:
-            assert process.stdout is not None
             said = ""
             for line in process.stdout:
                 said += line

@@ -1,7 +1,5 @@
 """The rasterizer's tests run on each instruction set that this processor has."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

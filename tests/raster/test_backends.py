@@ -1,7 +1,5 @@
 """The native kernels against the reference implementation, on every instruction set; always the same bits."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 
@@ -68,8 +66,6 @@ def test_statistic_counts_its_own_channels_alone(statistic: tuple[int, ...] | No
     if statistic is None:
         assert first.statistic is None
     else:
-        assert first.statistic is not None
-        assert second.statistic is not None
         torch.testing.assert_close(first.statistic, second.statistic, rtol=1e-4, atol=1e-5)
 
 
@@ -123,7 +119,6 @@ def test_same_bits_wherever_in_a_vector_a_gaussian_is(simd: str, culled: int) ->
     found = outcome(rasterize_cpu, both, camera, (0,))
     assert not found.radii[:culled].any()
     assert not any(gradient[:culled].any() for gradient in found.gradients)
-    assert found.statistic is not None
     shifted = Splats(*(gradient[culled:] for gradient in found.gradients))
     found = found._replace(radii=found.radii[culled:], gradients=shifted, statistic=found.statistic[culled:])
     assert same_bits(found, expected)
@@ -142,7 +137,7 @@ def test_a_picture_without_gradients_has_the_same_bits_and_nothing_to_go_back_to
     arguments = (*inputs, plain.features, plain.features, plain.alpha, *map(torch.empty_like, inputs), None)
     for forward in (lambda: None, lambda: native.forward(*inputs, *picture, for_backward=False)):
         forward()
-        with pytest.raises(ValueError, match="no forward pass was kept"):
+        with pytest.raises(ValueError, match="forward"):
             native.backward(*arguments)
     native.forward(*inputs, *picture)
     native.backward(*arguments)
@@ -174,8 +169,6 @@ def test_gradients_follow_inputs_that_are_views_or_not_contiguous() -> None:
     to_features = torch.randn(picture.features.shape, generator=generator)
     to_alpha = torch.randn(picture.alpha.shape, generator=generator)
     ((picture.features * to_features).sum() + (picture.alpha * to_alpha).sum()).backward()
-    assert turned.grad is not None
-    assert wide.grad is not None
     torch.testing.assert_close(turned.grad.T, expected.gradients.means)
     torch.testing.assert_close(wide.grad[:, :4], expected.gradients.features)
     assert not wide.grad[:, 4:].any()

@@ -1,7 +1,5 @@
 """gsplat against the reference implementation, on a GPU; ``test_cuda.py`` tests what needs none."""
 
-from __future__ import annotations
-
 from importlib.metadata import version
 
 import pytest

@@ -1,11 +1,10 @@
 """Empty and extreme inputs, in both backends."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 import torch
+from faults import Fault
 from raster_scenes import (
     difference,
     differences,
@@ -17,7 +16,7 @@ from raster_scenes import (
     round_gaussian,
 )
 
-from polarguide.raster import Rasterize, Splats, rasterize_reference
+from polarguide.raster import Rasterize, ScreenStatistic, Splats, choose_backend, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.interface import BLUR
 
@@ -51,7 +50,6 @@ def test_gaussians_behind_the_camera_are_culled(rasterize: Rasterize) -> None:
     assert not result.alpha.any()
     assert not result.radii.any()
     assert all(not gradient.any() for gradient in result.gradients)
-    assert result.statistic is not None
     assert not result.statistic.any()
 
 
@@ -236,3 +234,66 @@ def test_radii_are_zero_outside_the_picture_and_three_sigma_inside(rasterize: Ra
     # 5 pixels of spread and the blur; the definition adds a little under the root to round ellipses.
     variance = (100 / 3 * 0.15) ** 2 + BLUR
     assert float(radii[0]) == pytest.approx(3 * math.sqrt(variance + math.sqrt(0.1)), rel=1e-4)
+
+
+@BOTH
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", Splats._fields)
+def test_what_is_not_finite_is_refused_with_its_index(rasterize: Rasterize, name: str, value: float) -> None:
+    camera = looking_ahead(8, 8)
+    for index in (0, 3, 5):
+        gaussians = repeated(round_gaussian(1.0, 0.5), 6)
+        broken = getattr(gaussians, name).clone()
+        broken.view(6, -1)[index, -1] = value
+        fault = Fault(f"rasterize({name})", "finite", f"Gaussian {index}")
+        fault.raised_by(rasterize, gaussians._replace(**{name: broken}), camera)
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("means", (6, 2)),
+        ("means", ()),
+        ("means", (5, 3)),
+        ("rotations", (6, 3)),
+        ("rotations", (5, 4)),
+        ("scales", (6,)),
+        ("scales", (7, 3)),
+        ("opacities", (6, 1)),
+        ("opacities", (1,)),
+        ("features", (6,)),
+        ("features", (5, 3)),
+        ("features", (6, 3, 1)),
+    ],
+)
+def test_wrong_shapes_are_refused(rasterize: Rasterize, name: str, shape: tuple[int, ...]) -> None:
+    gaussians = repeated(round_gaussian(1.0, 0.5), 6)
+    fault = Fault("rasterize(", "shape")
+    fault.raised_by(rasterize, gaussians._replace(**{name: torch.ones(shape)}), looking_ahead(8, 8))
+
+
+@BOTH
+@pytest.mark.parametrize("channels", [0, 33, 100])
+def test_channels_beyond_the_interface_are_refused(rasterize: Rasterize, channels: int) -> None:
+    gaussians = round_gaussian(1.0, 0.5)._replace(features=torch.ones(1, channels))
+    Fault(expected="1 to 32", found=str(channels)).raised_by(rasterize, gaussians, looking_ahead(8, 8))
+
+
+@BOTH
+@pytest.mark.parametrize("channels", [(2,), (0, -1), (1, 1)])
+def test_channels_that_there_are_not_are_refused(rasterize: Rasterize, channels: tuple[int, ...]) -> None:
+    for name, given in (("statistic", ScreenStatistic(channels)), ("still", channels)):
+        Fault(name).raised_by(rasterize, round_gaussian(1.0, 0.5), looking_ahead(8, 8), **{name: given})
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.int64])
+def test_native_backend_refuses_other_number_types(dtype: torch.dtype) -> None:
+    gaussians = round_gaussian(1.0, 0.5)
+    for name in Splats._fields:
+        other = gaussians._replace(**{name: getattr(gaussians, name).to(dtype)})
+        Fault(f"rasterize({name})", "float32").raised_by(rasterize_cpu, other, looking_ahead(8, 8))
+
+
+def test_cuda_is_refused_with_a_remedy() -> None:
+    Fault("--device cuda", remedy="--device cpu").raised_by(choose_backend, "cuda")

@@ -1,7 +1,5 @@
 """What blending means, in closed form."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

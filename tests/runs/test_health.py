@@ -1,7 +1,5 @@
 """What a finished training says of itself: it names what has burned, and is silent about what is right."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable
@@ -10,14 +8,16 @@ from typing import Any
 
 import pytest
 import torch
+from faults import Fault
+from heard import Heard
 from safetensors.torch import load_file
+from tiny import circling, make_scene
 from torch import Tensor
 
 import polarguide
 from polarguide.capture import Scene, View, load_scene
 from polarguide.capture.exposures import FOUR, PLAIN, Exposure
 from polarguide.capture.variants import select_exposures
-from polarguide.core.errors import PolarguideError
 from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.core.progress import SILENT
 from polarguide.geometry.camera import Camera
@@ -29,8 +29,6 @@ from polarguide.shading.result import RenderResult
 from polarguide.training.angles.polarizers import Polarizers
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
-from tests.helpers.heard import Heard
-from tests.helpers.tiny import circling, make_scene
 
 STOKES = RECIPES["polarguide-stokes"]
 BURNED = Path(__file__).parent / "burned"
@@ -163,7 +161,6 @@ def test_gaussians_that_no_view_sees_are_counted_once_all_views_were_looked_at()
     scene = around(WHOLE)
 
     def seen(result: RenderResult) -> RenderResult:
-        assert result.radii is not None
         return dataclasses.replace(result, radii=result.radii * (torch.arange(10) < 7))
 
     model = StandIn(scene, **{view.name: seen for view in scene.views})
@@ -186,8 +183,6 @@ def test_a_wrong_angle_shows_behind_the_filter(kind: str) -> None:
     wrong = examined(model, scene, (*views[:4], views[4].with_exposures(exposures), *views[5:]))
     assert right.warnings == ()
     before, after = right.views["v04"].psnr, wrong.views["v04"].psnr
-    assert before is not None
-    assert after is not None
     assert after < before - 6
 
 
@@ -242,7 +237,6 @@ def test_a_training_writes_its_health_and_the_page_shows_it(demo_scene: Path, tm
         reporter=heard,
     )
     found = run.health
-    assert found is not None
     assert len(found.views) == 2
     assert any(said.startswith("health: 2 training views") for said in heard.said)
     assert run.polarization == "measured"
@@ -253,7 +247,6 @@ def test_a_training_writes_its_health_and_the_page_shows_it(demo_scene: Path, tm
     sheet = run.write_pictures(views="v000", layers=["final"])
     assert b"tEXtPolarization\0measured" in sheet.read_bytes()
     (run.folder / HEALTH).write_text('{"polarization": {"measured": -1, "fitted": 0, "none": 0}}')
-    with pytest.raises(PolarguideError, match=r"health\.json"):
-        _ = run.health
+    Fault("health.json").raised_by(getattr, run, "health")
     (run.folder / HEALTH).unlink()
     assert run.polarization == "not recorded"

@@ -1,7 +1,5 @@
 """What nobody specified of a training is decided in one place: no other has a number of its own to fall back on."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """From Gaussians to layers: what adds up to what, and what a mirror does."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -83,10 +81,6 @@ def test_layers_add_up_to_the_final_picture(
     gaussians: dict[str, Tensor], rasterize: Rasterize, shading: DeferredShading
 ) -> None:
     result = render(gaussians, camera(), rasterize, shading=shading, light={"texels": environment()})
-    assert result.specular is not None
-    assert result.diffuse is not None
-    assert result.strength is not None
-    assert result.reflection is not None
     torch.testing.assert_close(result.specular + result.diffuse, result.final)
     strength = result.strength[..., None]
     assert 0 <= float(strength.min()) <= float(strength.max()) <= 1
@@ -171,7 +165,6 @@ def test_depth_of_one_gaussian_is_its_camera_depth(gaussians: dict[str, Tensor])
     one["means"] = torch.tensor([[0.0, 0.1, 0.5]])
     one["log_scales"] = torch.zeros(1, 3)
     result = render(one, camera(), rasterize_cpu, RenderRequest(depth=True))
-    assert result.depth is not None
     torch.testing.assert_close(result.depth, torch.full((20, 24), 4.5), rtol=1e-5, atol=0)
 
 
@@ -214,7 +207,6 @@ def test_every_parameter_that_shows_gets_a_finite_gradient(
         assert bool(torch.isfinite(gradient).all()), name
         assert bool(gradient.any()), name
     assert (trained["strength_logits"].grad is not None) == reflects == (texels.grad is not None)
-    assert statistic.gradient is not None
     assert statistic.gradient.shape == (COUNT, 2)
 
 
@@ -233,14 +225,10 @@ def test_native_and_reference_render_the_same_with_gradients(
         outcomes.append((result, {name: t.grad for name, t in trained.items()}))
     (fast, fast_gradients), (slow, slow_gradients) = outcomes
     torch.testing.assert_close(fast.final.double(), slow.final, atol=1e-5, rtol=1e-4)
-    assert fast.depth is not None
-    assert slow.depth is not None
     seen = slow.alpha > 0.01
     torch.testing.assert_close(fast.depth.double()[seen], slow.depth[seen], atol=1e-4, rtol=1e-4)
     for name, expected in slow_gradients.items():
         found = fast_gradients[name]
-        assert found is not None
-        assert expected is not None
         assert float((found.double() - expected).norm()) < 1e-3 * float(expected.norm()), name
 
 
@@ -263,8 +251,6 @@ def test_local_light_adds_to_the_environments_before_fresnel(gaussians: dict[str
         gaussians, camera(), rasterize_reference, shading=FRESNEL, light={"texels": environment()}
     )
     with_it = render(gaussians, camera(), rasterize_reference, shading=LOCAL, light={"texels": environment()})
-    assert without.reflection is not None
-    assert with_it.reflection is not None
     torch.testing.assert_close(with_it.reflection, without.reflection + 0.5 * without.alpha[..., None])
     torch.testing.assert_close(with_it.base, without.base)
 
@@ -305,8 +291,6 @@ def test_normals_keep_their_outer_side_past_the_silhouette(gaussians: dict[str, 
     other = render(
         gaussians, camera(), rasterize_reference, shading=FRESNEL, light={"texels": environment()}
     ).normal
-    assert normal is not None
-    assert other is not None
     assert not torch.allclose(normal, other)
 
 
@@ -324,9 +308,6 @@ def test_held_layers_are_the_layers_and_leave_rotations_alone(
         shading=shading,
         light={"texels": texels},
     )
-    assert result.detached_layers is not None
-    assert result.specular is not None
-    assert result.diffuse is not None
     assert torch.equal(result.detached_layers[0], result.specular)
     assert torch.equal(result.detached_layers[1], result.diffuse)
 
@@ -345,7 +326,6 @@ def test_held_layers_are_the_layers_and_leave_rotations_alone(
     still = render(
         frozen, camera(), rasterize_cpu, RenderRequest(depth=True), shading=shading, light={"texels": texels}
     )
-    assert still.specular is not None
     assert torch.equal(still.specular, result.detached_layers[0])
 
 

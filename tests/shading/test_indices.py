@@ -1,6 +1,6 @@
 """Refractive indices of single Gaussians in the deferred shading model: what they change, and what they leave."""
 
-from __future__ import annotations
+from dataclasses import fields
 
 import pytest
 import shaded_gaussians
@@ -8,15 +8,24 @@ import torch
 from instruction_sets import instruction_sets, selected
 from shaded_gaussians import COUNT, camera
 from torch import Tensor
+from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from polarguide import optics
-from polarguide.raster import rasterize_reference
+from polarguide.capture import Scene
+from polarguide.raster import choose_backend, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
+from polarguide.raster.surface import surface_picture
+from polarguide.recipes import recipe_named
+from polarguide.runs.defaults import resolve
 from polarguide.shading.deferred import INDEX_NOTE, DeferredShading
-from polarguide.shading.gbuffer import RenderRequest, render
+from polarguide.shading.gbuffer import RenderRequest, render, splatting
+from polarguide.shading.model import PLAIN
 from polarguide.shading.result import RenderResult
+from polarguide.training.actions import outward_directions
 from polarguide.training.native_terms import S1_AND_S2, Polarization, Terms, pixel_terms
+from polarguide.training.settings import TrainSettings
+from polarguide.training.trainer import Trainer
 
 RESOLUTION = 8
 SHADING = DeferredShading("fresnel", local=True, metal=True, indices=True)
@@ -78,12 +87,9 @@ def test_the_native_pass_agrees_with_the_reference(metals: int, held: bool, dept
         for name in TRAINED:
             values[name].requires_grad_()
         result = rendered(SHADING, values, layers_detached=held, depth=depth)
-        assert result.index is not None
         assert not result.index.requires_grad
-        assert result.specular is not None
         loss = (result.final * result.final).sum() + result.specular.sum()
         if held:
-            assert result.detached_layers is not None
             loss = loss + 2 * result.detached_layers[0].sum()
         loss = loss + SHADING.predicted_stokes(result, camera()).square().sum()
         loss.backward()
@@ -97,13 +103,9 @@ def test_the_index_of_a_pixel_is_that_of_what_it_shows() -> None:
     values = gaussians(others=COUNT)
     values["index_offset"].fill_(-0.17)
     result = rendered(SHADING, values)
-    assert result.index is not None
     assert_close(result.index, 1.5 - 0.17 * result.alpha)
     # As bright as Fresnel's equations say: all that differs from the run's index is the reflectance.
     before = rendered(WITHOUT, values)
-    assert before.specular is not None
-    assert result.specular is not None
-    assert before.normal is not None
     cosine = (
         -(camera().world_rays() * torch.nn.functional.normalize(before.normal, dim=-1)).sum(-1).clamp(-1, 0)
     )
@@ -151,8 +153,6 @@ def test_colors_attributes_and_the_page() -> None:
     values["index_offset"].requires_grad_()  # as in a run that is opened
     page, plain = SHADING.page(values, light), WITHOUT.page(values, light)
     values["index_offset"].requires_grad_(False)
-    assert page is not None
-    assert plain is not None
     assert INDEX_NOTE in page.notes
     # Whatever the index that the page draws with, surfaces reflect as much at 45 degrees as with their own.
     cosine = torch.tensor(0.5).sqrt()
@@ -168,3 +168,93 @@ def test_runs_recorded_before_there_were_indices_have_none() -> None:
     recorded = {name: value for name, value in SHADING.data().items() if name != "indices"}
     assert SHADING.as_recorded(recorded) == WITHOUT
     assert SHADING.as_recorded(SHADING.data()) == SHADING
+
+
+@pytest.fixture(scope="module")
+def trainer(tiny_scene: Scene) -> Trainer:
+    recipe = recipe_named("polarguide-stokes")
+    made = Trainer(
+        tiny_scene, recipe, resolve(TrainSettings(steps=60), tiny_scene, recipe), choose_backend("cpu")
+    )
+    made.run(lambda _: None, until=30)
+    return made
+
+
+def seen(trainer: Trainer, **asked: bool) -> RenderResult:
+    state, camera = trainer.state, trainer.scene.test_views[0].camera
+    with torch.no_grad():
+        return render(
+            state.gaussians,
+            camera,
+            trainer.backend.rasterize,
+            RenderRequest(**asked),
+            shading=trainer.shading,
+            light=state.light,
+        )
+
+
+def test_the_layers_and_the_polarization_stay(trainer: Trainer) -> None:
+    camera = trainer.scene.test_views[0].camera
+    blended, found = seen(trainer, depth=True), seen(trainer, depth=True, at_median_depth=True)
+    for field in fields(RenderResult):
+        one, other = (getattr(result, field.name) for result in (blended, found))
+        if field.name not in ("normal", "depth", "blended_normal") and isinstance(one, Tensor):
+            assert torch.equal(one, other), field.name
+    assert torch.equal(found.blended_normal, blended.normal)
+    assert found.shaded_normal is found.blended_normal
+    assert blended.shaded_normal is blended.normal
+    predicted = [trainer.shading.predicted_stokes(result, camera) for result in (blended, found)]
+    assert torch.equal(*predicted)
+
+
+def test_normals_and_depth_are_those_around_the_median(trainer: Trainer) -> None:
+    found, gaussians = seen(trainer, depth=True, at_median_depth=True), trainer.state.gaussians
+    camera = trainer.scene.test_views[0].camera
+    with torch.no_grad():
+        given, _ = splatting(gaussians, camera, PLAIN, sh_degree=0, normals=False, depth=False)
+    assert torch.equal(found.depth, surface_picture(given, camera).depth)
+    assert bool((found.normal.norm(dim=-1) <= found.alpha + 1e-5).all())
+    blended = seen(trainer, depth=True)
+    assert float((found.depth - blended.depth).abs().max()) > 1e-3, "they are not the same thing"
+
+
+def test_what_is_not_asked_for_is_not_there(trainer: Trainer) -> None:
+    assert seen(trainer, at_median_depth=True).depth is None
+    state, camera = trainer.state, trainer.scene.test_views[0].camera
+    plain = render(
+        state.gaussians,
+        camera,
+        trainer.backend.rasterize,
+        RenderRequest(normals=False, depth=True, at_median_depth=True),
+        shading=PLAIN,
+    )
+    assert plain.normal is None
+    assert plain.blended_normal is None
+    assert not plain.depth.requires_grad
+
+
+def test_a_wall_is_seen_from_the_side_of_the_cameras_and_what_is_behind_it_is_not(tiny_scene: Scene) -> None:
+    """A dense opaque patch before one camera, and one Gaussian well behind it."""
+    view = tiny_scene.train_views[0]
+    camera = view.camera
+    center = camera.center.float()
+    ahead = camera.rotation[2].float()
+    across = camera.rotation[:2].float()
+    steps = torch.linspace(-1.5, 1.5, 25)
+    grid = torch.stack(torch.meshgrid(steps, steps, indexing="ij"), dim=-1).reshape(-1, 2)
+    wall = center + 2 * ahead + grid @ across
+    means = torch.cat((wall, (center + 4 * ahead)[None]))
+    count = len(means)
+    rows = {
+        "means": means,
+        "quaternions": torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4),
+        "log_scales": torch.full((count, 3), 0.08).log(),
+        "opacity_logits": torch.full((count,), 4.0),
+        "sh_dc": torch.zeros(count, 3),
+        "sh_rest": torch.zeros(count, 15, 3),
+    }
+    outward = outward_directions(rows, [view], choose_backend("cpu").rasterize)
+    middle = grid.norm(dim=1) < 0.5
+    toward = normalize(center - wall, dim=-1)
+    torch.testing.assert_close(outward[:-1][middle], toward[middle], atol=1e-5, rtol=1e-5)
+    assert torch.equal(outward[-1], torch.zeros(3))

@@ -1,15 +1,13 @@
 """A plug-in's recipe through the public interface: trained, opened, scored, exported and ablated by name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
+from faults import Fault
 from plugins import install
 from toy_shading import TOY, SkyShading
 
 import polarguide
-from polarguide.core.errors import PolarguideError
 from polarguide.experiments.compare import ablated
 from polarguide.results.evaluation.sources import model_digest
 from polarguide.shading.deferred import DeferredShading
@@ -22,16 +20,14 @@ def test_a_recipe_object_goes_all_the_way(tmp_path: Path, demo_scene: Path) -> N
     run = polarguide.open_run(tmp_path / "run", recipe=TOY, scene=scene)
     assert run.evaluate()["psnr"] > 5
     assert run.export("ply", tmp_path)[0].stat().st_size > 1000
-    with pytest.raises(PolarguideError, match="one of"):
-        polarguide.open_run(tmp_path / "run")
-    with pytest.raises(PolarguideError, match="expected toy, which"):
-        polarguide.open_run(tmp_path / "run", recipe="3dgs")
+    Fault(expected="one of").raised_by(polarguide.open_run, tmp_path / "run")
+    Fault(expected="toy, which").raised_by(polarguide.open_run, tmp_path / "run", recipe="3dgs")
 
 
 def test_a_scene_of_another_size_is_refused(trained: Path, demo_scene: Path) -> None:
     other = polarguide.load_scene(demo_scene, downscale=8)
-    with pytest.raises(PolarguideError, match=r"expected downscale 4, transfer linear.*found downscale 8"):
-        polarguide.open_run(trained, scene=other).evaluate()
+    run = polarguide.open_run(trained, scene=other)
+    Fault(expected="downscale 4, transfer linear", found="downscale 8").raised_by(run.evaluate)
 
 
 def test_the_code_of_a_plugins_model_counts() -> None:

@@ -1,7 +1,5 @@
 """For the rendering tests: Mitsuba, or a reason to skip; and its variants, all paths compiled or one path at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

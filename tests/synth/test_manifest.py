@@ -1,16 +1,13 @@
 """Checksums of a rendered scene that somebody else made."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from faults import Fault
 
-from polarguide.core.errors import PolarguideError
 from polarguide.synth.folder import MANIFEST, folder_state, verify_scene
 
 
@@ -22,37 +19,39 @@ def scene(root: Path, listed: bytes = b"") -> Path:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "found"),
+    ("name", "content", "expected", "found"),
     [
-        (lambda root: (root / "scene.json").write_text("[]"), r"scene\.json: expected a JSON object"),
-        (lambda root: (root / "scene.json").write_bytes(b"\xff"), r"scene\.json: expected a JSON file"),
-        (lambda root: (root / "scene.json").unlink(), r"scene\.json: expected a readable file"),
-        (lambda root: (root / MANIFEST).unlink(), "checksums.txt: expected a readable file"),
-        (lambda root: ((root / MANIFEST).unlink(), os.mkfifo(root / MANIFEST)), "found a pipe or device"),
+        ("scene.json", b"[]", "a JSON object", ""),
+        ("scene.json", b"\xff", "a JSON file", ""),
+        ("scene.json", None, "a readable file", ""),
+        (MANIFEST, None, "a readable file", ""),
+        (MANIFEST, "pipe", "", "a pipe or device"),
     ],
 )
-def test_files_that_are_none(tmp_path: Path, spoil: Callable[[Path], object], found: str) -> None:
+def test_files_that_are_none(
+    tmp_path: Path, name: str, content: bytes | str | None, expected: str, found: str
+) -> None:
     root = scene(tmp_path / "scene")
     verify_scene(root)
-    spoil(root)
-    with pytest.raises(PolarguideError, match=found):
-        verify_scene(root)
+    (root / name).unlink()
+    if content == "pipe":
+        os.mkfifo(root / name)
+    elif content is not None:
+        (root / name).write_bytes(content)
+    Fault(name, expected, found).raised_by(verify_scene, root)
 
 
 @pytest.mark.parametrize("listed", [b"word\n", b"\xff\xfe\x00 x\n", b"0  \n"])
 def test_lists_that_are_none(tmp_path: Path, listed: bytes) -> None:
-    with pytest.raises(PolarguideError, match=r"expected the file that checksums\.txt lists"):
-        verify_scene(scene(tmp_path / "scene", listed))
+    Fault(expected="checksums.txt lists").raised_by(verify_scene, scene(tmp_path / "scene", listed))
 
 
 def test_no_file_outside_the_scene_is_read(tmp_path: Path) -> None:
     (tmp_path / "victim").write_text("mine")
     listed = f"{hashlib.sha256(b'mine').hexdigest()}  ../victim\n".encode()
-    with pytest.raises(PolarguideError, match="a list of files of this scene"):
-        verify_scene(scene(tmp_path / "scene", listed))
+    Fault(expected="files of this scene").raised_by(verify_scene, scene(tmp_path / "scene", listed))
 
 
 def test_a_request_that_says_nothing_more(tmp_path: Path) -> None:
     (tmp_path / "request.json").write_text('{"scene": {}, "settings": {}, "more": null}')
-    with pytest.raises(PolarguideError, match=r"more: null in place of"):
-        folder_state(tmp_path, {"scene": {}, "settings": {}})
+    Fault(found="more: null").raised_by(folder_state, tmp_path, {"scene": {}, "settings": {}})

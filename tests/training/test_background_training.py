@@ -1,25 +1,21 @@
 """Training a subject with nothing behind it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
 import torch
+from faults import Fault
+from trainings import CPU, make_trainer, run
 
 from polarguide.capture import Scene
-from polarguide.core.errors import PolarguideError
-from polarguide.raster import Backend, choose_backend, rasterize_reference
+from polarguide.raster import Backend, rasterize_reference
 from polarguide.recipes import RECIPES
-from polarguide.runs.defaults import resolve
+from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.training.actions import LEAST_PIXELS, touched_pixels
 from polarguide.training.losses import Weights, coverage_loss
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
-from polarguide.training.state import first_state
 from polarguide.training.trainer import Trainer
-
-BACKEND = choose_backend("cpu")
 
 
 @pytest.fixture
@@ -34,20 +30,8 @@ def black_scene(tiny_scene: Scene) -> Scene:
     return replace(tiny_scene, views=tuple(views))
 
 
-def trainer(scene: Scene, background: str, recipe: Recipe | str = "3dgs", steps: int = 60) -> Trainer:
-    settings = TrainSettings(steps, 3, background=background)  # type: ignore[arg-type]
-    chosen = RECIPES[recipe] if isinstance(recipe, str) else recipe
-    return Trainer(scene, chosen, resolve(settings, scene, chosen), BACKEND)
-
-
-def outside(made: Trainer, scene: Scene) -> float:
-    """Mean alpha of the first view's two outermost rows."""
-    from polarguide.shading.gbuffer import RenderRequest, render
-
-    alpha = render(
-        made.state.gaussians, scene.views[0].camera, BACKEND.rasterize, RenderRequest(normals=False)
-    ).alpha.detach()
-    return float(torch.cat((alpha[:2], alpha[-2:])).mean())
+def trainer(scene: Scene, background: str, recipe: Recipe = RECIPES["3dgs"], steps: int = 60) -> Trainer:
+    return make_trainer(scene, recipe, steps, background=background)
 
 
 def test_the_mode_is_found_from_the_pictures_unless_it_is_given(
@@ -63,23 +47,20 @@ def test_the_mode_is_found_from_the_pictures_unless_it_is_given(
 
 @pytest.mark.parametrize("name", ["3dgs", "3dgs-dr", "ref-gs", "polarguide-stokes"])
 def test_every_recipe_begins_without_far_gaussians(black_scene: Scene, name: str) -> None:
-    begun = Trainer(
-        black_scene, RECIPES[name], resolve(TrainSettings(60), black_scene, RECIPES[name]), BACKEND
-    )
-    assert len(begun.state.gaussians) == len(black_scene.points)
-    with_shell = first_state(
-        black_scene, RECIPES[name], resolve(TrainSettings(60), black_scene, RECIPES[name])
-    )
-    assert len(with_shell.gaussians) == len(black_scene.points) + RECIPES[name].initialization.shell
+    for background, shell in (("auto", 0), ("scene", RECIPES[name].initialization.shell)):
+        begun = trainer(black_scene, background, RECIPES[name])
+        assert len(begun.state.gaussians) == len(black_scene.points) + shell
 
 
 def test_empty_pixels_are_emptier_than_where_surroundings_are_trained(black_scene: Scene) -> None:
-    alphas = {}
+    outside = []
     for background in ("scene", "black"):
         made = trainer(black_scene, background, steps=150)
-        made.run(lambda _: None)
-        alphas[background] = outside(made, black_scene)
-    assert alphas["black"] < 0.5 * alphas["scene"]
+        run(made)
+        camera = black_scene.views[0].camera
+        alpha = render(made.state.gaussians, camera, CPU.rasterize, RenderRequest(normals=False)).alpha
+        outside.append(float(torch.cat((alpha[:2], alpha[-2:])).mean().detach()))
+    assert outside[1] < 0.5 * outside[0]
 
 
 def test_coverage_counts_empty_pixels_alone() -> None:
@@ -88,7 +69,6 @@ def test_coverage_counts_empty_pixels_alone() -> None:
     loss = coverage_loss(alpha, empty)
     assert float(loss.detach()) == 0.375
     loss.backward()
-    assert alpha.grad is not None
     assert alpha.grad.tolist() == [[0.5, 0.5], [0.0, 0.0]]
     assert float(coverage_loss(alpha.detach(), torch.zeros(2, 2))) == 0
 
@@ -100,7 +80,6 @@ def test_a_step_is_pulled_to_emptiness_where_the_background_is_black(black_scene
     masked = replace(black_scene, views=tuple(replace(view, mask=mask) for view in black_scene.views))
     losses = []
     recipe = RECIPES["3dgs"]
-    assert isinstance(recipe, Recipe)
     for weight in (0.0, Weights().coverage):
         stages = tuple(replace(s, weights=replace(s.weights, coverage=weight)) for s in recipe.stages)
         losses.append(float(trainer(masked, "black", replace(recipe, stages=stages)).step().measured[2]))
@@ -109,8 +88,6 @@ def test_a_step_is_pulled_to_emptiness_where_the_background_is_black(black_scene
 
 def summed_weights(made: Trainer, number: int) -> list[float]:
     """What one Gaussian adds to each training view, by pictures with it white among black ones."""
-    from polarguide.shading.gbuffer import splats
-
     given = splats(made.state.gaussians)
     features = torch.zeros(len(given.means), 1)
     features[number] = 1.0
@@ -124,7 +101,7 @@ def test_pictures_that_a_gaussian_adds_to_are_counted(black_scene: Scene) -> Non
         made.state.gaussians["means"][0] = torch.tensor([0.0, 0.0, 50.0])
         made.state.gaussians["opacity_logits"][1] = -12.0
     cameras = [view.camera for view in black_scene.train_views]
-    counts, most = touched_pixels(made.state.gaussians, cameras, BACKEND.rasterize)
+    counts, most = touched_pixels(made.state.gaussians, cameras, CPU.rasterize)
     for number in (0, 1, 2, 7):
         weights = summed_weights(made, number)
         assert counts[number] == sum(w >= LEAST_PIXELS for w in weights)
@@ -138,9 +115,9 @@ def test_what_no_view_sees_goes_when_the_density_control_ends(black_scene: Scene
     with torch.no_grad():
         made.state.gaussians["means"][0] = torch.tensor([0.0, -500.0, 0.0])
     count = len(made.state.gaussians)
-    made.run(lambda _: None, until=19)
+    run(made, 19)
     assert len(made.state.gaussians) == count
-    made.run(lambda _: None, until=21)
+    run(made, 21)
     assert len(made.state.gaussians) < count
     assert float(made.state.gaussians["means"].detach().abs().max()) < 100
     assert len(made.state.statistics.mean()) == len(made.state.gaussians)
@@ -149,22 +126,21 @@ def test_what_no_view_sees_goes_when_the_density_control_ends(black_scene: Scene
 def test_surroundings_keep_what_no_view_sees(black_scene: Scene) -> None:
     made = trainer(black_scene, "scene", steps=40)
     count = len(made.state.gaussians)
-    made.run(lambda _: None)
+    run(made)
     assert len(made.state.gaussians) == count
 
 
 def test_what_is_faint_in_all_views_goes_where_the_recipe_says_so(black_scene: Scene) -> None:
     stages, recipe = {}, RECIPES["polarguide-stokes"]
-    assert isinstance(recipe, Recipe)
     assert recipe.densification.faint_pixels == 0.1
     for faint in (0.0, 0.1):
         changed = replace(recipe, densification=replace(recipe.densification, faint_pixels=faint))
         made = trainer(black_scene, "scene", recipe=changed, steps=40)
         with torch.no_grad():
             made.state.gaussians["opacity_logits"][1] = -5.4  # over the least opacity, and hardly to be seen
-        made.run(lambda _: None, until=19)
+        run(made, 19)
         before = len(made.state.gaussians)
-        made.run(lambda _: None, until=20)
+        run(made, 20)
         stages[faint] = before, len(made.state.gaussians)
     assert stages[0.0][0] == stages[0.0][1] == stages[0.1][0]
     assert 0 < stages[0.1][1] < stages[0.1][0]
@@ -174,16 +150,11 @@ def test_all_stays_where_no_view_sees_anything(black_scene: Scene) -> None:
     def nothing(splats, camera, **asked):  # type: ignore[no-untyped-def]
         return rasterize_reference(splats._replace(opacities=splats.opacities * 0), camera, **asked)
 
-    made = Trainer(
-        black_scene,
-        RECIPES["3dgs"],
-        resolve(TrainSettings(40, background="black"), black_scene, RECIPES["3dgs"]),
-        Backend(BACKEND.device, nothing),
-    )
-    made.run(lambda _: None)
+    backend = Backend(CPU.device, nothing)
+    made = make_trainer(black_scene, RECIPES["3dgs"], 40, backend=backend, background="black")
+    run(made)
     assert len(made.state.gaussians) == len(black_scene.points)
 
 
 def test_a_mode_that_there_is_not_is_refused() -> None:
-    with pytest.raises(PolarguideError, match="background: expected one of auto, scene, black, masked"):
-        TrainSettings(background="white")  # type: ignore[arg-type]
+    Fault("background", "auto, scene, black, masked", "white").raised_by(TrainSettings, background="white")

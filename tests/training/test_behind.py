@@ -1,7 +1,5 @@
 """Behind the subject, terms on normals turn Gaussians, and neither move nor fade them."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from raster_scenes import difference
@@ -55,8 +53,6 @@ def gradients(
     result = rendered(of, rasterize)
     if behind is not None:
         result = turned_behind(result, *behind)
-    assert result.normal is not None
-    assert result.depth is not None
     generator = torch.Generator().manual_seed(3)
     weight = torch.rand(24, 32, 4, generator=generator, dtype=torch.float64).to(dtype)
     weight[:, :17] = 0
@@ -81,9 +77,7 @@ def test_far_gaussians_turn_and_neither_move_nor_fade(rasterize: Rasterize, dtyp
 
 def test_half_way_half_of_the_gradient_moves() -> None:
     # Depths are about 10: a share of one half lies where the inverse depth is midway.
-    of = gaussians(torch.float32)
-    depth = rendered(of, rasterize_cpu).depth
-    assert depth is not None
+    depth = rendered(gaussians(torch.float32), rasterize_cpu).depth
     shares = shares_before(depth.detach(), 5.0, 1e9)[:, 20:]
     whole, part = (gradients(behind, rasterize_cpu, torch.float32) for behind in (None, (5.0, 1e9)))
     ratio = float(part["means"].norm() / whole["means"].norm())

@@ -1,7 +1,6 @@
 """Checkpoints of every recipe with one tensor spoiled: refused by name, before anything computes with them."""
 
-from __future__ import annotations
-
+import dataclasses
 import math
 import os
 import shutil
@@ -10,20 +9,23 @@ from pathlib import Path
 
 import pytest
 import torch
+from faults import Fault
 from safetensors.torch import load_file, save_file
 from torch import Tensor
+from toy_shading import TOY, SkyShading
+from trainings import different
 
 import polarguide
 from polarguide.capture import Scene
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import SceneOptions, SessionOptions
-from polarguide.recipes import RECIPES, recipe_named
+from polarguide.recipes import RECIPES
 from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
-from polarguide.training.state import TrainingState, first_state
+from polarguide.training.state import Environment, TrainingState, first_state
 
 
 def stepped(scene: Scene, recipe: Recipe) -> TrainingState:
@@ -67,15 +69,12 @@ OF_GAUSSIANS = [name for name, recipe in sorted(RECIPES.items()) if isinstance(r
 
 @pytest.fixture(scope="module", params=OF_GAUSSIANS)
 def whole(request: pytest.FixtureRequest, tiny_scene: Scene) -> tuple[Recipe, dict[str, Tensor]]:
-    recipe = recipe_named(request.param)
-    assert isinstance(recipe, Recipe)
-    return recipe, stepped(tiny_scene, recipe).tensors()
+    return RECIPES[request.param], stepped(tiny_scene, RECIPES[request.param]).tensors()
 
 
 def test_the_state_itself_is_taken_back(whole: tuple[Recipe, dict[str, Tensor]]) -> None:
     recipe, tensors = whole
-    back = TrainingState.from_tensors(tensors, recipe).tensors()
-    assert back.keys() == tensors.keys()
+    assert TrainingState.from_tensors(tensors, recipe).tensors().keys() == tensors.keys()
 
 
 @pytest.mark.parametrize("spoiled", SPOILED)
@@ -107,12 +106,17 @@ def test_every_missing_tensor_is_named(whole: tuple[Recipe, dict[str, Tensor]]) 
 @pytest.mark.parametrize(
     ("name", "values"),
     [("stranger", torch.zeros(2)), ("scalars", torch.tensor([-1, 0, 0])), ("scalars", torch.tensor([1, 0, 2])),
-     ("scalars", torch.tensor([2**62, 0])), ("scalars", torch.tensor([1, 0, 0, 0])), ("scalars", torch.tensor([1]))],
+     ("scalars", torch.tensor([2**62, 0])), ("scalars", torch.tensor([1, 0, 0, 0])), ("scalars", torch.tensor([1])),
+     ("gaussians.means", torch.zeros(0, 3)), ("gaussians.quaternions", 0), ("statistics.seen", -1),
+     ("adam.means.exp_avg_sq", -1), ("adam.means.step", -1)],
 )  # fmt: skip
 def test_what_no_training_leaves_is_refused(
-    tiny_scene: Scene, busy_recipe: Recipe, name: str, values: Tensor
+    tiny_scene: Scene, busy_recipe: Recipe, name: str, values: Tensor | int
 ) -> None:
+    """A number stands for as many of it as the tensor has values."""
     tensors = stepped(tiny_scene, busy_recipe).tensors()
+    if isinstance(values, int):
+        values = torch.full_like(tensors[name], values)
     with pytest.raises(ValueError, match=name):
         refuse_foreign({**tensors, name: values}, busy_recipe)
 
@@ -124,22 +128,10 @@ def test_the_third_scalar_of_the_first_checkpoints_is_let_through(
     for flag in (0, 1):
         older = {**tensors, "scalars": torch.cat((tensors["scalars"], torch.tensor([flag])))}
         refuse_foreign(older, busy_recipe)
-        loaded = TrainingState.from_tensors(older, busy_recipe).tensors()
-        assert loaded.keys() == tensors.keys()
-        assert all(torch.equal(loaded[name], tensors[name]) for name in tensors)
+        assert different(TrainingState.from_tensors(older, busy_recipe).tensors(), tensors) == []
 
 
-def test_signs_and_lengths(tiny_scene: Scene, busy_recipe: Recipe) -> None:
-    tensors = stepped(tiny_scene, busy_recipe).tensors()
-    for name in ("statistics.seen", "adam.means.exp_avg_sq", "adam.means.step"):
-        with pytest.raises(ValueError, match="negative"):
-            refuse_foreign({**tensors, name: tensors[name] - 1e6}, busy_recipe)
-    none = {name: values[:0] if name.startswith("gaussians.") else values for name, values in tensors.items()}
-    with pytest.raises(ValueError, match="of no Gaussian"):
-        refuse_foreign(none, busy_recipe)
-    still = {**tensors, "gaussians.quaternions": torch.zeros_like(tensors["gaussians.quaternions"])}
-    with pytest.raises(ValueError, match="length zero"):
-        refuse_foreign(still, busy_recipe)
+SETTINGS, READING = TrainSettings(2), SceneOptions(downscale=8)
 
 
 @pytest.fixture(scope="module")
@@ -147,49 +139,122 @@ def with_moments(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     """A finished run that has kept the optimizer's state."""
     out = tmp_path_factory.mktemp("moments") / "run"
     session = SessionOptions(threads=1, keep_optimizer=True)
-    polarguide.train(
-        demo_scene, out, settings=TrainSettings(40), reading=SceneOptions(downscale=4), session=session
-    )
+    polarguide.train(demo_scene, out, settings=SETTINGS, reading=READING, session=session)
     return out
 
 
-@pytest.mark.parametrize("way", ["open", "resume"])
+def shorter(values: Tensor) -> Tensor:
+    return values[:-1].clone()
+
+
+def of_three_views(values: Tensor) -> Tensor:
+    return values.expand(3, -1).clone()
+
+
+@pytest.mark.parametrize(
+    ("resume", "change", "names", "found"),
+    [
+        (False, shorter, ["adam.means.exp_avg"], "adam.means.exp_avg"),
+        (True, shorter, ["adam.means.exp_avg"], "adam.means.exp_avg"),
+        (True, of_three_views, ["statistics.gradient", "statistics.seen"], "one with 3"),
+    ],
+)
 def test_opening_and_going_on_check_alike(
-    with_moments: Path, demo_scene: Path, tmp_path: Path, way: str
-) -> None:
+    with_moments: Path, demo_scene: Path, tmp_path: Path,
+    resume: bool, change: Callable[[Tensor], Tensor], names: list[str], found: str,
+) -> None:  # fmt: skip
     """Moments that do not fit used to crash the optimizer, and only where a run was gone on with."""
-    run = tmp_path / "run"
-    shutil.copytree(with_moments, run)
+    run, fault = Path(shutil.copytree(with_moments, tmp_path / "run")), Fault(CHECKPOINT, found=found)
     tensors = load_file(run / CHECKPOINT)
-    tensors["adam.means.exp_avg"] = tensors["adam.means.exp_avg"][:-1].clone()
-    save_file(tensors, run / CHECKPOINT)
-    reading, settings = SceneOptions(downscale=4), TrainSettings(40)
-    attempt = {
-        "open": lambda: polarguide.open_run(run),
-        "resume": lambda: polarguide.train(demo_scene, run, settings=settings, reading=reading, resume=True),
-    }[way]
-    with pytest.raises(PolarguideError, match=r"adam\.means\.exp_avg"):
-        attempt()
-
-
-def test_sums_for_other_views_a_step_are_refused(trained: Path, demo_scene: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(trained, run)
-    tensors = load_file(run / CHECKPOINT)
-    for name in ("statistics.gradient", "statistics.seen"):
-        tensors[name] = tensors[name].expand(3, -1).clone()
-    save_file(tensors, run / CHECKPOINT)
-    with pytest.raises(PolarguideError, match="views a step"):
-        polarguide.train(
-            demo_scene,
-            run,
-            settings=TrainSettings(40),
-            reading=SceneOptions(downscale=4),
-            resume=True,
-        )
+    save_file(tensors | {name: change(tensors[name]) for name in names}, run / CHECKPOINT)
+    if resume:
+        fault.raised_by(polarguide.train, demo_scene, run, settings=SETTINGS, reading=READING, resume=True)
+    else:
+        fault.raised_by(polarguide.open_run, run)
 
 
 def test_a_checkpoint_that_is_no_file_is_refused(tmp_path: Path, busy_recipe: Recipe) -> None:
     os.mkfifo(tmp_path / CHECKPOINT)
-    with pytest.raises(PolarguideError, match="pipe"):
-        load_checkpoint(tmp_path, busy_recipe)
+    Fault(CHECKPOINT, found="pipe").raised_by(load_checkpoint, tmp_path, busy_recipe)
+
+
+RATES = {"texels": 0.1, "mlp_bias_0": 0.01}
+
+
+def stepped_light(rates: dict[str, float], steps: int, environment: Environment | None = None) -> Environment:
+    if environment is None:
+        environment = Environment({name: torch.linspace(-1, 1, 6) for name in rates}, rates)
+    for step in range(steps):
+        total = torch.stack([(t - step).square().sum() for t in environment.parameters.values()]).sum()
+        total.backward()
+        environment.step()
+    return environment
+
+
+def test_texels_alone_keep_the_names_of_the_first_checkpoints() -> None:
+    names = {"texels", "adam.step", "adam.exp_avg", "adam.exp_avg_sq"}
+    assert set(stepped_light({"texels": 0.1}, 1).state()) == {f"environment.{name}" for name in names}
+
+
+def test_names_do_not_collide() -> None:
+    assert len(stepped_light(RATES, 1).state()) == 8
+
+
+@pytest.mark.parametrize("rates", [{"texels": 0.1}, RATES])
+def test_going_on_from_a_state_gives_the_same_bits(rates: dict[str, float]) -> None:
+    whole = stepped_light(rates, 2)
+    begun = Environment.from_state(whole.state(), rates)
+    for environment in (whole, begun):
+        stepped_light(rates, 3, environment)
+    found, expected = begun.state(), whole.state()
+    assert set(found) == set(expected)
+    assert all(torch.equal(found[name], expected[name]) for name in expected)
+
+
+def test_every_parameter_learns_at_its_own_rate() -> None:
+    first = torch.linspace(-1, 1, 6)
+    moved = stepped_light(RATES, 1)
+    for name, rate in RATES.items():
+        step = (moved.parameters[name].detach() - first).abs()
+        assert float(step.max()) == pytest.approx(rate, rel=1e-3)
+
+
+def test_a_parameter_without_a_gradient_rests() -> None:
+    environment = Environment({name: torch.ones(2) for name in RATES}, RATES)
+    environment.step()
+    environment.parameters["texels"].sum().backward()
+    environment.step()
+    assert torch.equal(environment.parameters["mlp_bias_0"].detach(), torch.ones(2))
+    assert not torch.equal(environment.parameters["texels"].detach(), torch.ones(2))
+
+
+def test_a_parameter_without_a_rate_is_refused() -> None:
+    with pytest.raises(KeyError):
+        Environment({"texels": torch.ones(2)}, {})
+
+
+@dataclasses.dataclass(frozen=True)
+class _Undeclared(SkyShading):
+    def initial_parameters(self, colors: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
+        return super().initial_parameters(colors, generator) | {"tint": torch.ones(len(colors))}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Dark(SkyShading):
+    def initial_light(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
+        return {}
+
+
+@pytest.mark.parametrize(
+    ("shading", "where", "values"),
+    [(_Undeclared(), "_Undeclared, tint", "["), (_Dark(), "_Dark, sky", "no values")],
+)
+def test_first_values_have_the_declared_shapes(
+    demo_scene: Path, shading: SkyShading, where: str, values: str
+) -> None:
+    scene = polarguide.load_scene(demo_scene, downscale=8)
+    recipe = dataclasses.replace(TOY, shading=shading)
+    with pytest.raises(PolarguideError) as refusal:
+        first_state(scene, recipe, resolve(TrainSettings(4), scene, recipe))
+    assert refusal.value.where == where
+    assert refusal.value.found.startswith(values)

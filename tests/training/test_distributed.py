@@ -1,25 +1,25 @@
 """Several processes train what one process with as many views a step trains."""
 
-from __future__ import annotations
-
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file
 from torch import Tensor
+from trainings import different, make_trainer, run, trained
 
+import polarguide
 from polarguide.capture import Scene
-from polarguide.raster import choose_backend
-from polarguide.runs.defaults import resolve
+from polarguide.core.options import SceneOptions, SessionOptions
+from polarguide.core.system import process_is_alive
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
 from polarguide.training.distributed import Ranks
 from polarguide.training.recipe import Recipe
-from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import StepReport, Trainer
 
 PROGRAM = Path(__file__).parents[1] / "helpers" / "ranks_program.py"
 PATIENCE = 300.0
@@ -39,30 +39,16 @@ def shared(
     return [load_file(out / str(rank) / CHECKPOINT) for rank in range(ranks)]
 
 
-def alone(
-    scene: Scene, recipe: Recipe, *, steps: int, views: int, until: int | None = None
-) -> tuple[Trainer, list[StepReport]]:
-    settings = resolve(TrainSettings(steps, 3, views_per_step=views), scene, recipe)
-    trainer, reports = Trainer(scene, recipe, settings, choose_backend("cpu")), list[StepReport]()
-    trainer.run(reports.append, until=until)
-    return trainer, reports
-
-
-def different(a: dict[str, Tensor], b: dict[str, Tensor]) -> list[str]:
-    assert set(a) == set(b)
-    return [n for n in a if a[n].shape != b[n].shape or a[n].numpy().tobytes() != b[n].numpy().tobytes()]
-
-
 @pytest.mark.slow
 def test_two_ranks_of_one_view_are_one_process_of_two_bit_by_bit(
     tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path
 ) -> None:
     steps = 300
-    trainer, reports = alone(tiny_scene, busy_recipe, steps=steps, views=2)
-    assert len({report.gaussians for report in reports}) > 3, "the density control did nothing"
+    alone = make_trainer(tiny_scene, busy_recipe, steps, views_per_step=2)
+    assert len({report.gaussians for report in run(alone)}) > 3, "the density control did nothing"
     first, second = shared(tmp_path, ranks=2, steps=steps, views=2)
     assert different(first, second) == []
-    assert different(first, trainer.state.tensors()) == []
+    assert different(first, alone.state.tensors()) == []
 
 
 @pytest.mark.slow
@@ -72,10 +58,9 @@ def test_other_shares_agree_up_to_summation_order(
 ) -> None:
     """Two views each; and a rank without a view. The ranks decide the same, to the bit."""
     steps = 4  # the density control comes after the last: its decisions are compared by the row counts
-    trainer, _ = alone(tiny_scene, busy_recipe, steps=steps, views=views)
+    expected = trained(tiny_scene, busy_recipe, steps, views_per_step=views)
     first, *others = shared(tmp_path, ranks=ranks, steps=steps, views=views)
     assert all(different(first, other) == [] for other in others)
-    expected = trainer.state.tensors()
     assert {n: t.shape for n, t in first.items()} == {n: t.shape for n, t in expected.items()}
     for name in ("gaussians.means", "gaussians.sh_dc", "gaussians.log_scales", "gaussians.opacity_logits"):
         # Adam's first steps have the size of the rate, whatever the gradient: where one rounds to the other side of
@@ -88,15 +73,12 @@ def test_several_views_a_step_are_resumed_bit_by_bit(
     tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path
 ) -> None:
     """Also between two rounds of the density control, when the statistics are under way."""
-    backend = choose_backend("cpu")
-    settings = resolve(TrainSettings(30, 3, views_per_step=3), tiny_scene, busy_recipe)
-    whole, _ = alone(tiny_scene, busy_recipe, steps=30, views=3)
-    begun = Trainer(tiny_scene, busy_recipe, settings, backend)
-    begun.run(lambda _: None, until=21)
+    begun = make_trainer(tiny_scene, busy_recipe, 30, views_per_step=3)
+    run(begun, until=21)
     save_checkpoint(tmp_path, begun.state)
-    resumed = Trainer(tiny_scene, busy_recipe, settings, backend, load_checkpoint(tmp_path, busy_recipe))
-    resumed.run(lambda _: None)
-    assert different(resumed.state.tensors(), whole.state.tensors()) == []
+    state = load_checkpoint(tmp_path, busy_recipe)
+    resumed = trained(tiny_scene, busy_recipe, 30, state=state, views_per_step=3)
+    assert different(resumed, trained(tiny_scene, busy_recipe, 30, views_per_step=3)) == []
 
 
 @pytest.mark.slow
@@ -106,18 +88,18 @@ def test_another_number_of_ranks_goes_on_bit_by_bit(
 ) -> None:
     """Stopped between two rounds of the density control, when every rank has seen other views than the others."""
     steps, until, views = 30, 21, 2
-    whole, reports = alone(tiny_scene, busy_recipe, steps=steps, views=views)
-    assert len({report.gaussians for report in reports[until:]}) > 1, "the density control did nothing after"
+    whole = make_trainer(tiny_scene, busy_recipe, steps, views_per_step=views)
+    assert len({report.gaussians for report in run(whole)[until:]}) > 1, (
+        "the density control did nothing after"
+    )
     if before > 1:
         first = shared(tmp_path, ranks=before, steps=steps, views=views, until=until)
         assert int(first[0]["scalars"][0]) == until
-        settings = resolve(TrainSettings(steps, 3, views_per_step=views), tiny_scene, busy_recipe)
         state = load_checkpoint(tmp_path / "0", busy_recipe)
-        resumed = Trainer(tiny_scene, busy_recipe, settings, choose_backend("cpu"), state)
-        resumed.run(lambda _: None)
-        ends = [resumed.state.tensors()]
+        ends = [trained(tiny_scene, busy_recipe, steps, state=state, views_per_step=views)]
     else:
-        begun, _ = alone(tiny_scene, busy_recipe, steps=steps, views=views, until=until)
+        begun = make_trainer(tiny_scene, busy_recipe, steps, views_per_step=views)
+        run(begun, until)
         save_checkpoint(tmp_path, begun.state)
         ends = shared(tmp_path / "end", ranks=after, steps=steps, views=views, begun=tmp_path)
     assert [different(end, whole.state.tensors()) for end in ends] == [[]] * after
@@ -135,18 +117,75 @@ def test_slots_are_shared_out_once_each_and_the_first_rank_has_one(world: int, v
 
 
 def test_rates_follow_the_square_root_of_the_views(tiny_scene: Scene, busy_recipe: Recipe) -> None:
-    one, four = (
-        Trainer(
-            tiny_scene,
-            busy_recipe,
-            resolve(TrainSettings(30, 3, views_per_step=views), tiny_scene, busy_recipe),
-            choose_backend("cpu"),
-        )
-        for views in (1, 4)
-    )
-    for trainer in (one, four):
+    groups = []
+    for views in (1, 4):
+        trainer = make_trainer(tiny_scene, busy_recipe, 30, views_per_step=views)
         trainer.step()
-    groups = [trainer.state.gaussians._optimizer.param_groups for trainer in (one, four)]
+        groups.append(trainer.state.gaussians._optimizer.param_groups)
     for a, b in zip(*groups, strict=True):
         assert b["lr"] == pytest.approx(2 * a["lr"])
         assert b["betas"] == pytest.approx((0.9**4, 0.999**4))
+
+
+STEPS = 400
+
+
+def flags(scene: Path, out: Path) -> list[str]:
+    sizes = ["--downscale", "4", "--steps", str(STEPS), "--checkpoint-every", "20", "--threads", "1"]
+    return ["train", str(scene), "--out", str(out), "--recipe", "3dgs", *sizes]
+
+
+def launch(scene: Path, out: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--standalone"]
+    command += ["-m", "polarguide", *flags(scene, out)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+
+
+def ranks_of(parent: int) -> dict[int, int]:
+    """Process by rank."""
+    found = {}
+    for pid in Path(f"/proc/{parent}/task/{parent}/children").read_text().split():
+        settings = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+        found |= {int(s[5:]): int(pid) for s in settings if s.startswith(b"RANK=")}
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="finds the ranks in /proc")
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_killed_rank_ends_all_and_the_run_goes_on_alone(
+    demo_scene: Path, tmp_path: Path, victim: int
+) -> None:
+    out = tmp_path / "run"
+    process = launch(demo_scene, out)
+    give_up = time.monotonic() + PATIENCE
+    while not (out / CHECKPOINT).exists() and time.monotonic() < give_up:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    ranks = ranks_of(process.pid)
+    assert set(ranks) == {0, 1}
+    os.kill(ranks[victim], signal.SIGKILL)
+    begin = time.monotonic()
+    _, errors = process.communicate(timeout=60)
+    assert time.monotonic() - begin < 60
+    assert process.returncode != 0
+    assert not any(process_is_alive(pid) for pid in ranks.values())
+    told = [line for line in errors.splitlines() if line.startswith("error: training: expected 2 processes")]
+    assert len(told) == 1, errors
+    assert f"rank {victim} (process {ranks[victim]}) was lost" in told[0]
+    assert "--resume" in told[0]
+    assert 0 < int(load_file(out / CHECKPOINT)["scalars"][0]) < STEPS
+    if victim == 0:
+        polarguide.train(
+            demo_scene,
+            out,
+            recipe="3dgs",
+            settings=polarguide.TrainSettings(STEPS),
+            session=SessionOptions(threads=1),
+            reading=SceneOptions(downscale=4),
+            resume=True,
+        )
+        assert int(load_file(out / CHECKPOINT)["scalars"][0]) == STEPS

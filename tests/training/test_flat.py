@@ -1,7 +1,5 @@
 """Flat surfaces that mirror: their normals from one view, without depth; nothing on curved ones."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -60,7 +58,6 @@ def test_a_plane_has_one_normal_on_its_true_side(tilt: float, mirrors: float) ->
     normal = torch.tensor([math.sin(tilt), 0.0, math.cos(tilt)])
     view, where = floor(camera(), normal, mirrors=mirrors)
     found = flat_surface(view, INDEX, FlatRules())
-    assert found is not None
     assert degrees(found.normal, normal) < 0.2
     assert float((found.where & where).sum() / where.sum()) > 0.85
     assert float((found.where & ~where).float().mean()) < 0.03
@@ -112,7 +109,6 @@ def test_it_takes_the_place_of_a_guide_that_is_the_mirror_image() -> None:
     of = camera()
     view, _ = floor(of)
     flat = flat_surface(view, INDEX, FlatRules())
-    assert flat is not None
     rays = of.rays()
     true = of.to_camera(UP.expand_as(rays))
     wrong = of.to_world(

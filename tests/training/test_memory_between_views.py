@@ -1,13 +1,12 @@
 """A look at all views gives freed memory back view by view."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
+from metal_balls import gaussians_of_the_ball, views_of
 
 from polarguide.capture import View
 from polarguide.core.system import MemoryBound
@@ -17,7 +16,6 @@ from polarguide.training.actions import outward_directions
 from polarguide.training.metals.evidence import evidence
 from polarguide.training.metals.observations import contradicted, label_weights
 from polarguide.training.rules import MetalRules
-from tests.helpers.metal_balls import gaussians_of_the_ball, views_of
 
 RULES = MetalRules()
 GAUSSIANS = gaussians_of_the_ball()

@@ -1,7 +1,5 @@
 """Priors of the demo scene, whose normals and layers are known, with the true normals as guide."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -46,9 +44,6 @@ def psnr(found: Tensor, linear: Tensor, where: Tensor) -> float:
 
 def layers_psnr(priors: ViewPriors, view: View) -> tuple[float, float]:
     ground_truth = ground_truth_of(view)
-    assert ground_truth.specular is not None
-    assert ground_truth.diffuse is not None
-    assert ground_truth.mask is not None
     where = ground_truth.mask & (priors.separated > 0)
     assert float(where.sum() / ground_truth.mask.sum()) > 0.5
     return psnr(priors.specular, ground_truth.specular / 2, where), psnr(

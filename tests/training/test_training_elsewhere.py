@@ -1,6 +1,4 @@
-"""Training on a device that is not the CPU, with values: the density control, resets, refreshes and checkpoints."""
-
-from __future__ import annotations
+"""Training on a device that is not the CPU, with values: every step, what happens between steps, and checkpoints."""
 
 from pathlib import Path
 
@@ -9,20 +7,18 @@ import torch
 from other_device import BACKEND, THERE, OtherDevice
 from safetensors.torch import load_file
 from torch import Tensor
+from trainings import CPU, different, make_trainer, run
 
 from polarguide.capture import Scene
 from polarguide.gaussians.ply import read_ply
-from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
-from polarguide.runs.defaults import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
 from polarguide.runs.model import write_run_ply
 from polarguide.training.recipe import Recipe
-from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer
 
-STEPS = TrainSettings(30, 3)
-HALF = 13
+OF_GAUSSIANS = [name for name, recipe in RECIPES.items() if isinstance(recipe, Recipe)]
+STEPS, HALF = 20, 9
 
 
 @pytest.fixture(autouse=True)
@@ -38,15 +34,42 @@ def checkpoint(folder: Path, trainer: Trainer) -> dict[str, Tensor]:
     return load_file(folder / CHECKPOINT)
 
 
+@pytest.mark.parametrize("name", OF_GAUSSIANS)
+def test_a_step_of_every_stage_stays_there_and_waits_for_nothing(tiny_scene: Scene, name: str) -> None:
+    """When a view is looked at again: its picture, priors and pose have reached the device."""
+    steps = 40
+    with OtherDevice() as device:
+        trainer = make_trainer(tiny_scene, RECIPES[name], steps, backend=BACKEND)
+        plain = [step for step in range(steps) if not trainer.schedule.at(step).actions]
+        stages = {trainer.schedule.at(step).stage.name: step for step in plain}
+        assert len(stages) == len(RECIPES[name].stages)
+        for step in stages.values():
+            for again in (False, True):
+                trainer.state.step, before = step, device.waits
+                trainer._backpropagate(0, trainer.schedule.at(step).stage, True)
+                trainer._join_gradients(idle=False)
+                trainer._optimize()
+                assert not again or device.waits == before, step
+
+
+def test_several_views_a_step_stay_there_too(tiny_scene: Scene) -> None:
+    with OtherDevice():
+        trainer = make_trainer(tiny_scene, RECIPES["polarguide"], STEPS, backend=BACKEND, views_per_step=2)
+        report = trainer.step()
+    assert report.measured.device == THERE
+    assert trainer.state.statistics.gradient.shape == (2, len(trainer.state.gaussians))
+    assert trainer.state.statistics.gradient.device == THERE
+
+
 def test_a_training_stays_there_and_goes_on_from_its_checkpoint(
     tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path
 ) -> None:
     """Nothing mixes devices, and a step with nothing due before or after it waits for nothing."""
     densified = busy_recipe.densification.every
     with OtherDevice() as device:
-        trainer = Trainer(tiny_scene, busy_recipe, resolve(STEPS, tiny_scene, busy_recipe), BACKEND)
+        trainer = make_trainer(tiny_scene, busy_recipe, STEPS, backend=BACKEND)
         counts = [len(trainer.state.gaussians)]
-        for step in range(STEPS.steps):
+        for step in range(STEPS):
             if step == HALF:
                 checkpoint(tmp_path / "half", trainer)
             due = trainer.schedule.at(step).actions or (step + 1) % densified == 0
@@ -60,36 +83,31 @@ def test_a_training_stays_there_and_goes_on_from_its_checkpoint(
         assert {n for n, t in tensors.items() if t.device != THERE} == set()
         whole = checkpoint(tmp_path / "whole", trainer)
         state = load_checkpoint(tmp_path / "half", busy_recipe, THERE)
-        again = Trainer(tiny_scene, busy_recipe, resolve(STEPS, tiny_scene, busy_recipe), BACKEND, state)
-        again.run(lambda _: None)
-        resumed = checkpoint(tmp_path / "again", again)
-    assert {name for name in whole if not torch.equal(whole[name], resumed[name])} == set()
+        resumed = make_trainer(tiny_scene, busy_recipe, STEPS, state, backend=BACKEND)
+        run(resumed)
+        assert different(whole, checkpoint(tmp_path / "again", resumed)) == []
     state = load_checkpoint(tmp_path / "half", busy_recipe)
-    Trainer(
-        tiny_scene, busy_recipe, resolve(STEPS, tiny_scene, busy_recipe), choose_backend("cpu"), state
-    ).run(lambda _: None, until=HALF + 1)
+    run(make_trainer(tiny_scene, busy_recipe, STEPS, state), until=HALF + 1)
 
 
 @pytest.mark.parametrize("name", ["3dgs", "polarguide-stokes", "ref-gs"])
 def test_what_a_recipe_begins_and_ends_with(tiny_scene: Scene, tmp_path: Path, name: str) -> None:
     """First rows, the side that is outward, and the PLY: as on the CPU."""
-    written, outward = {}, {}
-    for backend in (choose_backend("cpu"), BACKEND):
-        here = backend.device.type == "cpu"
+    written, outward = [], []
+    for backend in (CPU, BACKEND):
         with OtherDevice():
-            trainer = Trainer(tiny_scene, RECIPES[name], resolve(STEPS, tiny_scene, RECIPES[name]), backend)
+            trainer = make_trainer(tiny_scene, RECIPES[name], STEPS, backend=backend)
             if RECIPES[name].oriented:
                 trainer._act("orient_normals")
-                outward[here] = trainer.state.gaussians["outward"].detach().to("cpu")
-            path = tmp_path / f"{here}.ply"
-            write_run_ply(path, trainer.state, trainer.shading)
-            written[here] = read_ply(path)
+                outward.append(trainer.state.gaussians["outward"].detach().to("cpu"))
+            write_run_ply(tmp_path / "run.ply", trainer.state, trainer.shading)
+        written.append(read_ply(tmp_path / "run.ply"))
     assert bool(outward) == RECIPES[name].oriented
     if outward:
-        assert bool(outward[True].any())
-        torch.testing.assert_close(outward[False], outward[True], rtol=1e-4, atol=1e-4)
-    for field, values in written[True].items():
-        torch.testing.assert_close(written[False][field], values, rtol=1e-4, atol=1e-4)
+        assert bool(outward[0].any())
+        torch.testing.assert_close(*outward, rtol=1e-4, atol=1e-4)
+    for field, values in written[0].items():
+        torch.testing.assert_close(written[1][field], values, rtol=1e-4, atol=1e-4)
 
 
 def test_the_other_device_refuses_what_a_gpu_refuses() -> None:

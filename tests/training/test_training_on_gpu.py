@@ -1,7 +1,5 @@
 """Training on a GPU: it learns what the CPU learns, waits for nothing of its own, and its checkpoints move about."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,21 +1,14 @@
 """The controls without polarization read none: other S1 and S2 of the same S0 change no bit of what they train."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
+from trainings import different, trained
 
 from polarguide import optics
 from polarguide.capture import Scene, View
-from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES, ablations_of, recipe_named
-from polarguide.runs.defaults import resolve
-from polarguide.training.recipe import Recipe
-from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import Trainer
 
 STEPS = 30
 CONTROLS = [r.name for base in RECIPES for r in ablations_of(base) if ":unpolarized" in r.name]
@@ -34,19 +27,13 @@ def other_scene(tiny_scene: Scene) -> Scene:
     return replace(tiny_scene, views=tuple(repolarized(view) for view in tiny_scene.views))
 
 
-def trained(scene: Scene, recipe: Recipe) -> dict[str, Tensor]:
+def changed(name: str, *scenes: Scene) -> list[str]:
+    """Names of the tensors in which trainings on two scenes differ."""
+    recipe = recipe_named(name)
     # Density control and huge Gaussians within the thirty steps, too.
     density = replace(recipe.densification, every=5, gradient=1e-5, large_minimum=1)
     recipe = replace(recipe, densification=density)
-    trainer = Trainer(scene, recipe, resolve(TrainSettings(STEPS, 3), scene, recipe), choose_backend("cpu"))
-    trainer.run(lambda _: None)
-    return trainer.state.tensors()
-
-
-def changed(first: dict[str, Tensor], second: dict[str, Tensor]) -> set[str]:
-    """Names of the tensors that are not the same bits."""
-    assert set(first) == set(second)
-    return {n for n in first if first[n].numpy().tobytes() != second[n].numpy().tobytes()}
+    return different(*(trained(scene, recipe, STEPS) for scene in scenes))
 
 
 def test_the_other_scene_differs_in_s1_and_s2_alone(tiny_scene: Scene, other_scene: Scene) -> None:
@@ -72,17 +59,15 @@ def test_every_recipe_of_ours_has_its_control() -> None:
 
 @pytest.mark.parametrize("name", [*CONTROLS, "3dgs-dr", "ref-gs"])
 def test_no_bit_depends_on_polarization(tiny_scene: Scene, other_scene: Scene, name: str) -> None:
-    recipe = recipe_named(name)
-    assert changed(trained(tiny_scene, recipe), trained(other_scene, recipe)) == set()
+    assert changed(name, tiny_scene, other_scene) == []
 
 
 @pytest.mark.parametrize(
     "name", ["polarguide-paper", "polarguide-paper:kind", "polarguide", "polarguide-stokes"]
 )
 def test_of_what_polarization_guides_bits_do(tiny_scene: Scene, other_scene: Scene, name: str) -> None:
-    recipe = recipe_named(name)
-    names = changed(trained(tiny_scene, recipe), trained(other_scene, recipe))
-    assert {"gaussians.means", "gaussians.quaternions", "environment.texels"} <= names
+    names = changed(name, tiny_scene, other_scene)
+    assert {"gaussians.means", "gaussians.quaternions", "environment.texels"} <= {*names}
 
 
 def test_consistency_counts_everywhere_in_the_control() -> None:

@@ -1,7 +1,5 @@
 """Who may talk to the viewer, and what a connection may do."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import math
@@ -14,6 +12,7 @@ from typing import Any
 
 import msgspec
 import pytest
+from faults import Fault
 from served_viewer import CAMERA, PATIENCE, Served, drain
 from viewer_scenes import photographs, shown
 from websockets.datastructures import Headers
@@ -213,8 +212,9 @@ def test_a_viser_that_listens_otherwise_is_not_started(monkeypatch: pytest.Monke
             closed.append(True)
 
     monkeypatch.setattr("polarguide.viewer.server._listening", lambda *_: Server())
-    with pytest.raises(PolarguideError, match=r"viser==1\.1"):
-        Viewer(lambda: seen, photographs(seen), shading=seen.shading)
+    Fault("the viewer", remedy="viser==1.1").raised_by(
+        Viewer, lambda: seen, photographs(seen), shading=seen.shading
+    )
     assert closed
 
 
@@ -269,14 +269,13 @@ def test_a_camera_is_clamped() -> None:
 def test_a_camera_that_looks_at_its_own_place_is_refused() -> None:
     """As clamped, that is: viser asks for the direction."""
     wild = {**CAMERA, "position": [1e300, 0, 0], "look_at": [60.0, 0, 0]}
-    with pytest.raises(Refused, match="looks at itself"):
+    with pytest.raises(Refused, match="looks at"):
         checked(msgspec.msgpack.encode(wild), lambda _: None, 50.0)
 
 
 @pytest.mark.parametrize("host", ["a" * 70_000, "\udcff", "xn--\u2603.."])
 def test_names_that_no_network_can_have_are_one_line(host: str) -> None:
-    with pytest.raises(PolarguideError, match="expected an address of this machine"):
-        _listening(None, host, 8080, "a title")
+    Fault("host", "an address of this machine").raised_by(_listening, None, host, 8080, "a title")
 
 
 OWN = Gate("127.0.0.1", ["tunnel.example.org"], ["https://hub.example.org"])
@@ -312,24 +311,19 @@ def test_other_pages_are_refused_with_the_remedy(origin: str) -> None:
 
 
 def test_a_request_without_a_name_or_with_two_is_refused() -> None:
-    twice = Headers([("Host", "127.0.0.1"), ("Host", "127.0.0.1")])
-    assert OWN.refusal(Headers()) is not None
-    assert OWN.refusal(twice) is not None
-    two = Headers([("Host", "localhost"), ("Origin", "http://localhost"), ("Origin", "http://evil.example")])
-    assert OWN.refusal(two) is not None
+    host, origin = ("Host", "localhost"), ("Origin", "http://localhost")
+    for headers in ([], [host, host], [host, origin, ("Origin", "http://evil.example")]):
+        assert OWN.refusal(Headers(headers)) is not None
 
 
 def test_the_name_that_is_listened_at_passes() -> None:
     assert Gate("workstation.lan").refusal(Headers(Host="workstation.lan:8080")) is None
 
 
-def test_a_name_that_is_none_is_refused() -> None:
-    for given in ({"hosts": ["a/b"]}, {"origins": ["ftp://x"]}, {"hosts": [""]}):
-        with pytest.raises(PolarguideError, match="a name such as"):
-            Gate("127.0.0.1", **given)
-
-
-@pytest.mark.parametrize("name", ["*", "*.example.org", "a b", "a,b", "tunnel..org", "<b>"])
+@pytest.mark.parametrize("name", ["*", "*.example.org", "a b", "a,b", "tunnel..org", "<b>", "a/b", ""])
 def test_a_pattern_is_no_name(name: str) -> None:
-    with pytest.raises(PolarguideError, match="expected a name such as"):
-        Gate("127.0.0.1", [name])
+    Fault("allow_host", "a name such as", name).raised_by(Gate, "127.0.0.1", [name])
+
+
+def test_an_origin_is_a_page() -> None:
+    Fault("allow_origin", "a name such as", "ftp://x").raised_by(Gate, "127.0.0.1", origins=["ftp://x"])

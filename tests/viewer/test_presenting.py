@@ -1,7 +1,5 @@
 """Picking white, up and a length in the viewer, with a fake in place of the browser; and what is saved of it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

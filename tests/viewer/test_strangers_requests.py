@@ -1,8 +1,6 @@
 # ruff: noqa: E501
 """The viewer against requests that no browser makes: broken HTTP, broken WebSocket frames, and many of them at once."""
 
-from __future__ import annotations
-
 import os
 import socket
 import struct

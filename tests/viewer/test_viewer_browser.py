@@ -3,8 +3,6 @@
 Needs a Chromium of the system; the extra ``test`` brings Playwright.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -132,8 +130,7 @@ def test_dragging_turns_the_scene(opened):
     opened.page.mouse.down()
     opened.page.mouse.move(320, 430, steps=6)
     opened.page.mouse.up()
-    moved = opened.until(lambda picture: psnr(picture, before) < 30)
-    assert psnr(moved, before) < 30
+    assert psnr(opened.until(lambda picture: psnr(picture, before) < 30), before) < 30
     assert opened.page.get_by_label("Go to").first.input_value() == "(free)"
 
 

@@ -1,7 +1,5 @@
 """The picture of the errors: its columns, its scales, and what is gray in it."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 
@@ -18,7 +16,7 @@ from polarguide.visualization import figures
 CPU = torch.device("cpu")
 
 
-def drawn(monkeypatch, tmp_path: Path, scene, *, layers=True, views=None):
+def drawn(monkeypatch, tmp_path: Path, scene, *, layers=True):
     """The tiles by row and column heading, and the scales, that a sheet of a scene is made of."""
     seen = {}
 
@@ -27,11 +25,9 @@ def drawn(monkeypatch, tmp_path: Path, scene, *, layers=True, views=None):
         return np.zeros((4, 4, 3), np.uint8)
 
     monkeypatch.setattr(error_sheet, "contact_sheet", catch)
-    facts = SceneFacts.of(scene)
-    shown = scene.views if views is None else views
-    sheet = ErrorSheet(len(shown))
-    for view in shown:
-        result, stokes, _ = rendered(view, 5)
+    facts, sheet = SceneFacts.of(scene), ErrorSheet(len(scene.views))
+    for view in scene.views:
+        result, stokes, _ = rendered(known_scene().views[0] if view.ground_truth is None else view, 5)
         if not layers:
             result.specular = result.diffuse = stokes = None
         sheet.add(view, ViewTarget.of_view(view, facts, CPU), result, stokes)
@@ -70,18 +66,7 @@ def test_columns_are_those_that_a_run_has(monkeypatch, tmp_path):
         "normal error",
     ]
     bare = tuple(dataclasses.replace(view, truth=None) for view in scene.views)
-    stand_in = dataclasses.replace(scene, views=bare)
-    seen = {}
-    monkeypatch.setattr(
-        error_sheet,
-        "contact_sheet",
-        lambda *given, **more: seen.update(columns=given[2]) or np.zeros((4, 4, 3), np.uint8),
-    )
-    facts, sheet = SceneFacts.of(stand_in), ErrorSheet(1)
-    result, stokes, _ = rendered(scene.views[0], 5)
-    sheet.add(bare[0], ViewTarget.of_view(bare[0], facts, CPU), result, stokes)
-    sheet.write(tmp_path / "errors.png")
-    assert seen["columns"] == [
+    assert drawn(monkeypatch, tmp_path, dataclasses.replace(scene, views=bare))["columns"] == [
         "photograph",
         "picture error",
         "AoLP x DoLP / 0.5",
@@ -107,21 +92,10 @@ def test_a_key_to_its_colors_stands_below_every_column(monkeypatch, tmp_path):
 
 def test_many_views_are_thinned_out(monkeypatch, tmp_path):
     scene = known_scene()
-    views = [dataclasses.replace(scene.views[0], name=f"v{k}") for k in range(20)]
-    facts = SceneFacts.of(scene)
-    result, stokes, _ = rendered(scene.views[0], 5)
-    target = ViewTarget.of_view(scene.views[0], facts, CPU)
-    seen = {}
-    monkeypatch.setattr(
-        error_sheet,
-        "contact_sheet",
-        lambda *given, **more: seen.update(labels=given[1]) or np.zeros((4, 4, 3), np.uint8),
-    )
-    sheet = ErrorSheet(len(views))
-    for view in views:
-        sheet.add(view, target, result, stokes)
-    sheet.write(tmp_path / "errors.png")
-    assert seen["labels"] == [f"v{k}" for k in range(0, 20, 3)]
+    names = [f"v{k}" for k in range(20)]
+    views = tuple(dataclasses.replace(scene.views[0], name=name) for name in names)
+    many = dataclasses.replace(scene, views=views, test_names=tuple(names))
+    assert drawn(monkeypatch, tmp_path, many)["labels"] == names[::3]
 
 
 def test_a_sheet_on_disk(tmp_path):

@@ -1,7 +1,5 @@
 """Mesh against true depth: spheres whose distance from the truth is known, and other packages' distances."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.util
 import math

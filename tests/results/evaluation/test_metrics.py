@@ -69,18 +69,19 @@ def test_shown_has_a_finite_gradient_at_black():
     assert torch.allclose(dark.grad, torch.full((3,), 12.92))
 
 
-@pytest.mark.parametrize("name", pairs())
-def test_psnr_agrees_with_other_packages(name):
-    pred, true = pairs()[name]
+each_pair = pytest.mark.parametrize(("pred", "true"), pairs().values(), ids=pairs())
+
+
+@each_pair
+def test_psnr_agrees_with_other_packages(pred, true):
     a, b = metrics.shown(pred.double()), metrics.shown(true.double())
     value = metrics.psnr(pred, true)
     assert value == pytest.approx(peak_signal_noise_ratio(b.numpy(), a.numpy(), data_range=1), abs=1e-6)
     assert value == pytest.approx(float(torchmetrics_psnr(a, b, data_range=1.0)), abs=1e-5)
 
 
-@pytest.mark.parametrize("name", pairs())
-def test_ssim_agrees_with_scikit_image(name):
-    pred, true = pairs()[name]
+@each_pair
+def test_ssim_agrees_with_scikit_image(pred, true):
     theirs = structural_similarity(
         metrics.shown(true.double()).numpy(),
         metrics.shown(pred.double()).numpy(),
@@ -93,9 +94,8 @@ def test_ssim_agrees_with_scikit_image(name):
     assert similarity(pred, true) == pytest.approx(theirs, abs=1e-6)
 
 
-@pytest.mark.parametrize("name", pairs())
-def test_ssim_agrees_with_torchmetrics_inside(name):
-    pred, true = pairs()[name]
+@each_pair
+def test_ssim_agrees_with_torchmetrics_inside(pred, true):
     a, b = (metrics.shown(p.double()).movedim(-1, 0)[None] for p in (pred, true))
     _, everywhere = torchmetrics_ssim(a, b, sigma=1.5, data_range=1.0, return_full_image=True)
     # It also averages the windows that reach over the border, filled with a mirror image.
@@ -153,17 +153,18 @@ def test_nothing_kept_is_nan(metric):
     assert math.isnan(metric(noise(1), noise(2), torch.zeros(40, 56, dtype=torch.bool)))
 
 
-def test_shapes_that_do_not_fit_are_refused():
-    with pytest.raises(
-        ValueError, match=r"expected equal shapes \[H, W, C\], found \[40, 56, 3\] and \[40, 55, 3\]"
-    ):
-        metrics.psnr(noise(1), noise(1)[:, 1:])
-    with pytest.raises(ValueError, match=r"keep: expected bool \[40, 56\]"):
-        metrics.ssim(noise(1), noise(1), torch.ones(40, 56))
-    with pytest.raises(ValueError, match="at least 11 x 11 pixels, found 56 x 10"):
-        metrics.ssim(noise(1)[:10], noise(1)[:10])
-    with pytest.raises(ValueError, match="normals: expected equal shapes"):
-        metrics.normal_angles_deg(noise(1), noise(1)[1:])
+@pytest.mark.parametrize(
+    ("metric", "given", "what"),
+    [
+        (metrics.psnr, (noise(1), noise(1)[:, 1:]), r"\[40, 56, 3\] and \[40, 55, 3\]"),
+        (metrics.ssim, (noise(1), noise(1), torch.ones(40, 56)), r"keep: .*\[40, 56\]"),
+        (metrics.ssim, (noise(1)[:10], noise(1)[:10]), "56 x 10"),
+        (metrics.normal_angles_deg, (noise(1), noise(1)[1:]), "normals: "),
+    ],
+)
+def test_shapes_that_do_not_fit_are_refused(metric, given, what):
+    with pytest.raises(ValueError, match=what):
+        metric(*given)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1e-7, 11.24, 45.0, 90.0, 179.9999999, 180.0])
@@ -207,6 +208,8 @@ def test_aligned_layer_forgives_one_factor_per_channel_and_no_more():
     assert layer_psnr(tinted, lobe, keep, aligned=True) > 120
     assert layer_psnr(tinted + 0.1, lobe, keep, aligned=True) < 40
     assert layer_psnr(tinted, lobe, keep) < 20
+    black = torch.zeros_like(lobe)
+    assert layer_psnr(black, lobe, None, aligned=True) == layer_psnr(black, lobe, None)
 
 
 def test_alignment_minimizes_the_linear_error():
@@ -217,12 +220,6 @@ def test_alignment_minimizes_the_linear_error():
     ]
     expected = metrics.psnr(pred.double() * torch.tensor(np.array(scales)), lobe / 2)
     assert layer_psnr(pred, lobe, None, aligned=True) == pytest.approx(expected, abs=1e-9)
-
-
-def test_black_layer_can_be_aligned():
-    lobe = noise(17)
-    black = torch.zeros_like(lobe)
-    assert layer_psnr(black, lobe, None, aligned=True) == layer_psnr(black, lobe, None)
 
 
 def test_reflective_mask():

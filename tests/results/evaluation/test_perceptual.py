@@ -1,7 +1,5 @@
 """LPIPS with a network of random weights, and FLIP against its formulas."""
 
-from __future__ import annotations
-
 import importlib.machinery
 import math
 import sys

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from faults import Fault
 
-from polarguide.core.errors import PolarguideError
 from polarguide.results.evaluation import metrics, record, scores, table
 from polarguide.results.evaluation.table import HIGHEST_PSNR, VIEW_METRICS
 from polarguide.results.evaluation.target import ViewTarget
@@ -140,30 +140,14 @@ def test_broken_pixels_are_scored_and_counted():
 
 
 def test_summary_is_the_plain_mean_of_what_is_there():
-    views = {
-        "a": {
-            "psnr": 20.0,
-            "ssim": 0.5,
-            "psnr_reflective": None,
-            "lpips": None,
-            "lpips_reason": "no network",
-        },
-        "b": {
-            "psnr": 30.0,
-            "ssim": 0.7,
-            "psnr_reflective": 18.0,
-            "lpips": None,
-            "lpips_reason": "no network",
-        },
-        "c": {
-            "psnr": 40.0,
-            "ssim": math.nan,
-            "psnr_reflective": None,
-            "lpips": None,
-            "lpips_reason": "no network",
-        },
-    }
-    means = scores.summarize(views)
+    unknown = {"psnr_reflective": None, "lpips": None, "lpips_reason": "no network"}
+    means = scores.summarize(
+        {
+            "a": {**unknown, "psnr": 20.0, "ssim": 0.5},
+            "b": {**unknown, "psnr": 30.0, "ssim": 0.7, "psnr_reflective": 18.0},
+            "c": {**unknown, "psnr": 40.0, "ssim": math.nan},
+        }
+    )
     assert means["psnr"] == 30
     assert means["ssim"] == pytest.approx(0.6)
     assert means["psnr_reflective"] == 18
@@ -221,10 +205,11 @@ def test_errors_by_object_are_part_of_the_record(tmp_path, views):
     record.write_metrics(tmp_path / "metrics.json", **given)
     assert record.read_metrics(tmp_path)["objects"] == {}
     wrong = {"cup": {key: value for key, value in objects["cup"].items() if key != "stokes_error"}}
-    with pytest.raises(PolarguideError, match="stokes_error"):
-        record.write_metrics(tmp_path / "metrics.json", **given, objects=wrong)
-    with pytest.raises(PolarguideError, match="a number or null"):
-        record.write_metrics(tmp_path / "metrics.json", **given, materials={"metal": {**ERRORS, "psnr": "x"}})
+    path, materials = tmp_path / "metrics.json", {"metal": {**ERRORS, "psnr": "x"}}
+    Fault(expected="the field stokes_error").raised_by(record.write_metrics, path, **given, objects=wrong)
+    Fault("psnr)", "a number or null", '"x"').raised_by(
+        record.write_metrics, path, **given, materials=materials
+    )
 
 
 def test_failed_write_leaves_the_old_file(tmp_path, views):
@@ -270,21 +255,15 @@ def test_schema_names_what_is_wrong(tmp_path, views, path, value, place, expecte
         scored.update(lpips=None, lpips_reason="not wanted here")
     good = record.write_metrics(tmp_path / "metrics.json", views=views, run={}, provenance=dict(PROVENANCE))
     set_at(good, path, value)
-    with pytest.raises(PolarguideError) as caught:
-        record.validate_metrics(good, "m.json")
-    assert caught.value.where == place
-    assert expected in caught.value.expected
-    assert found in caught.value.found
+    Fault(place, expected, found).raised_by(record.validate_metrics, good, "m.json")
 
 
 def test_a_record_is_read_from_its_run(tmp_path, views):
-    with pytest.raises(PolarguideError, match=r"metrics.json: expected the scores of a run, found none"):
-        record.read_metrics(tmp_path)
+    Fault("metrics.json", "the scores of a run", "none").raised_by(record.read_metrics, tmp_path)
     written = record.write_metrics(tmp_path / "metrics.json", views=views, run={}, provenance=PROVENANCE)
     assert record.read_metrics(tmp_path) == written
     (tmp_path / "metrics.json").write_text(json.dumps(written | {"fps": math.nan}))
-    with pytest.raises(PolarguideError, match=r"metrics\.json"):
-        record.read_metrics(tmp_path)
+    Fault("metrics.json (fps)", "finite").raised_by(record.read_metrics, tmp_path)
 
 
 def test_shown_metrics_are_those_of_the_tables(views):

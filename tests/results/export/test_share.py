@@ -1,7 +1,5 @@
 """The page: whole in one file, safe with any name, and small."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import hashlib
@@ -153,7 +151,6 @@ def test_the_same_run_gives_the_same_page() -> None:
 def test_records_are_close_to_what_they_stand_for(recipe: str) -> None:
     state, shading = random_state(recipe)
     page = shading.page(state.gaussians, state.light)
-    assert page is not None
     assert page.kind == KINDS[recipe]
     data = records(state.gaussians, page.values)
     seen = torch.sigmoid(state.gaussians["opacity_logits"].detach()) >= 1 / 255

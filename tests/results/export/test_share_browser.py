@@ -3,8 +3,6 @@
 Needs a Chromium of the system; the extra ``test`` brings Playwright.
 """
 
-from __future__ import annotations
-
 import base64
 import time
 from collections.abc import Iterator
@@ -79,7 +77,6 @@ class Opened:
 
 def decoded(data: bytes) -> np.ndarray:
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    assert picture is not None
     return np.ascontiguousarray(picture[..., ::-1])
 
 
@@ -171,8 +168,7 @@ def test_mouse_turns_shifts_and_zooms(fresh: Opened) -> None:
         fresh.page.mouse.down(**how)
         fresh.page.mouse.move(340, 160)
         fresh.page.mouse.up(**how)
-        after = fresh.look()["eye"]
-        assert after != before
+        assert fresh.look()["eye"] != before
         return float(abs(fresh.page.evaluate("Math.hypot(...polarguide.navigation.eye)") - distance))
 
     assert drag() < 1e-3  # about the scene: the distance stays
@@ -212,13 +208,11 @@ def test_title_and_picture_fit_without_scrolling(fresh: Opened, size: tuple[int,
     fresh.page.set_viewport_size({"width": size[0], "height": size[1]})
     for name in ("h1", "header p", "#picture", "#panel"):
         box = fresh.page.locator(name).bounding_box()
-        assert box is not None
         assert box["x"] >= 0
         assert box["y"] >= 0
         assert box["x"] + box["width"] <= size[0]
         assert box["y"] + box["height"] <= size[1]
     picture = fresh.page.locator("#picture").bounding_box()
-    assert picture is not None
     assert picture["height"] > 0.6 * size[1]
 
 
@@ -298,8 +292,7 @@ def test_the_slider_parts_diffuse_from_final(fresh: Opened) -> None:
 
 def test_views_are_chosen_by_name(fresh: Opened) -> None:
     fresh.page.select_option("#view", label="v3")
-    expected = ring()["v3"].center.tolist()
-    np.testing.assert_allclose(fresh.look()["eye"], expected, atol=1e-6)
+    np.testing.assert_allclose(fresh.look()["eye"], ring()["v3"].center.tolist(), atol=1e-6)
 
 
 def test_the_screen_shows_what_pictures_gives(fresh: Opened) -> None:

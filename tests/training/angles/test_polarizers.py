@@ -1,7 +1,5 @@
 """Unknown angles in training: found, believed, doubted, and the same after a resume."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable
@@ -9,35 +7,48 @@ from pathlib import Path
 
 import pytest
 import torch
+from heard import Heard
+from tiny import make_scene
 from torch import Tensor
+from trainings import CPU, different, run
 
 from polarguide.capture import Scene, View
 from polarguide.capture.exposures import FOUR, Exposure, read_table
 from polarguide.capture.variants import select_exposures
-from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES, recipe_named
 from polarguide.runs.defaults import resolve
 from polarguide.runs.families import report_polarizers
 from polarguide.training.angles.polarizers import Polarizers, mean_angle
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.checked import refuse_foreign
+from polarguide.training.recipe import Recipe
 from polarguide.training.rules import AngleRules
-from polarguide.training.settings import StepReport, TrainSettings
+from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
-from tests.helpers.heard import Heard
-from tests.helpers.tiny import make_scene
 
 STOKES = RECIPES["polarguide-stokes"]
 WHOLE = make_scene()
 TRUTH = {view.name: view.stokes() for view in WHOLE.views}
 STEPS = 40
 RULES = AngleRules()
-CPU = choose_backend("cpu")
 
 
 def predicted(view: View) -> Tensor:
     """A model that has learned everything."""
     return TRUTH[view.name]
+
+
+def unknown(search: int = 0) -> tuple[Scene, Polarizers]:
+    """Pictures whose angles are to be found."""
+    scene = select_exposures(WHOLE, "unknown")
+    return scene, Polarizers(scene, STOKES, STEPS, search=search)
+
+
+def reported(folder: Path, scene: Scene, polarizers: Polarizers) -> list[str]:
+    """The sentences of the report."""
+    heard = Heard()
+    report_polarizers(folder, scene, polarizers, heard)
+    return heard.said
 
 
 def judged(scene: Scene) -> Polarizers:
@@ -56,16 +67,13 @@ def with_exposures(scene: Scene, **said: Exposure) -> Scene:
 
 
 def test_unknown_angles_are_found_and_believed() -> None:
-    scene, true = select_exposures(WHOLE, "unknown"), select_exposures(WHOLE, "one")
-    polarizers = Polarizers(scene, STOKES, STEPS)
+    (scene, polarizers), true = unknown(), select_exposures(WHOLE, "one")
     assert polarizers.judgments() == []
     assert next(step for step in range(STEPS) if polarizers.due(step)) == STEPS // 2
     changed = polarizers.take(polarizers.fit(predicted)[None])
     assert changed == {view.name for view in scene.train_views}
     for view, known in zip(scene.train_views, true.train_views, strict=True):
         believed, said = polarizers.believed(view).exposures[0], known.exposures[0]
-        assert believed.angle is not None
-        assert said.angle is not None
         assert (believed.angle - said.angle + 90) % 180 - 90 == pytest.approx(0, abs=0.1)
         assert torch.equal(polarizers.believed(view).codes, view.codes)
     assert polarizers.take(polarizers.fit(predicted)[None]) == set()
@@ -101,8 +109,7 @@ def test_the_mean_of_fits_goes_by_what_each_is_sure_of() -> None:
 
 
 def test_pictures_whose_fits_do_not_agree_are_named(tmp_path: Path) -> None:
-    scene = select_exposures(WHOLE, "unknown")
-    polarizers = Polarizers(scene, STOKES, STEPS)
+    scene, polarizers = unknown()
     fits = polarizers.fit(predicted).repeat(4, 1, 1)
     fits[:, :, 3] = 2.0
     polarizers.take(fits)
@@ -113,12 +120,8 @@ def test_pictures_whose_fits_do_not_agree_are_named(tmp_path: Path) -> None:
     polarizers.take(fits)
     unsettled = [k for k, judgment in enumerate(polarizers.judgments()) if judgment.unsettled]
     assert unsettled == [turned, seldom]
-    heard = Heard()
-    report_polarizers(tmp_path, scene, polarizers, heard)
-    warned = [text for text in heard.said if "do not agree" in text]
-    names = [scene.train_views[k].name for k in unsettled]
-    assert len(warned) == 1
-    assert all(name in warned[0] for name in names)
+    (warned,) = [text for text in reported(tmp_path, scene, polarizers) if "do not agree" in text]
+    assert all(scene.train_views[k].name in warned for k in unsettled)
 
 
 def test_pictures_that_are_explained_poorly_are_named(tmp_path: Path) -> None:
@@ -146,14 +149,12 @@ def test_pictures_that_are_explained_poorly_are_named(tmp_path: Path) -> None:
     misfit, across = fits[0, row, 5:7].tolist()
     assert found[row].unexplained == pytest.approx(misfit / 0.05 * misfit / across)
     assert [judgment.view for judgment in found if judgment.poorly_explained] == [poor]
-    heard = Heard()
-    report_polarizers(tmp_path, scene, polarizers, heard)
-    assert [poor in text for text in heard.said if "turned by 90 degrees" in text] == [True]
+    told = reported(tmp_path, scene, polarizers)
+    assert [poor in text for text in told if "turned by 90 degrees" in text] == [True]
 
 
 def test_a_guess_is_better_than_a_photograph(tmp_path: Path) -> None:
-    scene = select_exposures(WHOLE, "unknown")
-    polarizers = Polarizers(scene, STOKES, STEPS)
+    scene, polarizers = unknown()
     fits = polarizers.fit(predicted).repeat(4, 1, 1)
     sure, guessed, lost = 0, 1, 2
     fits[:, :, 3] = 2.0
@@ -171,11 +172,9 @@ def test_a_guess_is_better_than_a_photograph(tmp_path: Path) -> None:
     assert polarizers.judgments()[guessed].angle == pytest.approx(float(fits[0, guessed, 0]))
     fits[0] = fits[1]
     polarizers.take(fits)
-    heard = Heard()
-    report_polarizers(tmp_path, scene, polarizers, heard)
-    names = [scene.train_views[k].name for k in (guessed, lost)]
-    assert any(names[0] in text and "the most likely one is used" in text for text in heard.said)
-    assert any(names[1] in text and "used as photographs" in text for text in heard.said)
+    told = reported(tmp_path, scene, polarizers)
+    for number, what in ((guessed, "the most likely one is used"), (lost, "used as photographs")):
+        assert any(scene.train_views[number].name in text and what in text for text in told)
 
 
 def test_swapped_pictures_and_missing_filters_are_named(tmp_path: Path) -> None:
@@ -189,9 +188,7 @@ def test_swapped_pictures_and_missing_filters_are_named(tmp_path: Path) -> None:
     assert abs(abs(found["v1"].off) - 90) < 1
     assert [name for name, judgment in found.items() if judgment.unfiltered] == ["v3"]
     assert polarizers.believed(ones.view("v1")).exposures == (Exposure(90.0),)  # it is said, so it holds
-    heard = Heard()
-    report_polarizers(tmp_path, ones, polarizers, heard)
-    warned = "\n".join(heard.said)
+    warned = "\n".join(reported(tmp_path, ones, polarizers))
     assert "1 of 5 pictures (v3#0) look as if taken without a filter" in warned
     assert "1 of 5 pictures (v1#0) contradict their angles: v1#0 is specified at 90 degrees" in warned
     lines = {item.view: item.exposure for item in read_table(tmp_path / "angles.csv")}
@@ -209,9 +206,8 @@ def test_only_what_is_an_exception_contradicts(tmp_path: Path) -> None:
         fits = right.clone()
         fits[0, :, 0] = (fits[0, :, 0] + torch.tensor(off, dtype=fits.dtype)) % 180.0
         polarizers.take(fits)
-        heard = Heard()
-        report_polarizers(tmp_path, scene, polarizers, heard)
-        return [k for k, j in enumerate(polarizers.judgments()) if j.contradicts], "\n".join(heard.said)
+        contradicting = [k for k, j in enumerate(polarizers.judgments()) if j.contradicts]
+        return contradicting, "\n".join(reported(tmp_path, scene, polarizers))
 
     assert told(2, -3, 80, 4, -2)[0] == [2]
     assert told(2, -3, 45, 4, -2)[0] == [2]
@@ -227,16 +223,13 @@ def test_only_what_is_an_exception_contradicts(tmp_path: Path) -> None:
 
 
 def test_where_most_angles_are_doubtful_it_says_what_to_do(tmp_path: Path) -> None:
-    scene = select_exposures(WHOLE, "unknown")
-    polarizers = Polarizers(scene, STOKES, STEPS)
+    scene, polarizers = unknown()
     fits = polarizers.fit(predicted)[None]
     fits[..., 3] = 2.0
     for doubtful in (2, 3):
         fits[:, :doubtful, 3] = 30.0
         polarizers.take(fits)
-        heard = Heard()
-        report_polarizers(tmp_path, scene, polarizers, heard)
-        said = "\n".join(heard.said)
+        said = "\n".join(reported(tmp_path, scene, polarizers))
         assert f"angles found for 5 of 5 pictures; {doubtful} of 5 are doubtful" in said
         assert ("--angles none" in said) == (2 * doubtful > 5)
         assert (tmp_path / "angles.csv").read_text().count("doubtful") == doubtful
@@ -257,41 +250,41 @@ def test_exposure_times_are_found() -> None:
     assert gains["v1"] == pytest.approx(1.0, abs=0.01)
 
 
-def trained(scene: Scene, until: int, state: TrainingState | None = None) -> AngleTrainer:
-    trainer = AngleTrainer(
-        scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU, state
-    )
-    trainer.run(lambda report: None, until=until)
-    return trainer
+def begun(
+    scene: Scene, state: TrainingState | None = None, recipe: Recipe = STOKES, **settings: bool
+) -> AngleTrainer:
+    given = TrainSettings(steps=STEPS, background="scene", **settings)  # type: ignore[arg-type]
+    return AngleTrainer(scene, recipe, resolve(given, scene, recipe), CPU, state)
+
+
+def trained(scene: Scene, until: int = STEPS, state: TrainingState | None = None) -> dict[str, Tensor]:
+    """The state that a training leaves."""
+    trainer = begun(scene, state)
+    run(trainer, until)
+    return {name: values.clone() for name, values in trainer.state.tensors().items()}
 
 
 def test_it_begins_again_with_the_angles_that_it_found() -> None:
     scene = select_exposures(WHOLE, "unknown")
-    reports: list[StepReport] = []
-    settings = resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES)
-    trainer = AngleTrainer(scene, STOKES, settings, CPU)
+    trainer = begun(scene)
     first, second = round(0.65 * STEPS), round(RULES.again[-1] * STEPS)
     search = first + second
     assert (trainer.begins_again, trainer.total) == (True, STEPS + search)
-    trainer.run(reports.append)
+    reports = run(trainer)
     assert [report.step for report in reports] == [*range(first), *range(second), *range(STEPS)]
     assert [report.done for report in reports] == [*range(1, STEPS + search + 1)]
     assert trainer.done == trainer.total
-    assert trainer.polarizers.table is not None
     assert len(trainer.polarizers.table) == 4 + len(RULES.again)
 
     # After the searches it is a training that has been told these angles, and keeps to them.
-    state = AngleTrainer(scene, STOKES, settings, CPU).state
+    state, whole = begun(scene).state, trainer.state.tensors()
     state.angles = trainer.polarizers.table
-    told = AngleTrainer(scene, STOKES, settings, CPU, state)
-    told.run(lambda report: None)
-    ours, theirs = trainer.state.tensors(), told.state.tensors()
-    assert all(torch.equal(values, theirs[name]) for name, values in ours.items())
+    assert different(whole, trained(scene, state=state)) == []
 
-    alongside = AngleTrainer(scene, STOKES, dataclasses.replace(settings, begin_again=False), CPU)
+    alongside = begun(scene, begin_again=False)
     assert alongside.total == STEPS
-    alongside.run(lambda report: None)
-    assert not torch.equal(alongside.state.gaussians["means"], trainer.state.gaussians["means"])
+    run(alongside)
+    assert "gaussians.means" in different(whole, alongside.state.tensors())
 
 
 def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -301,9 +294,7 @@ def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.Mo
     scene = select_exposures(WHOLE, "unknown")
     width = scene.views[0].camera.width
     assert width > 16
-    trainer = AngleTrainer(
-        scene, quick, resolve(TrainSettings(steps=STEPS, background="scene"), scene, quick), CPU
-    )
+    trainer = begun(scene, recipe=quick)
     assert trainer.total == STEPS + 13 + 19
     looked_at = set[int]()
     fit = trainer.polarizers.fit
@@ -317,63 +308,49 @@ def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.Mo
         return fit(watched)
 
     monkeypatch.setattr(trainer.polarizers, "fit", seen)
-    trainer.run(lambda report: None)
+    run(trainer)
     assert looked_at == {width // -(-width // 16)}
     assert trainer.done == trainer.total
     # What was found holds for the pictures in full size.
     view = trainer.scene.train_views[0]
     assert trainer.polarizers.believed(view).codes is view.codes
     # On a schedule that tells nothing of a search, known angles are looked at three times.
-    scene = select_exposures(WHOLE, "one")
-    known = AngleTrainer(
-        scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU
-    )
-    assert [step for step in range(STEPS) if known.polarizers.due(step)] == [8, 12, 20]
+    known = begun(select_exposures(WHOLE, "one")).polarizers
+    assert [step for step in range(STEPS) if known.due(step)] == [8, 12, 20]
 
 
 @pytest.mark.parametrize("exposures", ["one", "four", "none"])
 def test_where_all_angles_are_known_nothing_begins_again(exposures: str) -> None:
-    scene = select_exposures(WHOLE, exposures)  # type: ignore[arg-type]
-    trainer = AngleTrainer(
-        scene, STOKES, resolve(TrainSettings(steps=STEPS, background="scene"), scene, STOKES), CPU
-    )
+    trainer = begun(select_exposures(WHOLE, exposures))  # type: ignore[arg-type]
     assert (trainer.begins_again, trainer.total) == (False, STEPS)
 
 
 @pytest.mark.parametrize("until", [STEPS // 2, 23, 27, 39])
 def test_a_resumed_training_gives_the_same_bits(until: int) -> None:
     scene = select_exposures(WHOLE, "unknown")
-    whole = trained(scene, STEPS)
-    stored = {name: values.clone() for name, values in trained(scene, until).state.tensors().items()}
+    stored = trained(scene, until)
+    assert "angles" in stored
     refuse_foreign(stored, STOKES)
-    resumed = trained(scene, STEPS, TrainingState.from_tensors(stored, STOKES))
-    ours, theirs = whole.state.tensors(), resumed.state.tensors()
-    assert ours.keys() == theirs.keys()
-    assert "angles" in ours
-    assert all(torch.equal(values, theirs[name]) for name, values in ours.items())
+    resumed = trained(scene, state=TrainingState.from_tensors(stored, STOKES))
+    assert different(resumed, trained(scene)) == []
 
 
 @pytest.mark.parametrize("exposures", ["three", "two", "one", "mixed", "none", "sparse"])
 def test_all_captures_train(exposures: str) -> None:
-    scene = select_exposures(WHOLE, exposures)  # type: ignore[arg-type]
-    trainer = trained(scene, STEPS)
-    assert all(bool(values.isfinite().all()) for values in trainer.state.tensors().values())
+    state = trained(select_exposures(WHOLE, exposures))  # type: ignore[arg-type]
+    assert all(bool(values.isfinite().all()) for values in state.values())
 
 
 def test_four_pictures_train_as_ever() -> None:
-    ours = trained(WHOLE, STEPS).state.tensors()
     listed = [
         dataclasses.replace(view, exposures=tuple(Exposure(float(e.angle or 0)) for e in FOUR))
         for view in WHOLE.views
     ]
-    again = trained(dataclasses.replace(WHOLE, views=tuple(listed)), STEPS).state.tensors()
-    assert ours.keys() == again.keys()
-    assert all(torch.equal(values, again[name]) for name, values in ours.items())
+    assert different(trained(dataclasses.replace(WHOLE, views=tuple(listed))), trained(WHOLE)) == []
 
 
 def test_the_fits_of_the_latest_search_hold() -> None:
-    scene = select_exposures(WHOLE, "unknown")
-    polarizers = Polarizers(scene, STOKES, STEPS, search=STEPS)
+    _, polarizers = unknown(search=STEPS)
     fit = polarizers.fit(predicted)
     fit[:, 3] = 2.0
     first, second = fit.clone(), fit.clone()

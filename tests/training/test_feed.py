@@ -1,23 +1,24 @@
-"""What a training keeps of its views: the same bits wherever it is kept, and what the coding costs."""
+"""What a training keeps of its views, and the sizes in which it looks at them: the same bits wherever it stops."""
 
-from __future__ import annotations
-
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from trainings import different, make_trainer, run, trained
 
 from polarguide.capture import Scene
-from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
-from polarguide.runs.defaults import resolve
+from polarguide.runs.folder import load_checkpoint, save_checkpoint
+from polarguide.runs.forecast import _priors_made
 from polarguide.training import view_store
+from polarguide.training.feed import Feed, coarse_steps
 from polarguide.training.priors import view_priors
-from polarguide.training.recipe import Recipe, Weights
-from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import Trainer
+from polarguide.training.recipe import Coarse, Recipe, Weights
+from polarguide.training.settings import ResolvedSettings
+from polarguide.training.targets import StepTargets
 from polarguide.training.view_store import (
     Entry,
     Packed,
@@ -41,28 +42,20 @@ def same(a: Entry, b: Entry) -> bool:
     return a.keys() == b.keys() and all(torch.equal(unpacked(a[name]), unpacked(b[name])) for name in a)
 
 
-def trained(scene: Scene, recipe: Recipe, store: ViewStore, *, until: int = STEPS) -> dict[str, Tensor]:
-    trainer = Trainer(
-        scene, recipe, resolve(TrainSettings(60, 3), scene, recipe), choose_backend("cpu"), store=store
-    )
-    trainer.run(lambda _: None, until=until)
-    return {name: values.clone() for name, values in trainer.state.tensors().items()}
-
-
 def test_what_a_training_keeps_where_does_not_change_its_bits(
     tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path
 ) -> None:
     whole = ViewStore()
-    expected = trained(tiny_scene, busy_recipe, whole)
+    expected = trained(tiny_scene, busy_recipe, 60, until=STEPS, store=whole)
     assert whole.in_memory
     assert whole.in_file == 0
     for limit, folder in ((0, tmp_path), (whole.in_memory // 2, tmp_path), (0, None)):
         store = ViewStore(limit, folder)
-        found = trained(tiny_scene, busy_recipe, store)
+        assert different(expected, trained(tiny_scene, busy_recipe, 60, until=STEPS, store=store)) == [], (
+            limit
+        )
         assert store.in_memory <= limit
         assert (store.in_file > 0) == (folder is not None)
-        assert expected.keys() == found.keys()
-        assert all(expected[n].numpy().tobytes() == found[n].numpy().tobytes() for n in expected), limit
         assert not list(tmp_path.iterdir()), "the file has no name"
         store.close()
 
@@ -70,14 +63,11 @@ def test_what_a_training_keeps_where_does_not_change_its_bits(
 def test_a_training_goes_on_with_another_store_to_the_same_bits(
     tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path
 ) -> None:
-    expected = trained(tiny_scene, busy_recipe, ViewStore())
-    settings, backend = resolve(TrainSettings(60, 3), tiny_scene, busy_recipe), choose_backend("cpu")
-    begun = Trainer(tiny_scene, busy_recipe, settings, backend)
-    begun.run(lambda _: None, until=STOP)
-    rest = Trainer(tiny_scene, busy_recipe, settings, backend, begun.state, store=ViewStore(3000, tmp_path))
-    rest.run(lambda _: None, until=STEPS)
-    found = rest.state.tensors()
-    assert all(expected[n].numpy().tobytes() == found[n].numpy().tobytes() for n in expected)
+    begun = make_trainer(tiny_scene, busy_recipe, 60)
+    run(begun, STOP)
+    store = ViewStore(3000, tmp_path)
+    rest = trained(tiny_scene, busy_recipe, 60, until=STEPS, state=begun.state, store=store)
+    assert different(rest, trained(tiny_scene, busy_recipe, 60, until=STEPS)) == []
 
 
 def test_entries_come_back_from_memory_and_file(tmp_path: Path) -> None:
@@ -131,7 +121,6 @@ def test_a_file_that_was_cut_is_made_again(tmp_path: Path) -> None:
     store = ViewStore(0, tmp_path)
     for seed in range(2):
         store.get("kind", f"v{seed}", lambda seed=seed: entry_of(seed))
-    assert store._file is not None
     store._file.truncate(100)
     assert same(store.get("kind", "v1", lambda: entry_of(1)), entry_of(1))
 
@@ -143,12 +132,8 @@ def test_coding_keeps_zero_and_the_largest_and_rounds_the_rest(scale: float) -> 
     assert float((found - values).abs().max()) <= scale * 0.51 / 32767
     assert float(found[2000]) == 0
     assert float(found[-1]) == pytest.approx(scale, rel=1e-7)
-    assert torch.equal(unpacked(packed(torch.zeros(5))), torch.zeros(5))
-
-
-def test_a_coded_half_or_one_is_itself() -> None:
-    flags = torch.tensor([0.0, 1.0, 1.0])
-    assert torch.equal(unpacked(packed(flags)), flags)
+    for exact in (torch.zeros(5), torch.tensor([0.0, 1.0, 1.0])):
+        assert torch.equal(unpacked(packed(exact)), exact)
 
 
 def test_terms_find_what_they_read_of_the_priors(tiny_scene: Scene) -> None:
@@ -169,3 +154,63 @@ def test_terms_find_what_they_read_of_the_priors(tiny_scene: Scene) -> None:
     assert found.normal.shape == priors.normal.shape
     pixels = view.camera.width * view.camera.height
     assert sum(part.bytes for part in entry.values()) == 46 * pixels
+
+
+STOKES = RECIPES["polarguide-stokes"]
+ALL_STEPS = 40
+HALVED = dataclasses.replace(STOKES, coarse=Coarse(share=0.5, factor=2, pixels=1))
+NEVER = dataclasses.replace(STOKES, coarse=Coarse(share=0.0))
+
+
+def test_the_first_half_of_the_steps_looks_at_smaller_pictures(
+    tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[int, ...]] = []
+    targets = Feed.targets
+
+    def watched(self: Feed, *given: Any) -> StepTargets:
+        found = targets(self, *given)
+        seen.append(tuple(found.picture.shape[:2]))
+        return found
+
+    monkeypatch.setattr(Feed, "targets", watched)
+    trained(tiny_scene, HALVED, ALL_STEPS)
+    height, width = tiny_scene.train_views[0].codes.shape[1:3]
+    assert seen == [(height // 2, width // 2)] * (ALL_STEPS // 2) + [(height, width)] * (ALL_STEPS // 2)
+
+
+def test_what_was_kept_of_smaller_pictures_goes(tiny_scene: Scene) -> None:
+    store = ViewStore()
+    trainer = make_trainer(tiny_scene, HALVED, ALL_STEPS, store=store)
+    run(trainer, ALL_STEPS // 2)
+    kinds = {kind for kind, _ in store._held}
+    assert {"small photograph", "small priors"} <= kinds
+    run(trainer)
+    kinds = {kind for kind, _ in store._held}
+    assert not any(kind.startswith("small") for kind in kinds)
+    assert {"photograph", "priors"} <= kinds
+
+
+@pytest.mark.parametrize("stop", [13, 20, 27])
+def test_going_on_gives_the_same_bits(tiny_scene: Scene, tmp_path: Path, stop: int) -> None:
+    begun = make_trainer(tiny_scene, HALVED, ALL_STEPS)
+    run(begun, stop)
+    save_checkpoint(tmp_path, begun.state)
+    resumed = trained(tiny_scene, HALVED, ALL_STEPS, state=load_checkpoint(tmp_path, HALVED))
+    assert different(resumed, trained(tiny_scene, HALVED, ALL_STEPS)) == []
+
+
+def test_small_pictures_are_looked_at_whole(tiny_scene: Scene) -> None:
+    assert coarse_steps(STOKES, tiny_scene.train_views, 5000) == 0
+    assert coarse_steps(HALVED, tiny_scene.train_views, 5000) == 2500
+    assert different(trained(tiny_scene, STOKES, ALL_STEPS), trained(tiny_scene, NEVER, ALL_STEPS)) == []
+
+
+def test_priors_are_counted_by_size() -> None:
+    """Where the size changes they are all made once more."""
+    settings = ResolvedSettings(steps=1000, refractive_index=1.5)
+    assert _priors_made(STOKES, settings, 10, 0)[True] == 0
+    whole = _priors_made(STOKES, settings, 10, 0)[False]
+    halved = _priors_made(STOKES, settings, 10, 430)
+    assert halved[True] > 0
+    assert halved[True] + halved[False] == whole + 10

@@ -1,18 +1,21 @@
 """Where cameras stand, and paths of cameras."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from faults import Fault
 from torch import Tensor
 
-from polarguide.core.errors import PolarguideError
-from polarguide.geometry.camera import Camera, look_at
+from polarguide import optics
+from polarguide.capture import view
+from polarguide.gaussians.geometry import quaternions_to_rotations
+from polarguide.geometry.camera import Camera, look_at, quaternion
+from polarguide.geometry.polarizer import ANGLES, four_intensities, malus, stokes_of_four
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.trajectory import camera_record, interpolated, orbit, read_path
 
@@ -50,8 +53,7 @@ def test_up_is_level_s_normal_though_all_cameras_look_down_from_one_side() -> No
         side = turn @ torch.linalg.cross(UP, torch.tensor([0.0, 0, 1], dtype=torch.float64))
         rotation, translation = look_at(CENTER + 4 * (side + UP), CENTER, UP)
         cameras.append(replace(LENS, rotation=rotation, translation=translation))
-    found = scene_frame(cameras).up
-    assert angle_between(found, UP) < 0.1
+    assert angle_between(scene_frame(cameras).up, UP) < 0.1
     mean = -torch.stack([camera.rotation[1] for camera in cameras]).mean(dim=0)
     assert angle_between(mean, UP) > 30
     on_end = [
@@ -127,47 +129,101 @@ def test_a_file_of_cameras_is_read_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "where", "expected"),
     [
-        {"width": 0},
-        {"width": 10**6},
-        {"height": "tall"},
-        {"fx": -1.0},
-        {"fx": float("nan")},
-        {"rotation": [0.0] * 9},
-        {"rotation": [1.0, 0, 0, 0, 1, 0, 0, 0, -1]},
-        {"rotation": [1.0]},
-        {"translation": [1.0, 2.0]},
-        {"translation": None},
+        ({"width": 0}, ".width)", "1 to 8192"),
+        ({"width": 10**6}, ".width)", "1 to 8192"),
+        ({"height": "tall"}, ".height)", "a whole number"),
+        ({"fx": -1.0}, ".fx)", "above 0"),
+        ({"fx": float("nan")}, ".fx)", "above 0"),
+        ({"rotation": [0.0] * 9}, ".rotation)", "a rotation"),
+        ({"rotation": [1.0, 0, 0, 0, 1, 0, 0, 0, -1]}, ".rotation)", "a rotation"),
+        ({"rotation": [1.0]}, ".rotation)", "length >= 9"),
+        ({"translation": [1.0, 2.0]}, ".translation)", "length 3"),
+        ({"translation": None}, ".translation)", "a list"),
+        ({"fx": 1e-30, "fy": 1e-30}, ")", "positive focal lengths"),
+        ({"fx": 1e-2}, ")", "positive focal lengths"),
+        ({"cx": 1e300}, ")", "a principal point"),
+        ({"translation": [1e38, 0.0, 0.0]}, ".translation)", "up to 1e+09"),
     ],
 )
-def test_cameras_that_are_none_are_refused(change: dict[str, object], tmp_path: Path) -> None:
-    file = tmp_path / "path.json"
-    file.write_text(json.dumps({"cameras": [camera_record(LENS) | change]}))
-    (field,) = change
-    with pytest.raises(PolarguideError, match=rf"path.json \(cameras\[0\]\.?{field}.*Give orbit, spiral"):
-        read_path(file)
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"fx": 1e-30, "fy": 1e-30}, "positive focal lengths"),
-        ({"fx": 1e-2}, "positive focal lengths"),
-        ({"cx": 1e300}, "a principal point"),
-        ({"translation": [1e38, 0.0, 0.0]}, r"\.translation\): expected numbers up to 1e\+09"),
-    ],
-)
-def test_numbers_that_no_camera_has_are_refused(change: dict[str, object], says: str, tmp_path: Path) -> None:
+def test_numbers_that_no_camera_has_are_refused(
+    change: dict[str, object], where: str, expected: str, tmp_path: Path
+) -> None:
     file = tmp_path / "path.json"
     file.write_text(json.dumps({"cameras": [camera_record(LENS), camera_record(LENS) | change]}))
-    with pytest.raises(PolarguideError, match=rf"path.json \(cameras\[1\].*{says}.*Give orbit, spiral"):
-        read_path(file)
+    Fault(f"path.json (cameras[1]{where}", expected, "", "orbit, spiral").raised_by(read_path, file)
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"cameras": []}', '{"cameras": 3}', "[" * 100_000])
 def test_files_without_cameras_are_refused(text: str, tmp_path: Path) -> None:
     (tmp_path / "path.json").write_text(text)
     for name in ("path.json", "none.json"):
-        with pytest.raises(PolarguideError, match=rf"{name}.*Give orbit, spiral"):
-            read_path(tmp_path / name)
+        Fault(name, remedy="orbit, spiral").raised_by(read_path, tmp_path / name)
+
+
+PLACE, TARGET, UPWARD = (2.0, -1.0, 0.5), (0.2, 0.3, -0.4), (0.1, 0.2, 1.0)
+
+
+@pytest.mark.parametrize("convert", [tuple, np.array, lambda v: torch.tensor(v, dtype=torch.float64)])
+def test_the_target_is_on_the_axis_and_up_is_upward(convert) -> None:  # type: ignore[no-untyped-def]
+    camera = Camera(8, 6, 10.0, 10.0, 4.0, 3.0, *look_at(convert(PLACE), convert(TARGET), convert(UPWARD)))
+    torch.testing.assert_close(camera.center, torch.tensor(PLACE, dtype=torch.float64))
+    eye = torch.eye(3, dtype=torch.float64)
+    torch.testing.assert_close(camera.rotation @ camera.rotation.T, eye)
+    assert float(torch.linalg.det(camera.rotation)) == pytest.approx(1.0)
+    x, y, z = camera.rotation @ torch.tensor(TARGET, dtype=torch.float64) + camera.translation
+    assert (float(x), float(y)) == pytest.approx((0.0, 0.0), abs=1e-14)
+    assert float(z) == pytest.approx(float(np.linalg.norm(np.subtract(TARGET, PLACE))))
+    right, down, _ = camera.rotation @ torch.tensor(UPWARD, dtype=torch.float64)
+    assert float(right) == pytest.approx(0.0, abs=1e-14)
+    assert float(down) < 0
+
+
+def test_a_quaternion_makes_its_rotation_again() -> None:
+    rotation, _ = look_at(PLACE, TARGET, UPWARD)
+    w, x, y, z = quaternion(rotation)
+    assert w**2 + x**2 + y**2 + z**2 == pytest.approx(1.0)
+    again = quaternions_to_rotations(torch.tensor([w, x, y, z], dtype=torch.float64))
+    torch.testing.assert_close(again, rotation)
+
+
+def test_matrices_project_a_point_like_the_camera() -> None:
+    camera = Camera(8, 6, 10.0, 11.0, 4.1, 2.9, *look_at(PLACE, TARGET, UPWARD))
+    point = torch.tensor([*TARGET, 1.0], dtype=torch.float64)
+    x, y, z = camera.intrinsics @ (camera.world_to_camera @ point)[:3]
+    assert (float(x / z), float(y / z)) == pytest.approx((4.1, 2.9))
+
+
+LIGHT = np.random.default_rng(0).uniform(0.1, 1.0, (3, 4, 5))
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, math.pi / 2, -1.1])
+def test_arrays_and_tensors_give_the_same(angle: float) -> None:
+    s0, s1, s2 = LIGHT
+    expected = s0 / 2 + np.hypot(s1, s2) / 2 * np.cos(np.arctan2(s2, s1) - 2 * angle)
+    assert np.allclose(malus(LIGHT, angle), expected, rtol=0, atol=1e-15)
+    tensor = malus(torch.from_numpy(LIGHT), torch.tensor(angle, dtype=torch.float64))
+    assert np.allclose(tensor.numpy(), expected, rtol=0, atol=1e-15)
+
+
+def test_an_angle_for_each_pixel() -> None:
+    angles = np.radians(np.resize(ANGLES, (4, 5)))
+    assert malus(LIGHT, angles)[1, 2] == pytest.approx(malus(LIGHT[:, 1, 2], angles[1, 2]))
+
+
+def test_the_angle_has_a_gradient() -> None:
+    angle = torch.tensor(0.4, dtype=torch.float64, requires_grad=True)
+    malus(torch.tensor([1.0, 0.3, 0.2], dtype=torch.float64), angle).backward()
+    assert float(angle.grad) == pytest.approx(-0.3 * math.sin(0.8) + 0.2 * math.cos(0.8))
+
+
+def test_the_four_angles_are_the_law_and_invert() -> None:
+    four = np.stack(four_intensities(LIGHT))
+    assert np.allclose(four, [malus(LIGHT, math.radians(angle)) for angle in ANGLES], rtol=0, atol=1e-15)
+    assert np.allclose(np.stack(stokes_of_four(four)), LIGHT, rtol=0, atol=1e-15)
+
+
+def test_the_angles_are_one_object() -> None:
+    assert optics.ANGLES is ANGLES
+    assert view.ANGLES is ANGLES

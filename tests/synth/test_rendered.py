@@ -1,25 +1,33 @@
-"""Rendered light against Fresnel's equations, by the optics that read real captures.
+"""Rendered scenes: light against Fresnel, meshes, what stands before an object, and the sensor.
 
 A smooth ball under an even sky: every zenith and azimuth, known exactly.
 """
 
-from __future__ import annotations
-
+import contextlib
 import math
+import random
+import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from faults import Fault
+from scipy.spatial import ConvexHull, Delaunay
 from torch import Tensor
 
 from polarguide import optics
+from polarguide.capture.sensor.pattern import sensor_pattern
+from polarguide.core.errors import PolarguideError
 from polarguide.geometry.camera import Camera, look_at
 from polarguide.geometry.vectors import unit_array as unit
-from polarguide.synth.build import BuiltScene, build_scene
+from polarguide.synth.build import BuiltScene, _mesh, _user_mesh, build_scene
+from polarguide.synth.colmap import place_cameras
 from polarguide.synth.film import LobeRadiance, render_lobes
 from polarguide.synth.ground_truth import ground_truth_maps
 from polarguide.synth.schema import parse_scene
-from polarguide.synth.settings import Variant
+from polarguide.synth.sensor import Sensor, mosaic, noisy
+from polarguide.synth.settings import PRESETS, Variant, find_scene
 from polarguide.synth.transport import PathLimits
 
 INDEX = 1.5
@@ -198,3 +206,155 @@ def test_lobes_add_up_to_mitsubas_own_path_tracer(
     assert float(a[0].mean()) == pytest.approx(float(b[0].mean()), rel=0.02)
     # Sampled wavelengths make noise of their own.
     assert (optics.dolp(a) - optics.dolp(b)).abs().mean() < (5e-3 if variant.channels == 3 else 2e-2)
+
+
+HEAD = "ply\nformat binary_little_endian 1.0\nelement vertex {}\n" + "".join(
+    f"property float {axis}\n" for axis in "xyz"
+)
+FACES = "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
+PLACES = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0)
+
+
+def ply(vertices: object, faces: object, body: bytes) -> bytes:
+    return (HEAD.format(vertices) + FACES.format(faces)).encode() + body
+
+
+def corners(*numbers: int) -> bytes:
+    return bytes([len(numbers)]) + struct.pack(f"<{len(numbers)}i", *numbers)
+
+
+@pytest.mark.usefixtures("variant")
+def test_a_triangle(tmp_path: Path) -> None:
+    (tmp_path / "m.ply").write_bytes(ply(3, 1, PLACES + corners(0, 1, 2)))
+    mesh = _user_mesh(tmp_path / "m.ply")
+    assert mesh.points.shape == (3, 3)
+    assert mesh.faces.tolist() == [[0, 1, 2]]
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("m.ply", ply(-5, 1, b"")),
+        ("m.ply", ply("9" * 5000, 1, b"")),
+        ("m.ply", ply(3, 1, PLACES + corners(0, 1, 99))),
+        ("m.ply", ply(3, 1, PLACES + corners(0, 1, -1))),
+        ("m.ply", ply(3, 1, PLACES + b"\xff")),
+        ("m.ply", ply(3, 0, PLACES)),
+        ("m.ply", b"ply\nformat"),
+        ("m.ply", HEAD.format(3).encode() + b"\xffelement face 1\n"),
+        ("m.obj", b""),
+        ("m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n"),
+        ("m.obj", b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+    ],
+)
+def test_damaged_ones_are_named(tmp_path: Path, name: str, data: bytes) -> None:
+    (tmp_path / name).write_bytes(data)
+    Fault(name).raised_by(_user_mesh, tmp_path / name)
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("seed", range(40))
+def test_random_damage_is_read_or_named(tmp_path: Path, seed: int) -> None:
+    """Corners beyond the points once made Mitsuba write where nothing was, which ended a later test or none."""
+    draw = random.Random(seed)
+    count = draw.choice([3, 40, 400])
+    points = struct.pack(f"<{3 * count}f", *(draw.uniform(-1, 1) for _ in range(3 * count)))
+    triangles = b"".join(corners(*(draw.randrange(count) for _ in range(3))) for _ in range(2 * count))
+    data = bytearray(ply(count, 2 * count, points + triangles))
+    for _ in range(draw.choice([1, 2, 20])):
+        place = draw.randrange(len(data) - 4)
+        data[place : place + 4] = struct.pack(
+            "<i", draw.choice([-1, 99_999, 2**31 - 1, draw.randrange(2**31)])
+        )
+    (tmp_path / "m.ply").write_bytes(data)
+    with contextlib.suppress(PolarguideError):
+        mesh = _user_mesh(tmp_path / "m.ply")
+        assert 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.points)
+
+
+POINTS = 20_000
+
+
+def spread(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Points all over the triangles, more of each where there are few."""
+    side = max(2, int(np.sqrt(2 * POINTS / len(faces))))
+    a, b = (grid.ravel() for grid in np.meshgrid(np.linspace(0, 1, side), np.linspace(0, 1, side)))
+    a, b = a[a + b <= 1], b[a + b <= 1]
+    corners = vertices[faces]
+    points = corners[:, None, 0] + a[:, None] * (corners[:, 1:2] - corners[:, :1])
+    return (points + b[:, None] * (corners[:, 2:3] - corners[:, :1])).reshape(-1, 3)
+
+
+def projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    local = (points - camera.center.numpy()) @ camera.rotation.numpy().T
+    return local[:, :2] / np.maximum(local[:, 2:], 1e-9), local[:, 2]
+
+
+@pytest.mark.parametrize("name", [name for name in PRESETS if find_scene(name).object_only])
+def test_nothing_stands_before_the_object(name: str) -> None:
+    spec = find_scene(name)
+    meshes = {thing.name: _mesh(thing, spec) for thing in spec.things}
+    subject = np.concatenate([meshes[thing.name].points for thing in spec.things if thing.foreground])
+    subject = subject[ConvexHull(subject).vertices]
+    others = {
+        thing.name: spread(meshes[thing.name].points, meshes[thing.name].faces)
+        for thing in spec.things
+        if not thing.foreground and meshes[thing.name].points[:, 2].max() > subject[:, 2].min() + 0.01
+    }
+    for camera in place_cameras(spec.camera, 192, 144, 0):
+        shown, depth = projected(camera, subject)
+        outline = Delaunay(shown)
+        for other, points in others.items():
+            where, away = projected(camera, points)
+            before = (away > 0) & (away < depth.max()) & (outline.find_simplex(where) >= 0)
+            assert not before.any(), f"{other} hides a part of the object"
+
+
+IDEAL = Sensor(extinction=1e9, gains=(1, 1, 1, 1))
+
+
+def even(s0: float, s1: float, s2: float, size: int = 64) -> np.ndarray:
+    return np.tile(np.array([s0, s1, s2])[:, None, None, None], (1, size, size, 3))
+
+
+def samples(raw: np.ndarray, name: str, angle: int) -> np.ndarray:
+    pattern = sensor_pattern(name)
+    repeat = [side // pattern.period for side in raw.shape]
+    return raw[np.tile(pattern.angles, repeat) == angle].astype(float)
+
+
+@pytest.mark.parametrize("name", ["IMX250MYR", "IMX250MZR"])
+def test_an_ideal_sensor_stores_maluss_law(name: str) -> None:
+    raw = mosaic(even(0.8, 0.3, -0.2), name, 0, np.random.default_rng(0), IDEAL)
+    assert raw.dtype == np.uint16
+    for angle, expected in ((0, 0.55), (45, 0.3), (90, 0.25), (135, 0.5)):
+        value = (samples(raw, name, angle) - 64) / (4095 - 64)
+        np.testing.assert_allclose(value, expected, atol=2e-4)
+
+
+def test_faults_have_their_sizes() -> None:
+    sensor = Sensor(extinction=99.0, gains=(1.0, 0.9, 1.1, 1.0))
+    raw = mosaic(even(0.5, 0.5, 0.0), "IMX250MZR", 0, np.random.default_rng(0), sensor)
+    value = {a: (samples(raw, "IMX250MZR", a).mean() - 64) / (4095 - 64) for a in (0, 45, 90, 135)}
+    assert value[0] == pytest.approx(0.495, abs=1e-3)
+    assert value[90] == pytest.approx(1.1 * 0.005, abs=1e-3)
+    assert value[45] / value[135] == pytest.approx(0.9, abs=1e-3)
+
+
+def test_noise_is_that_of_photons_and_reading() -> None:
+    sensor = Sensor()
+    for noise in (1.0, 4.0):
+        found = noisy(np.full(200000, 0.3), noise, np.random.default_rng(1), sensor)
+        electrons = sensor.full_well / noise**2
+        expected = np.sqrt(0.3 * electrons + sensor.read_noise**2) / electrons
+        assert found.mean() == pytest.approx(0.3, abs=4 * expected / np.sqrt(200000))
+        assert found.std() == pytest.approx(expected, rel=0.02)
+    assert (noisy(np.full(3, 0.3), 0, np.random.default_rng(1), sensor) == 0.3).all()
+
+
+def test_values_stop_at_full_scale_and_at_zero() -> None:
+    raw = mosaic(even(5.0, 0, 0, 8), "IMX250MYR", 1, np.random.default_rng(0), Sensor())
+    assert (raw == 4095).all()
+    dark = mosaic(even(0, 0, 0), "IMX250MYR", 1, np.random.default_rng(0), Sensor())
+    assert dark.mean() == pytest.approx(64, abs=0.2)

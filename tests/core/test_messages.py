@@ -1,9 +1,8 @@
-"""The command that adds a package fits how this copy was installed, and the Python that it runs in."""
-
-from __future__ import annotations
+"""Errors, texts and reports: what a user reads."""
 
 import importlib.metadata
 import json
+import math
 import shlex
 import shutil
 import sys
@@ -14,6 +13,8 @@ import pytest
 
 from polarguide.core import errors
 from polarguide.core.errors import install_extra, install_package
+from polarguide.core.progress import SILENT
+from polarguide.core.text import decimal
 
 REQUIRES = ["viser==1.1.*", "scikit-image>=0.22", "flip-evaluator>=1.6; python_version < '3.14'",
             'mitsuba==3.9.*; extra == "synth"', "torchmetrics>=1.4; extra == 'lpips'",
@@ -93,3 +94,24 @@ def test_a_checkout_that_was_never_installed(tmp_path: Path, monkeypatch: pytest
     folder = sources(tmp_path / "checkout")
     monkeypatch.setattr(errors, "__file__", str(folder / "src" / "polarguide" / "core" / "errors.py"))
     assert shlex.split(install_extra("synth"))[-1] == f"{folder}[synth]"
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("1.5", 1.5), (" -3e2 ", -300.0), ("inf", math.inf), ("007", 7.0)]
+)
+def test_numbers(text: str, value: float) -> None:
+    assert decimal(text) == value
+
+
+@pytest.mark.parametrize("text", ["1_0", "4_5.0", "\u0664\u0665", "\uff11", "", "a", "0x10"])
+def test_what_python_alone_takes_for_a_number_is_none(text: str) -> None:
+    with pytest.raises(ValueError, match=r"not a number|could not convert"):
+        decimal(text)
+
+
+def test_the_default_is_silent(capsys: pytest.CaptureFixture[str]) -> None:
+    SILENT.say("a")
+    SILENT.warn("b")
+    with SILENT.track("c", None) as advance:
+        advance(1, total=2, note="d")
+    assert capsys.readouterr() == ("", "")
