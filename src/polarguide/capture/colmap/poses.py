@@ -204,6 +204,11 @@ class Poses:
         """Number of 3D points of the model."""
         return len(self._model.points3D)
 
+    def stated_size(self, view: str) -> tuple[int, int]:
+        """Width and height that the camera of a view was made for."""
+        camera = self._model.cameras[self._images[view].camera_id]
+        return int(camera.width), int(camera.height)
+
     def developed(self, geometries: Mapping[str, Geometry]) -> dict[str, PosedCamera]:
         """Cameras of the developed pictures, including distortion, by view.
 
