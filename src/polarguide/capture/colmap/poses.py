@@ -106,10 +106,11 @@ def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
     elif size[0] > 0 and size[0] * height == size[1] * width:
         crop, step = (0.0, 0.0), size[0] / width
     else:
+        apart = geometry.stored != geometry.size
+        files = f", or of the files, {geometry.stored[0]}x{geometry.stored[1]}" if apart else ""
         raise PolarguideError(
             where,
-            expected=f"the size of the pictures, {width}x{height}, or of the files, "
-            f"{geometry.stored[0]}x{geometry.stored[1]}",
+            expected=f"the size of the pictures, {width}x{height}{files}",
             found=f"{size[0]}x{size[1]}",
             remedy="Give a model that was made from these pictures, without a crop.",
         )

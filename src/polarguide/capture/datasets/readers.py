@@ -27,6 +27,7 @@ from polarguide.capture.datasets.dataset import (
     pinhole_camera,
     read_projections,
     require_files,
+    require_known_names,
     require_same_shape,
     stokes_dataset,
 )
@@ -155,6 +156,9 @@ def _plane(path: Path, shape: tuple[int, ...], like: Path) -> NDArray[np.float32
     return np.asarray(plane, np.float32)
 
 
+_GNERP_ENTRY = re.compile(r"w2c_mat_\d{1,6}|intrinsic(_\d{1,6})?")
+
+
 def _gnerp_cameras(path: Path, size: tuple[int, int]) -> dict[int, PosedCamera]:
     """Number -> camera, from ``w2c_mat_<i>`` and ``intrinsic``, or ``intrinsic_<i>`` where there is one."""
     content: dict[str, Any] = read_record(path, dict[str, Any])
@@ -172,10 +176,13 @@ def _gnerp_cameras(path: Path, size: tuple[int, int]) -> dict[int, PosedCamera]:
         cameras[int(match[1])] = pinhole_camera(size, checked_intrinsics(where, inner), *pose)
     if not cameras:
         raise missing_entry(path, "w2c_mat_<i>", content)
+    require_known_names(path, (key for key in content if _GNERP_ENTRY.fullmatch(key) is None))
     return cameras
 
 
 PHYGAP_CAMERAS = "camera_params.npz"
+# The angle of view says again what the intrinsics and the size say.
+_PHYGAP_ENTRIES = {"intrinsics", "extrinsics", "image_width", "image_height", "fov"}
 _CHANNELS = tuple(tuple(f"S{part}.{color}" for color in "RGB") for part in range(3))
 
 
@@ -195,6 +202,7 @@ def open_phygap(root: Path) -> Dataset:
     for key in ("intrinsics", "extrinsics", "image_width", "image_height"):
         if key not in arrays:
             raise missing_entry(path, key, arrays)
+    require_known_names(path, arrays.keys() - _PHYGAP_ENTRIES)
     inner = checked_intrinsics(f"{path} (intrinsics)", finite_numbers(path, arrays["intrinsics"], ((3, 3),)))
     poses = arrays["extrinsics"]
     if poses.ndim != 3 or poses.shape[1:] not in ((3, 4), (4, 4)):
@@ -231,6 +239,8 @@ def open_phygap(root: Path) -> Dataset:
 PISR_SENSOR: Final = "IMX250MYR"
 # Size that ``camera_matrix`` was made for.
 _PISR_SIZE = (1224, 1024)
+# Poses of the calibration target and its error, which OpenCV returns with them, are of no picture here.
+_PISR_ENTRIES = {"camera_matrix", "dist_coeffs", "rvecs", "tvecs", "ret", "rms"}
 _PISR_CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 
 
@@ -250,6 +260,7 @@ def open_pisr(root: Path) -> Dataset:
     for key in ("camera_matrix", "dist_coeffs"):
         if key not in intrinsics:
             raise missing_entry(inner_file, key, intrinsics)
+    require_known_names(inner_file, intrinsics.keys() - _PISR_ENTRIES)
     where = f"{inner_file} (camera_matrix)"
     inner = checked_intrinsics(where, finite_numbers(where, intrinsics["camera_matrix"], ((3, 3),)))
     coefficients = intrinsics["dist_coeffs"]
