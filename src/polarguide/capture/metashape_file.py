@@ -55,7 +55,7 @@ def read_metashape(path: Path) -> dict[str, PosedCamera]:
         PolarguideError: the file cannot be read, or its cameras are not all in one frame, or have another lens.
     """
     chunk = _chunk(path, _parsed(path))
-    cameras = [camera for camera in chunk.iter("camera") if camera.get("sensor_id") is not None]
+    cameras = list(chunk.iter("camera"))
     enabled = [camera for camera in cameras if camera.get("enabled", "true") not in _OFF]
     posed = [camera for camera in enabled if camera.findtext("transform") is not None]
     _require_one_component(path, chunk, posed)

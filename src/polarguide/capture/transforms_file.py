@@ -6,8 +6,9 @@ refused; one that is not known is warned of by name.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +16,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from polarguide.capture.camera_sizes import Sizes, settled_size
+from polarguide.capture.camera_sizes import Size, Sizes, settled_size
 from polarguide.capture.colmap.files import PosedCamera
 from polarguide.capture.colmap.model import view_of_name
 from polarguide.capture.datasets.dataset import checked_pose, require_known_names
@@ -114,7 +115,7 @@ def read_transforms(path: Path, sizes: Sizes) -> dict[str, PosedCamera]:
         if view in found:
             raise wrong_camera(where, f"one frame called {view}", "two")
         lens = {name: _either(frame, record, name) for name in _Lens.__struct_fields__}
-        found[view] = _camera_of(where, lens, _pose_of(where, frame), sizes(view))
+        found[view] = _camera_of(where, lens, _pose_of(where, frame), functools.partial(sizes, view))
     return found
 
 
@@ -138,7 +139,7 @@ def _pose_of(where: str, frame: _Frame) -> Any:
 
 
 def _camera_of(
-    where: str, lens: Mapping[str, Any], to_world: Any, sizes: tuple[tuple[int, int], ...]
+    where: str, lens: Mapping[str, Any], to_world: Any, sizes: Callable[[], Sequence[Size]]
 ) -> PosedCamera:
     """The camera of a frame."""
     fisheye = _is_fisheye(where, lens)
@@ -147,7 +148,7 @@ def _camera_of(
     size = _stated_size(where, lens)
     if size is None:
         in_pixels = lens["fl_x"] is not None or lens["fl_y"] is not None
-        size = settled_size(where, sizes, center, in_pixels=in_pixels)
+        size = settled_size(where, sizes(), center, in_pixels=in_pixels)
     focal = _focal_lengths(where, lens, size, fisheye)
     middle = [size[k] / 2 if center[k] is None else float(center[k]) for k in range(2)]
     return camera_to_world(where, size, (*focal, *middle), coefficients, to_world, fisheye=fisheye)

@@ -171,6 +171,11 @@ def known_poses(root: Path, pictures: Source, origin: str) -> Poses | None:
         return Poses.of_cameras(pictures.cameras, root, pictures.views)
     path = Path(origin)
     if path.suffix.lower() in POSE_FILES and path.is_file():
-        cameras = read_pose_file(path, pictures.views, lambda view: pictures.stored(view).sizes)
+        known = set(pictures.views)
+
+        def sizes(view: str) -> tuple[tuple[int, int], ...]:
+            return pictures.stored(view if view in known else pictures.views[0]).sizes
+
+        cameras = read_pose_file(path, pictures.views, sizes)
         return Poses.of_cameras(cameras, path, pictures.views, [path])
     return Poses.read(path, pictures.views)
