@@ -144,6 +144,9 @@ def write_json(path: Path, top: dict, frame: dict | None = None) -> Path:
          (90, 92, 33, 23, 0.1, 0.2, 0.01, 0.02, 0.3, 0, 0, 0)),
         (WHOLE, {"distortion_params": [0.1, 0, 0, 0, 0, 0]}, "FULL_OPENCV", (90, 92, 33, 23, 0.1, *[0] * 7)),
         (WHOLE, {"fl_x": 80.0, "fl_y": 81.0}, "PINHOLE", (80, 81, 33, 23)),
+        # what a frame says of focal length or distortion takes the place of all that the file says
+        ({**WHOLE, "camera_angle_x": ANGLE, "k1": 0.3, "k2": 0.1},
+         {"fl_x": 80.0, "distortion_params": [0.1, 0, 0, 0, 0, 0]}, "FULL_OPENCV", (80, 80, 33, 23, 0.1, *[0] * 7)),
         ({**WHOLE, "camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.4}, {}, "OPENCV_FISHEYE",
          (90, 92, 33, 23, 0.1, 0, 0, 0.4)),
         ({**WHOLE, "is_fisheye": True, "k1": 0.1}, {}, "OPENCV_FISHEYE", (90, 92, 33, 23, 0.1, 0, 0, 0)),
@@ -218,6 +221,25 @@ def test_a_size_that_the_file_lacks_is_that_of_the_pictures_it_fits(
     with pytest.raises(PolarguideError) as error:
         read_pose_file(tmp_path / "c.npz", VIEWS, lambda view: ((400, 300),))
     assert error.value.expected.endswith("400x300")
+
+
+@pytest.mark.parametrize(
+    ("entry", "matrix", "found"),
+    [
+        ("camera_mat_1", np.diag([1.8, 1.8, 1.0, 1.0]), "camera_mat_1"),
+        ("camera_mat_1", np.zeros(()), "camera_mat_1"),
+        ("world_mat_02", np.eye(4), "two"),
+    ],
+)
+def test_idr_cameras_of_another_unit_or_number_are_refused(
+    tmp_path: Path, entry: str, matrix: np.ndarray, found: str
+) -> None:
+    np.savez(tmp_path / "c.npz", **idr_cameras(), camera_mat_0=np.eye(4), world_mat_inv_0=np.eye(4))
+    read_pose_file(tmp_path / "c.npz", VIEWS, stated)
+    np.savez(tmp_path / "c.npz", **idr_cameras(), **{entry: matrix})
+    with pytest.raises(PolarguideError) as error:
+        read_pose_file(tmp_path / "c.npz", VIEWS, stated)
+    assert found in error.value.found
 
 
 def test_views_never_take_the_cameras_of_others_by_number(tmp_path: Path) -> None:

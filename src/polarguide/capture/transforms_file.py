@@ -114,14 +114,27 @@ def read_transforms(path: Path, sizes: Sizes) -> dict[str, PosedCamera]:
         view = view_of_name(frame.file_path)
         if view in found:
             raise wrong_camera(where, f"one frame called {view}", "two")
-        lens = {name: _either(frame, record, name) for name in _Lens.__struct_fields__}
+        lens = _lens_of(frame, record)
         found[view] = _camera_of(where, lens, _pose_of(where, frame), functools.partial(sizes, view))
     return found
 
 
-def _either(frame: _Lens, record: _Lens, name: str) -> Any:
-    own = getattr(frame, name)
-    return getattr(record, name) if own is None else own
+_FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+
+def _lens_of(frame: _Lens, record: _Lens) -> dict[str, Any]:
+    """The fields of a frame's lens: its own, else those of the file.
+
+    Focal lengths and coefficients are statements as a whole: a frame that makes one takes nothing of the file's.
+    """
+    lens = {name: getattr(frame, name) for name in _Lens.__struct_fields__}
+    whole = (_FOCAL, (*_COEFFICIENTS, "distortion_params"))
+    stated = {name for names in whole if any(lens[n] is not None for n in names) for name in names}
+    return {
+        name: getattr(record, name) if own is None and name not in stated else own
+        for name, own in lens.items()
+    }
 
 
 def _pose_of(where: str, frame: _Frame) -> Any:
@@ -182,17 +195,16 @@ def _distortion(where: str, lens: Mapping[str, Any], fisheye: bool) -> list[floa
     Raises:
         PolarguideError: there are others, or two statements differ.
     """
-    names = ("k1", "k2", "k3", "k4", "p1", "p2")
-    given = [lens[name] for name in names]
+    given = [lens[name] for name in _COEFFICIENTS]
     value = [float(number or 0.0) for number in given]
     listed = lens["distortion_params"]
     if listed is not None:
-        if len(listed) != len(names):
+        if len(listed) != len(_COEFFICIENTS):
             raise wrong_camera(
                 where, "six distortion_params: k1, k2, k3, k4, p1, p2", f"{len(listed)} numbers"
             )
         if any(own is not None and own != other for own, other in zip(given, listed, strict=True)):
-            found = f"{listed} beside {dict(zip(names, given, strict=True))}"
+            found = f"{listed} beside {dict(zip(_COEFFICIENTS, given, strict=True))}"
             raise wrong_camera(where, "distortion_params that agree with k1 to p2", found)
         value = [float(number) for number in listed]
     k1, k2, k3, k4, p1, p2 = value

@@ -49,7 +49,7 @@ class Dataset:
         views: view names, sorted.
         paths: all files that are read.
         files: view -> a file of it, whose header has the size of the view's picture.
-        cameras: view -> camera.
+        cameras: view -> camera; None where the folder has none of its own.
         read_stokes: reads the Stokes vectors of a view; None if ``mosaics`` holds raw files instead.
         masks: view -> file of its object mask, for the views that have one.
         read_mask: reads such a file, [H, W].
@@ -64,7 +64,7 @@ class Dataset:
     views: list[str]
     paths: list[Path]
     files: Mapping[str, Path]
-    cameras: Mapping[str, PosedCamera]
+    cameras: Mapping[str, PosedCamera] | None
     read_stokes: Callable[[str], StokesImage] | None
     masks: Mapping[str, Path]
     read_mask: Callable[[Path], NDArray[np.bool_]] = read_mask
@@ -91,8 +91,8 @@ def stokes_dataset(
     parts: Sequence[str],
     files: Mapping[str, Sequence[Path]],
     stokes: Callable[[NDArray[np.float32]], NDArray[np.float32]],
-    cameras_file: Path,
-    cameras: Mapping[str, PosedCamera],
+    cameras_file: Path | None,
+    cameras: Mapping[str, PosedCamera] | None,
     masks: Mapping[str, Path],
     *,
     read_mask: Callable[[Path], NDArray[np.bool_]] = read_mask,
@@ -107,7 +107,7 @@ def stokes_dataset(
         parts: what the three files of a view are called in messages.
         files: view -> its three files.
         stokes: the Stokes vectors [3, H, W, 3], given the three pictures [3, H, W, 3].
-        cameras_file: the file of the cameras.
+        cameras_file: the file of the cameras, if there is one.
 
     Raises:
         PolarguideError: a file is missing.
@@ -121,7 +121,11 @@ def stokes_dataset(
             require_same_shape(path, plane.shape, planes[0].shape, files[view][0])
         return stokes(np.stack(planes)), np.zeros(planes[0].shape[:2], bool)
 
-    paths = [*(path for paths in files.values() for path in paths), *masks.values(), cameras_file]
+    paths = [
+        *(path for paths in files.values() for path in paths),
+        *masks.values(),
+        *([] if cameras_file is None else [cameras_file]),
+    ]
     first = {view: of_view[0] for view, of_view in files.items()}
     return Dataset(
         name,
@@ -274,7 +278,7 @@ def read_projections(path: Path) -> Projections:
             )
         padded |= match[1] != str(number)
         scale_key, inner_key = f"scale_mat_{match[1]}", f"camera_mat_{match[1]}"
-        if inner_key in arrays and not np.allclose(arrays[inner_key], np.eye(len(arrays[inner_key]))):
+        if inner_key in arrays and not _is_identity(arrays[inner_key]):
             found_matrix = f"{inner_key}, which scales them to a picture from -1 to 1"
             raise wrong_camera(path, "world_mat that projects to pixels", found_matrix)
         if scale_key not in arrays:
@@ -286,6 +290,12 @@ def read_projections(path: Path) -> Projections:
         raise missing_entry(path, "world_mat_<i>", arrays)
     require_known_names(path, (key for key in arrays if _IDR_ENTRY.fullmatch(key) is None))
     return Projections(found, padded)
+
+
+def _is_identity(matrix: NDArray[Any]) -> bool:
+    return (
+        matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and np.allclose(matrix, np.eye(len(matrix)))
+    )
 
 
 def require_known_names(path: Path, strangers: Iterable[str]) -> None:

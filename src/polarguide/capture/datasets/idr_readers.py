@@ -52,14 +52,19 @@ def open_pandora(root: Path) -> Dataset:
     pictures = index_files(_folder(root, _PICTURES), SUFFIXES)
     # Files count from 1, unless a file or a picture is called 00.
     first = 0 if any(int(view) == 0 for view in views) or "00" in pictures else 1
-    offsets = (0,) if first == 0 else None
-    found, numbers = _cameras(root, cameras_file, {view: int(view) for view in views}, pictures, offsets)
-    cameras = cameras_of_views(cameras_file, numbers, found, "world_mat_")
-    shift = next(iter(numbers.values())) - int(next(iter(numbers))) if numbers else 0
+    cameras: dict[str, PosedCamera] | None = None
+    posed_by: Path | None = None
+    notes: tuple[str, ...] = ()
+    # PhyGaP's copy has a COLMAP model in place of the cameras.
+    if cameras_file.exists() or not (root / "sparse").is_dir():
+        offsets = (0,) if first == 0 else None
+        found, numbers = _cameras(root, cameras_file, {view: int(view) for view in views}, pictures, offsets)
+        cameras, posed_by = cameras_of_views(cameras_file, numbers, found, "world_mat_"), cameras_file
+        shift = next(iter(numbers.values())) - int(next(iter(numbers))) if numbers else 0
+        notes = (f"Files count from {first}, cameras from {first + shift}.",)
     masks, read = _masks(root, {view: int(view) - first for view in views})
-    notes = (f"Files count from {first}, cameras from {first + shift}.",)
     return stokes_dataset(
-        "pandora", _PANDORA_PARTS, files, _stokes, cameras_file, cameras, masks, read_mask=read, notes=notes
+        "pandora", _PANDORA_PARTS, files, _stokes, posed_by, cameras, masks, read_mask=read, notes=notes
     )
 
 
