@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from camera_files import write_model
 from dataset_files import HEIGHT, WIDTH, WRITERS, disc, light_of, poses, write_nersp, write_pandora
 
 from polarguide.capture.calibration import Calibration
@@ -16,6 +17,7 @@ from polarguide.capture.datasets.dataset import Dataset, read_mask
 from polarguide.capture.datasets.readers import detect_dataset, open_dataset
 from polarguide.capture.datasets.sense import RimAgreement, rim_agreement, sense_of_rims
 from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import StokesSource
 
@@ -115,6 +117,7 @@ def test_every_view_has_its_light_its_camera_and_its_mask(tmp_path: Path, case: 
     truth = list(poses())
     for index, view in zip(left, dataset.views, strict=True):
         rotation, translation = truth[index]
+        assert dataset.cameras is not None
         camera = dataset.cameras[view]
         np.testing.assert_allclose(camera.rotation, rotation, atol=1e-6)
         np.testing.assert_allclose(camera.translation, translation, atol=1e-6)
@@ -138,6 +141,18 @@ def test_a_missing_camera_is_named_and_no_view_is_to_be_removed(tmp_path: Path) 
         open_dataset(tmp_path / "in", "pandora")
     assert error.value.expected == "the entry world_mat_0 for view 01"
     assert "remove" not in error.value.remedy
+
+
+def test_a_copy_with_a_colmap_model_brings_no_cameras_of_its_own(tmp_path: Path) -> None:
+    """PhyGaP's copy of PANDORA."""
+    write_pandora(tmp_path / "in")
+    (tmp_path / "in" / "cameras.npz").unlink()
+    model = write_model(
+        tmp_path / "in" / "sparse" / "0", ("01", "02", "03"), f"PINHOLE {WIDTH} {HEIGHT} 90 92 33 23"
+    )
+    assert open_dataset(tmp_path / "in", "pandora").cameras is None
+    settings = PrepareSettings(gains="none", poses=str(model))
+    assert prepare_scene(tmp_path / "in", tmp_path / "out", settings).left_out == ["04"]
 
 
 @pytest.mark.parametrize("channels", [4, 2])

@@ -121,11 +121,8 @@ def stokes_dataset(
             require_same_shape(path, plane.shape, planes[0].shape, files[view][0])
         return stokes(np.stack(planes)), np.zeros(planes[0].shape[:2], bool)
 
-    paths = [
-        *(path for paths in files.values() for path in paths),
-        *masks.values(),
-        *([] if cameras_file is None else [cameras_file]),
-    ]
+    paths = [*(path for of_view in files.values() for path in of_view), *masks.values()]
+    paths += [] if cameras_file is None else [cameras_file]
     first = {view: of_view[0] for view, of_view in files.items()}
     return Dataset(
         name,
