@@ -72,8 +72,8 @@ class PrepareSettings:
             in larger files.
         poses: sfm, dataset, none, or the path of a COLMAP model, transforms.json (nerfstudio), cameras.xml (Metashape)
             or cameras.npz (IDR); auto takes those of a dataset, else sfm.
-        poses_of: What the poses of a path are of where EXIF turns pictures, the stored or the displayed pixels; auto
-            decides by the sizes of the cameras, else takes them for those of the stored pixels.
+        poses_of: Whether the poses of a path are of the pixels as stored, or of pictures as EXIF orientation displays
+            them; auto decides by the sizes of the cameras, else stored.
         matching: Pairs that SfM compares: all, or neighbors in the order of their names.
         sfm_pictures: What SfM finds features in: the photograph, or the minimum over the angles, which has less glare.
         intrinsics: fx,fy,cx,cy (and k1,k2,p1,p2) of all pictures as developed, for SfM; without it they are estimated.

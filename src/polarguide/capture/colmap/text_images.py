@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 _POSE = 9  # number, quaternion, translation, camera: what stands before the name
-_PLACE = 3  # x, y and the number of a point
+_PLACE = 3  # x, y and the number of a point; pycolmap checks all of them, lines of images show in the first
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ def read_text_images(data: bytes) -> TextImages:
     for count, line in enumerate(data.splitlines(), 1):
         cells = line.split()
         if number is not None:
-            if len(cells) % _PLACE or not all(map(_is_number, cells)):
+            if len(cells) % _PLACE or not all(map(_is_number, cells[: _POSE + _PLACE])):
                 raise ValueError(f"line {count} does not hold the observations of image {number}")
             number = None
             out.append(line)
