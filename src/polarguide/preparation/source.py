@@ -101,7 +101,11 @@ class Source(Protocol):
         """Stored size and orientation of a view's pictures, by the header of its first file."""
 
     def use_stored(self, views: Collection[str]) -> None:
-        """Develop these views as they are stored, whatever their orientation; before any of them is developed."""
+        """Develop these views as they are stored, whatever their orientation; before any of them is developed.
+
+        Files of sources that do not say more have no orientation.
+        """
+        return None
 
     def used_as_stored(self, view: str) -> bool:
         """Whether ``use_stored`` named a view."""
