@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +15,9 @@ from test_prepare_filter import with_orientation
 
 from polarguide.capture import load_scene
 from polarguide.capture.colmap.files import PosedCamera
-from polarguide.capture.colmap.poses import Poses
+from polarguide.capture.colmap.poses import Geometry, Poses
 from polarguide.capture.filter.exif import apply_orientation
+from polarguide.preparation.open_source import known_poses
 from polarguide.preparation.pose_frames import settle_pose_frames
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
@@ -82,6 +84,31 @@ def test_pictures_that_were_turned_before_poses_were_there_are_written_anew(tmp_
     model = write_model(tmp_path / "model", NAMES, "PINHOLE 128 96 110 112 61 50")
     prepare_scene(tmp_path / "in", tmp_path / "out", replace(SETTINGS, poses=str(model)))
     assert np.abs(read_polar(tmp_path / "out", "v000") - behind(light)).max() < 0.03
+
+
+@pytest.mark.parametrize(
+    ("lens", "asked", "size", "reason"),
+    [
+        ({"camera_angle_x": 1.0}, "auto", (128, 96), "sizes do not tell"),
+        ({"camera_angle_x": 1.0}, "displayed", (96, 128), "as --poses-of says"),
+        ({"fl_x": 100.0, "cx": 47.0, "cy": 65.0}, "auto", (96, 128), "as the sizes of the cameras tell"),
+        ({"fl_x": 100.0, "cx": 65.0, "cy": 47.0}, "auto", (128, 96), "as the sizes of the cameras tell"),
+    ],
+)
+def test_cameras_without_a_size_get_that_of_the_pixels_they_are_of(
+    tmp_path: Path, lens: dict, asked: str, size: tuple[int, int], reason: str
+) -> None:
+    frame = {"file_path": "a.jpg", "transform_matrix": np.eye(4).tolist()}
+    (tmp_path / "t.json").write_text(json.dumps({**lens, "frames": [frame, {**frame, "file_path": "x.jpg"}]}))
+    source = Tagged({"a": 6})
+    source.views = ["a"]
+    poses = known_poses(tmp_path, source, str(tmp_path / "t.json"), asked)
+    assert poses is not None
+    line = settle_pose_frames(source, poses, asked)
+    assert reason in line
+    (camera,) = poses.developed({"a": Geometry(size, (0, 0), 1, size)}).values()
+    assert (camera.width, camera.height) == size
+    assert source.kept == ({"a"} if size == (128, 96) else set())
 
 
 class Tagged(Source):

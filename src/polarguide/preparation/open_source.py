@@ -162,8 +162,11 @@ def origin_of_poses(pictures: Source, asked: str) -> str:
     return asked
 
 
-def known_poses(root: Path, pictures: Source, origin: str) -> Poses | None:
-    """The poses of a dataset or COLMAP model; None for other origins."""
+def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto") -> Poses | None:
+    """The poses of a dataset, or of a file or folder; None for other origins.
+
+    ``poses_of`` says what they are of where EXIF turns pictures: cameras without a size get that of those pixels.
+    """
     if origin in ("sfm", "none"):
         return None
     if origin == "dataset":
@@ -171,11 +174,15 @@ def known_poses(root: Path, pictures: Source, origin: str) -> Poses | None:
         return Poses.of_cameras(pictures.cameras, root, pictures.views)
     path = Path(origin)
     if path.suffix.lower() in POSE_FILES and path.is_file():
-        known = set(pictures.views)
+        known, assumed = set(pictures.views), set[str]()
 
         def sizes(view: str) -> tuple[tuple[int, int], ...]:
-            return pictures.stored(view if view in known else pictures.views[0]).sizes
+            assumed.add(view)
+            stored = pictures.stored(view if view in known else pictures.views[0])
+            return stored.turned_first if poses_of == "displayed" else stored.sizes
 
         cameras = read_pose_file(path, pictures.views, sizes)
-        return Poses.of_cameras(cameras, path, pictures.views, [path])
+        found = Poses.of_cameras(cameras, path, pictures.views, [path])
+        found.assumed_sizes = frozenset(assumed)
+        return found
     return Poses.read(path, pictures.views)

@@ -34,7 +34,7 @@ def settle_pose_frames(pictures: Source, poses: Poses, asked: str) -> str:
         codes[view] = stored.orientation
         if stored.size is not None and stored.orientation in QUARTER_TURNS:
             (width, height), camera = stored.size, poses.stated_size(view)
-            if width != height and camera[0] != camera[1]:
+            if camera is not None and width != height and camera[0] != camera[1]:
                 by_size[view] = (width > height) == (camera[0] > camera[1])
     if not codes:
         return ""

@@ -96,7 +96,7 @@ def prepare_scene(
             found=f"{len(pictures.views)} ({listed(pictures.views)})",
             remedy=_without_poses(root, pictures, settings),
         )
-    poses = known_poses(root, pictures, settings.poses)
+    poses = known_poses(root, pictures, settings.poses, settings.poses_of)
     frames = ""
     if poses is not None and settings.poses != "dataset":
         frames = settle_pose_frames(pictures, poses, settings.poses_of)

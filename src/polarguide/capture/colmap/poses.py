@@ -139,7 +139,15 @@ Key = tuple[int, Geometry]
 
 
 class Poses:
-    """A COLMAP model and the views of a capture that it has poses for."""
+    """A COLMAP model and the views of a capture that it has poses for.
+
+    Attributes:
+        views, missing: names of the views with a pose, and without.
+        folder, files: where the model is from.
+        assumed_sizes: views whose cameras came without a size, and have that of the pictures.
+    """
+
+    assumed_sizes: frozenset[str] = frozenset()
 
     def __init__(self, model: Any, where: Path, views: list[str], files: Sequence[Path] = ()) -> None:
         """Match the images of a model with views by stem.
@@ -205,10 +213,12 @@ class Poses:
         """Number of 3D points of the model."""
         return len(self._model.points3D)
 
-    def stated_size(self, view: str) -> tuple[int, int]:
-        """Width and height that the camera of a view was made for."""
+    def stated_size(self, view: str) -> tuple[int, int] | None:
+        """Width and height that the camera of a view was made for; None where nothing in its file tells."""
         camera = self._model.cameras[self._images[view].camera_id]
-        return int(camera.width), int(camera.height)
+        size = int(camera.width), int(camera.height)
+        middle = (camera.principal_point_x, camera.principal_point_y) == (size[0] / 2, size[1] / 2)
+        return None if view in self.assumed_sizes and middle else size
 
     def developed(self, geometries: Mapping[str, Geometry]) -> dict[str, PosedCamera]:
         """Cameras of the developed pictures, including distortion, by view.
