@@ -94,6 +94,7 @@ class _Measured(msgspec.Struct):
     scale: _Factor | None = None
     transfer: Literal["linear", "srgb"] | None = None
     light: dict[str, _Factor] | None = None
+    sense: Literal["ccw", "cw"] | None = None
 
 
 class _State(msgspec.Struct):

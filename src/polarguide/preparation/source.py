@@ -217,7 +217,7 @@ _WORKED = 4 * 3 * (3 + 3 + 4 + 4)
 class StokesSource(Source):
     """Stokes vectors in any unit, without a full scale."""
 
-    needs = ("scale",)
+    needs = ("scale", "sense")
 
     def __init__(self, dataset: Dataset, settings: PrepareSettings) -> None:
         """Use a dataset with ``read_stokes``; its sense of angles applies unless the settings name one."""
@@ -289,8 +289,8 @@ class StokesSource(Source):
         # Rounding of the scale may leave the largest intensity a hair above 1.
         clipped = clipped | (intensities > 1.0 + 1e-5).any(axis=(0, 3))
         height, width = clipped.shape
-        sense = measured.get("sense", self._calibration.sense)
-        rotated = oriented(np.clip(intensities, 0.0, 1.0), replace(self._calibration, sense=sense))
+        calibration = replace(self._calibration, sense=measured["sense"])
+        rotated = oriented(np.clip(intensities, 0.0, 1.0), calibration)
         return DevelopedView(
             intensities=rotated,
             invalid=clipped | ~finite,
