@@ -16,8 +16,10 @@ from tiny_capture import NAMES, TinyCapture, fails
 
 from polarguide.capture import load_scene, read_model
 from polarguide.capture.colmap import sfm
-from polarguide.capture.colmap.model import unseen_points
+from polarguide.capture.colmap.model import load_model, posed_images, unseen_points
+from polarguide.capture.colmap.poses import Geometry, Poses
 from polarguide.capture.colmap.sfm import NotConnectedError, connected_views, log_false_alarms, reconstruct
+from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import SILENT
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.polarizer import ANGLES
@@ -72,6 +74,52 @@ def test_model_directly_under_sparse(capture: TinyCapture) -> None:
         path.rename(folder.parent / path.name)
     folder.rmdir()
     assert read_model(capture.root).names == list(NAMES)
+
+
+@pytest.mark.parametrize(
+    ("name", "view"),
+    [
+        ("my cup (1) é.png", "my cup (1) é"),
+        ("0/a b/my cup.JPG", "my cup"),
+        ("C:\\\\in\\\\my cup .png", "my cup "),
+        ("train/r_0.5", "r_0.5"),
+        ("IMG_1.CR2 ", "IMG_1"),
+    ],
+)
+def test_names_of_text_models_are_not_cut(tmp_path: Path, name: str, view: str) -> None:
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24\n")
+    lines = f"# images\r\n1 1 0 0 0 0 0 0 1 {name}\r\n\r\n2 1e0 0 0 0 0 0 1 1 b.png\r\n1.5 2 -1\r\n"
+    (tmp_path / "images.txt").write_bytes(lines.encode())
+    found = Poses.read(tmp_path, [view, "b"])
+    assert found.views == [view, "b"]
+    found.warp(view, Geometry((64, 48), (0, 0), 1, (64, 48)))
+    found.write(tmp_path)
+    assert set(posed_images(load_model(tmp_path, ".bin"))) == {view, "b"}
+
+
+@pytest.mark.parametrize(
+    ("lines", "found"),
+    [
+        ("1 1 0 0 0 0 0 0 1 a.png\n2 1 0 0 0 0 0 0 1 b.png\n", "line 2"),  # one line an image
+        ("1 1 0 0 0 0 0 0 1 a.png\n\n1 1 0 0 0 0 0 0 1 b.png\n\n", "image 1 stands there twice"),
+        ("1 1 0 0 0 0 0 0 1\n\n", "line 1"),
+        ("1 1 0 0 0 0 0 0 1 a.png\n1 2\n", "line 2"),
+    ],
+)
+def test_text_models_that_would_be_read_in_part(tmp_path: Path, lines: str, found: str) -> None:
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24\n")
+    (tmp_path / "images.txt").write_text(lines)
+    with pytest.raises(PolarguideError) as error:
+        Poses.read(tmp_path, ["a", "b"])
+    assert found in error.value.found
+
+
+def test_cameras_without_a_focal_length_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 64 32 64 32\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
+    with pytest.raises(PolarguideError) as error:
+        Poses.read(tmp_path, ["a"])
+    assert "image a.png" in str(error.value.where)
 
 
 def test_binary_wins_over_text(capture: TinyCapture) -> None:

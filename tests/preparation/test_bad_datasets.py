@@ -19,6 +19,9 @@ from tiny_capture import write_picture
 from polarguide.capture.calibration import Calibration
 from polarguide.preparation.settings import PrepareSettings
 
+# The light of these tests has no outlines: nothing tells the sense of NeRSP's and NeISF's angles.
+pytestmark = pytest.mark.filterwarnings("ignore:The sense of .* is not certain")
+
 
 def npz(name: str, **changes: object) -> Callable[[Path], None]:
     """Other entries in a file of arrays; None removes one."""

@@ -6,7 +6,7 @@ import itertools
 import math
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from polarguide.capture.calibration import (
 )
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.exposures import Angle, angle_text, turned
-from polarguide.capture.filter.camera_raw import is_camera_raw
+from polarguide.capture.filter.camera_raw import is_camera_raw, stored_frame
 from polarguide.capture.filter.develop import (
     Shift,
     align_shots,
@@ -33,7 +33,7 @@ from polarguide.capture.filter.develop import (
     linear_intensities,
     rounding_of_bytes,
 )
-from polarguide.capture.filter.exif import apply_orientation, orientation_calibration, read_taken
+from polarguide.capture.filter.exif import apply_orientation, orientation, orientation_calibration, read_taken
 from polarguide.capture.filter.shots import (
     Shots,
     SingleShot,
@@ -43,14 +43,14 @@ from polarguide.capture.filter.shots import (
     read_stack,
     require_four_shots,
 )
-from polarguide.capture.formats.pictures import stated_size
+from polarguide.capture.formats.pictures import read_picture, stated_size
 from polarguide.capture.memory import require_memory_of_each
 from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.write import EXACT, Rounding
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.progress import Advance
 from polarguide.preparation.settings import PrepareSettings, white_gains
-from polarguide.preparation.source import DevelopedView, Source
+from polarguide.preparation.source import DevelopedView, Source, Stored
 
 _JUDGED_VIEWS = 8
 # Bytes for each pixel of a shot: as stored and stacked, linear, aligned or turned, written.
@@ -74,6 +74,22 @@ class ShotsSource(Source):
         self.paths, self.views = paths, sorted(views)
         self._shots = [path for view in self.views for path in views[view]]
         self._white = development_of(self._shots, settings)
+        self._as_stored: frozenset[str] = frozenset()
+
+    def stored(self, view: str) -> Stored:
+        """By the header of the view's first shot."""
+        first = self._of_view[view][0]
+        if is_camera_raw(first):
+            return Stored(*stored_frame(first))
+        return Stored(stated_size(first), orientation(read_picture(first)))
+
+    def use_stored(self, views: Collection[str]) -> None:
+        """Develop these views without turning them."""
+        self._as_stored = frozenset(views)
+
+    def used_as_stored(self, view: str) -> bool:
+        """Whether a view is not turned, whatever its orientation tag."""
+        return view in self._as_stored
 
     def _require_memory(self, what: str) -> None:
         """Refuse shots of a view that do not fit into memory, by their headers alone; ``what`` is for messages.
@@ -101,7 +117,8 @@ class ShotsSource(Source):
             shifts = estimate_shifts(linear)
             linear, bad = align_shots(linear, bad, shifts)
             notes = shift_notes(view, shifts)
-        return _Linear(shots, linear, np.asarray(bad.any(axis=0)), shifts, notes)
+        code = 1 if self.used_as_stored(view) else shots.orientation
+        return _Linear(shots, linear, np.asarray(bad.any(axis=0)), shifts, notes, code)
 
     def _developed(
         self,
@@ -115,10 +132,10 @@ class ShotsSource(Source):
         shots = found.shots
         return DevelopedView(
             intensities=np.ascontiguousarray(upright),
-            invalid=np.ascontiguousarray(apply_orientation(found.invalid, shots.orientation)),
+            invalid=np.ascontiguousarray(apply_orientation(found.invalid, found.orientation)),
             geometry=Geometry((width, height), (0, 0), 1, (width, height)),
             record={
-                "orientation": shots.orientation,
+                "orientation": found.orientation,
                 **record,
                 "clipped_share": round(float(shots.clipped.any(axis=0).mean()), 6),
                 "dark_share": round(float(shots.dark.mean()), 6),
@@ -131,13 +148,16 @@ class ShotsSource(Source):
 
 @dataclass
 class _Linear:
-    """Linear shots of a view [K, H, W, 3], unusable pixels [H, W], shifts, and notes for the user."""
+    """Linear shots of a view [K, H, W, 3], unusable pixels [H, W], shifts, notes for the user, and the orientation that
+    turns them into what is used.
+    """
 
     shots: Shots
     linear: NDArray[np.float32]
     invalid: NDArray[np.bool_]
     shifts: list[Shift]
     notes: list[str]
+    orientation: int
 
 
 class FilterSource(ShotsSource):
@@ -204,7 +224,7 @@ class FilterSource(ShotsSource):
                 found.notes.append(f"{view}: (I0 + I90)/(I45 + I135) {why}; not corrected.")
         factors = np.asarray(measured["scale"] / np.asarray(gains), np.float32)
         linear = oriented(found.linear * factors[:, None, None, None], asked.calibration)
-        code = found.shots.orientation
+        code = found.orientation
         turned = np.stack([apply_orientation(picture, code) for picture in linear])
         record = {
             "shifts": [[shift.x, shift.y] for shift in found.shifts],
@@ -313,7 +333,7 @@ class SinglesSource(ShotsSource):
         asked, mine = self._settings, self._singles[view]
         usual = [shot.angle for shot in mine] == list(ANGLES)
         found = self._linear(view, measured["transfer"], align=asked.align and usual)
-        code = found.shots.orientation
+        code = found.orientation
         turn = orientation_calibration(code)
         angles = [turned(turned(shot.angle, asked.calibration), turn) for shot in mine]
         exposures = [

@@ -50,7 +50,7 @@ FOLDERS = ("polar", "invalid", "masks", "sparse")
 REMEDY = "Give another --out; nothing was written."
 # Of a picture's angle, in its name.
 _LABEL = r"(\d{3}(\.\d+)?|unknown|none)(-\d+)?"
-_OF_POSES = ("poses", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
+_OF_POSES = ("poses", "poses_of", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
 
 
 _Code = Annotated[int, msgspec.Meta(ge=0, le=FULL_CODE)]
@@ -94,6 +94,7 @@ class _Measured(msgspec.Struct):
     scale: _Factor | None = None
     transfer: Literal["linear", "srgb"] | None = None
     light: dict[str, _Factor] | None = None
+    sense: Literal["ccw", "cw"] | None = None
 
 
 class _State(msgspec.Struct):
@@ -164,6 +165,7 @@ class SceneFolder:
             before["settings"]["white_balance"] = "gray"
         for name in ("analyzers", "angles"):  # earlier journals do not know them
             before["settings"].setdefault(name, None)
+        before["settings"].setdefault("poses_of", "auto")
         self._follows_none = before["settings"]["poses"] == "none" != now["settings"]["poses"]
         if self._follows_none:
             for record in (before, now):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from polarguide.capture.calibration import UNIDENTIFIED, UNIT_GAINS, balancing_gains, oriented, pair_ratio
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.datasets.dataset import Dataset, resized_mask
+from polarguide.capture.formats.pictures import stated_size
 from polarguide.capture.layout import index_files
 from polarguide.capture.memory import require_memory, require_memory_of_each
 from polarguide.capture.sensor.analyzer_file import read_analyzers
@@ -36,7 +37,7 @@ from polarguide.capture.write import EXACT, Rounding, rounding_of
 from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import Advance
 from polarguide.preparation.settings import PrepareSettings, white_gains
-from polarguide.preparation.source import DevelopedView, Source
+from polarguide.preparation.source import DevelopedView, Source, Stored
 
 SMALLEST = 16
 """Pixels of the shorter side of a mosaic."""
@@ -225,6 +226,17 @@ class MosaicSource(Source):
                 found=settings.white_balance,
                 remedy="Omit it.",
             )
+
+    def stored(self, view: str) -> Stored:
+        """By the header of the mosaic, or as the settings say."""
+        width, height = self._settings.width, self._settings.height
+        said = None if width is None or height is None else (width, height)
+        size = stated_size(self._files[view]) or said
+        step = DEMOSAIC_MODES[self._settings.demosaic]
+        if size is None or step == 1:
+            return Stored(size)
+        across, down = ((side - cut) // 2 * 2 // step for side, cut in zip(size, self._crop, strict=True))
+        return Stored(size, developed=(across, down))
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """Levels, gains of the angles and white balance of the capture; every file is read once."""

@@ -11,7 +11,6 @@ from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
 from polarguide.capture.exposures import TABLE
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots, folders_of_angles, split_name
-from polarguide.capture.formats.pictures import SUFFIXES, stated_size
 from polarguide.capture.layout import angle_folders, describe_contents, index_files, list_files
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import read_pose_file
@@ -163,8 +162,11 @@ def origin_of_poses(pictures: Source, asked: str) -> str:
     return asked
 
 
-def known_poses(root: Path, pictures: Source, origin: str) -> Poses | None:
-    """The poses of a dataset or COLMAP model; None for other origins."""
+def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto") -> Poses | None:
+    """The poses of a dataset, or of a file or folder; None for other origins.
+
+    ``poses_of`` says what they are of where EXIF turns pictures: cameras without a size get that of those pixels.
+    """
     if origin in ("sfm", "none"):
         return None
     if origin == "dataset":
@@ -172,14 +174,15 @@ def known_poses(root: Path, pictures: Source, origin: str) -> Poses | None:
         return Poses.of_cameras(pictures.cameras, root, pictures.views)
     path = Path(origin)
     if path.suffix.lower() in POSE_FILES and path.is_file():
-        first = pictures.paths[0]
-        size = (stated_size(first) if first.suffix.lower() in SUFFIXES else None) or (0, 0)
-        if path.suffix.lower() == ".npz" and 0 in size:
-            raise PolarguideError(
-                path,
-                expected="PNG, JPEG or TIFF pictures beside cameras of .npz, which do not state a size",
-                found=pictures.paths[0].name,
-                remedy="Give a COLMAP model, transforms.json or cameras.xml.",
-            )
-        return Poses.of_cameras(read_pose_file(path, pictures.views, size), path, pictures.views, [path])
+        known, assumed = set(pictures.views), set[str]()
+
+        def sizes(view: str) -> tuple[tuple[int, int], ...]:
+            assumed.add(view)
+            stored = pictures.stored(view if view in known else pictures.views[0])
+            return stored.turned_first if poses_of == "displayed" else stored.sizes
+
+        cameras = read_pose_file(path, pictures.views, sizes)
+        found = Poses.of_cameras(cameras, path, pictures.views, [path])
+        found.assumed_sizes = frozenset(assumed)
+        return found
     return Poses.read(path, pictures.views)

@@ -27,6 +27,7 @@ from polarguide.core.records import option_name
 from polarguide.preparation.exposure_table import write_exposure_table
 from polarguide.preparation.folder import PARTIAL, PHOTOGRAPHS, SCENE, SFM, SceneFolder, Workshop
 from polarguide.preparation.open_source import known_poses, open_source, origin_of_poses, poses_beside
+from polarguide.preparation.pose_frames import settle_pose_frames
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Source
 
@@ -95,13 +96,18 @@ def prepare_scene(
             found=f"{len(pictures.views)} ({listed(pictures.views)})",
             remedy=_without_poses(root, pictures, settings),
         )
-    poses = known_poses(root, pictures, settings.poses)
+    poses = known_poses(root, pictures, settings.poses, settings.poses_of)
+    frames = ""
+    if poses is not None and settings.poses != "dataset":
+        frames = settle_pose_frames(pictures, poses, settings.poses_of)
     folder = SceneFolder(target, _request(root, pictures, settings, poses))
     folder.require_measured(pictures.needs)
     if folder.finished:
         reporter.say(f"{target} is complete already; nothing to do.")
         return _outcome(folder, pictures, settings, new=False)
     reporter.say(f"{len(pictures.views)} views, format {pictures.kind}.")
+    if frames:
+        reporter.say(frames)
     beside = poses_beside(root) if settings.poses == "sfm" else []
     if beside:
         ways = " or ".join(f"--poses {shlex.quote(str(root / name))}" for name in beside)
@@ -225,6 +231,9 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
         for count, view in enumerate(views, 1):
             known = folder.views.get(view)
             warp = None
+            if known is not None and known.get("orientation", 1) != 1 and pictures.used_as_stored(view):
+                folder.drop(view)  # an earlier call without poses turned it for display
+                known = None
             if known is not None and poses is not None:
                 warp = poses.warp(view, msgspec.convert(known["geometry"], Geometry)).record()
             if not folder.has(view, warp):

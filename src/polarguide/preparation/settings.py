@@ -72,6 +72,8 @@ class PrepareSettings:
             in larger files.
         poses: sfm, dataset, none, or the path of a COLMAP model, transforms.json (nerfstudio), cameras.xml (Metashape)
             or cameras.npz (IDR); auto takes those of a dataset, else sfm.
+        poses_of: Whether the poses of a path are of the pixels as stored, or of pictures as EXIF orientation displays
+            them; auto decides by the sizes of the cameras, else stored.
         matching: Pairs that SfM compares: all, or neighbors in the order of their names.
         sfm_pictures: What SfM finds features in: the photograph, or the minimum over the angles, which has less glare.
         intrinsics: fx,fy,cx,cy (and k1,k2,p1,p2) of all pictures as developed, for SfM; without it they are estimated.
@@ -103,6 +105,7 @@ class PrepareSettings:
     analyzers: Annotated[Path | None, tyro.conf.Suppress] = None
     precision: Literal["source", "full"] = "source"
     poses: str = "auto"
+    poses_of: Literal["auto", "stored", "displayed"] = "auto"
     matching: Literal["exhaustive", "sequential"] = "exhaustive"
     sfm_pictures: Literal["photograph", "minimum"] = "photograph"
     intrinsics: str | None = None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -11,15 +12,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.calibration import oriented
+from polarguide.capture.calibration import Sense, oriented
 from polarguide.capture.colmap.files import PosedCamera
 from polarguide.capture.colmap.poses import Geometry
-from polarguide.capture.datasets.dataset import Dataset, not_as_published, resized_mask
+from polarguide.capture.datasets.dataset import Dataset, not_as_published, read_mask, resized_mask
+from polarguide.capture.datasets.sense import RimAgreement, rim_agreement, sense_of_rims
 from polarguide.capture.exposures import Angle
-from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, read_picture
+from polarguide.capture.filter.exif import QUARTER_TURNS
+from polarguide.capture.formats.pictures import SUFFIXES, stated_size
 from polarguide.capture.memory import require_memory_of_each
 from polarguide.capture.view import listed
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES, four_intensities
 from polarguide.preparation.settings import PrepareSettings
@@ -48,6 +51,34 @@ class DevelopedView:
     angles: Sequence[Angle] = ANGLES
 
 
+@dataclass(frozen=True)
+class Stored:
+    """How the pictures of a view lie in their files.
+
+    Attributes:
+        size: width and height of the stored pixels; None where no header states them.
+        orientation: EXIF's, 1 to 8; 1 is as stored.
+        developed: width and height of the developed picture, if it is smaller; None if not.
+    """
+
+    size: tuple[int, int] | None
+    orientation: int = 1
+    developed: tuple[int, int] | None = None
+
+    @property
+    def sizes(self) -> tuple[tuple[int, int], ...]:
+        """The sizes that a camera of the view may have been made for: stored, turned, developed."""
+        if self.size is None:
+            return ()
+        turned = (self.size[::-1],) if self.orientation in QUARTER_TURNS else ()
+        return (self.size, *turned, *(() if self.developed is None else (self.developed,)))
+
+    @property
+    def turned_first(self) -> tuple[tuple[int, int], ...]:
+        """``sizes`` with the turned one first, if the picture is turned by a quarter."""
+        return tuple(sorted(self.sizes, key=lambda size: self.size is None or size != self.size[::-1]))
+
+
 class Source(Protocol):
     """The pictures of one capture.
 
@@ -70,6 +101,20 @@ class Source(Protocol):
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read one view."""
+
+    def stored(self, view: str) -> Stored:
+        """Stored size and orientation of a view's pictures, by the header of its first file."""
+
+    def use_stored(self, views: Collection[str]) -> None:
+        """Develop these views as they are stored, whatever their orientation; before any of them is developed.
+
+        Files of sources that do not say more have no orientation.
+        """
+        return None
+
+    def used_as_stored(self, view: str) -> bool:
+        """Whether ``use_stored`` named a view."""
+        return False
 
 
 class MaskedSource(Source):
@@ -106,6 +151,18 @@ class MaskedSource(Source):
         self.kind, self.cameras, self.views = pictures.kind, pictures.cameras, pictures.views
         self.paths = [*pictures.paths, *self._masks.values()]
 
+    def stored(self, view: str) -> Stored:
+        """As the source says."""
+        return self._pictures.stored(view)
+
+    def use_stored(self, views: Collection[str]) -> None:
+        """As of the source; masks are then of the stored pixels, too."""
+        self._pictures.use_stored(views)
+
+    def used_as_stored(self, view: str) -> bool:
+        """As the source says."""
+        return self._pictures.used_as_stored(view)
+
     def measure(self, advance: Advance) -> dict[str, Any]:
         """Measure the source, and note views without a mask."""
         measured = self._pictures.measure(advance)
@@ -128,7 +185,7 @@ class MaskedSource(Source):
 
 def _fitted(path: Path, view: DevelopedView) -> NDArray[np.bool_]:
     """A mask at the size of the developed picture: True where at least half of a pixel is object."""
-    mask = decode_mask(path, read_picture(path), any_value=False)
+    mask = read_mask(path)
     geometry = view.geometry
     size = (mask.shape[1], mask.shape[0])
     if size == geometry.size:
@@ -149,6 +206,7 @@ def _fitted(path: Path, view: DevelopedView) -> NDArray[np.bool_]:
 PAIR_SUMS = (
     "n/a: the four intensities were made from Stokes vectors, so that I0 + I90 = I45 + I135 by construction"
 )
+_WORDS: dict[Sense, str] = {"ccw": "counter-clockwise", "cw": "clockwise"}
 _BRIGHT = 99.9
 _HEADROOM = 2.0
 _SAMPLES = 20_000
@@ -159,7 +217,7 @@ _WORKED = 4 * 3 * (3 + 3 + 4 + 4)
 class StokesSource(Source):
     """Stokes vectors in any unit, without a full scale."""
 
-    needs = ("scale",)
+    needs = ("scale", "sense")
 
     def __init__(self, dataset: Dataset, settings: PrepareSettings) -> None:
         """Use a dataset with ``read_stokes``; its sense of angles applies unless the settings name one."""
@@ -167,7 +225,12 @@ class StokesSource(Source):
         self.views, self.paths = dataset.views, dataset.paths
         self._dataset = dataset
         asked = settings.calibration
+        self._given_sense = asked.sense
         self._calibration = replace(asked, sense=asked.sense or dataset.sense)
+
+    def stored(self, view: str) -> Stored:
+        """By the header of a file that has the size of the Stokes vectors."""
+        return Stored(stated_size(self._dataset.files[view]))
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """Determine one scale for the whole capture, and the share of clipped pixels; every file is read once.
@@ -178,11 +241,17 @@ class StokesSource(Source):
         remedy = "Make the files smaller, all by the same factor, or prepare the dataset on a larger machine."
         require_memory_of_each(self.paths, _WORKED, "Stokes vectors", remedy=remedy)
         peaks: list[NDArray[np.float32]] = []
+        rims: list[RimAgreement | None] = []
         largest, negative, broken, count = 0.0, 0, 0, 0
         for number, view in enumerate(self.views, 1):
             stokes, finite, _ = self._stokes(view)
             intensities = np.stack(four_intensities(stokes))
             peak = intensities.max(axis=(0, 3))
+            if view in self._dataset.masks and self._calibration.order == ANGLES:
+                mask = resized_mask(self._dataset, view, peak.shape)
+                assert mask is not None
+                light = np.where(finite[..., None], stokes, np.nan)
+                rims.append(rim_agreement(light, mask, np.radians(self._calibration.zero)))
             peaks.append(peak.ravel()[:: max(1, peak.size // _SAMPLES)])
             largest = max(largest, float(peak.max()))
             negative += int((intensities < 0).sum())
@@ -195,11 +264,8 @@ class StokesSource(Source):
             raise not_as_published(self.paths[0], "light in at least one view", found)
         white = min(largest, _HEADROOM * bright) if bright > 0 else largest
         share = negative / max(1, 12 * count)
-        notes = [*self._dataset.notes, f"Four-angle sum check: {PAIR_SUMS}."]
-        notes.append(
-            f"Angles count {'clockwise' if self._calibration.sense == 'cw' else 'counter-clockwise'} as displayed "
-            f"({self.kind}; --sense and --zero say otherwise)."
-        )
+        sense, said = self._settle_sense([rim for rim in rims if rim is not None])
+        notes = [*self._dataset.notes, f"Four-angle sum check: {PAIR_SUMS}.", said]
         notes.append(
             f"One scale for all views: {white:.6g} of the dataset becomes full scale. {share:.3%} of the intensities "
             "are negative (more polarized than light can be: noise, or coarse files) and become 0."
@@ -212,7 +278,7 @@ class StokesSource(Source):
             "negative_share": round(share, 6),
             "not_finite_share": round(broken / count, 6),
             "pair_sums": PAIR_SUMS,
-            "sense": self._calibration.sense,
+            "sense": sense,
             "notes": notes,
         }
 
@@ -223,7 +289,8 @@ class StokesSource(Source):
         # Rounding of the scale may leave the largest intensity a hair above 1.
         clipped = clipped | (intensities > 1.0 + 1e-5).any(axis=(0, 3))
         height, width = clipped.shape
-        rotated = oriented(np.clip(intensities, 0.0, 1.0), self._calibration)
+        calibration = replace(self._calibration, sense=measured["sense"])
+        rotated = oriented(np.clip(intensities, 0.0, 1.0), calibration)
         return DevelopedView(
             intensities=rotated,
             invalid=clipped | ~finite,
@@ -234,6 +301,44 @@ class StokesSource(Source):
                 "invalid_share": round(float((clipped | ~finite).mean()), 6),
             },
             mask=resized_mask(self._dataset, view, (height, width)),
+        )
+
+    def _settle_sense(self, rims: list[RimAgreement]) -> tuple[Sense, str]:
+        """The sense of the angles and the line that says why; a warning where it may be the other one."""
+        assumed = self._calibration.sense or "ccw"
+        told = sense_of_rims(rims)
+        sense: Sense = assumed
+        known = self._dataset.sense_known
+        reason = (
+            "as --sense says" if self._given_sense else "as the release has them" if known else "as assumed"
+        )
+        other = "ccw" if assumed == "cw" else "cw"
+        if told is not None:
+            ccw, cw = (float(np.mean([getattr(rim, way) for rim in rims])) for way in ("ccw", "cw"))
+            figures = (
+                f"agreement with the outlines of the masks: {ccw:.2f} counter-clockwise, {cw:.2f} clockwise"
+            )
+            if told == assumed:
+                reason += f", and the light agrees ({figures})"
+            elif self._given_sense is None and not known:
+                sense, reason = told, f"as the light at the outlines of the masks has them ({figures})"
+            else:
+                warnings.warn(
+                    f"Angles are taken as {_WORDS[assumed]}, {reason}, but the light says {_WORDS[told]} ({figures}): "
+                    f"check with polarguide inspect; --sense {other} takes them so.",
+                    PolarguideWarning,
+                    stacklevel=3,
+                )
+        elif self._given_sense is None and not known:
+            warnings.warn(
+                f"The sense of {self.kind}'s angles is not certain, and outlines of masks do not tell: taken as "
+                f"{_WORDS[assumed]}. Check with polarguide inspect; --sense {other} takes them the other way.",
+                PolarguideWarning,
+                stacklevel=3,
+            )
+        return (
+            sense,
+            f"Angles count {_WORDS[sense]} as displayed, {reason} (--sense and --zero say otherwise).",
         )
 
     def _stokes(self, view: str) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:

@@ -16,8 +16,10 @@ import torch
 from torch import Tensor
 
 from polarguide.capture.colmap.files import check_model_files
+from polarguide.capture.colmap.text_images import read_text_images
 from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError
+from polarguide.core.files import read_file
 from polarguide.geometry.camera import FARTHEST, LENS, Camera, can_be_lens
 
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
@@ -177,8 +179,17 @@ def load_model(folder: Path, kind: str) -> Any:
     model = pycolmap.Reconstruction()
     check_model_files(folder, kind)
     try:
-        with _whole(folder, kind) as whole:
-            model.read_binary(str(whole)) if kind == ".bin" else model.read_text(str(whole))
+        if kind == ".bin":
+            with _whole(folder, kind) as whole:
+                model.read_binary(str(whole))
+        else:
+            images = read_text_images(read_file(folder / "images.txt"))
+            with _whole(folder, kind, images.data) as whole:
+                model.read_text(str(whole))
+            for number, image in model.images.items():
+                image.name = images.names[number]
+    except PolarguideError:
+        raise
     except Exception as error:  # pycolmap raises whatever C++ threw: ValueError, IndexError, MemoryError, ...
         raise PolarguideError(
             folder,
@@ -190,16 +201,19 @@ def load_model(folder: Path, kind: str) -> Any:
 
 
 @contextlib.contextmanager
-def _whole(folder: Path, kind: str) -> Iterator[Path]:
-    """The folder, or a copy with an empty file of points where it has none."""
-    if (folder / ("points3D" + kind)).exists():
+def _whole(folder: Path, kind: str, images: bytes | None = None) -> Iterator[Path]:
+    """The folder, or a copy: with an empty file of points where it has none, and with another file of images."""
+    if images is None and (folder / ("points3D" + kind)).exists():
         yield folder
         return
     with tempfile.TemporaryDirectory() as made:
         for name in MODEL_FILES:
             if (folder / (name + kind)).exists():
                 shutil.copyfile(folder / (name + kind), Path(made) / (name + kind))
-        (Path(made) / ("points3D" + kind)).write_bytes(bytes(8) if kind == ".bin" else b"")
+        if images is not None:
+            (Path(made) / ("images" + kind)).write_bytes(images)
+        if not (folder / ("points3D" + kind)).exists():
+            (Path(made) / ("points3D" + kind)).write_bytes(bytes(8) if kind == ".bin" else b"")
         yield Path(made)
 
 
@@ -217,8 +231,17 @@ def posed_images(model: Any) -> dict[str, list[Any]]:
                     found="another encoding",
                     remedy="Rename the picture, and export the model again.",
                 ) from None
-            images.setdefault(PurePosixPath(name.replace("\\", "/")).stem, []).append(image)
+            images.setdefault(view_of_name(name), []).append(image)
     return images
+
+
+def view_of_name(name: str) -> str:
+    """The view that a picture's name in a file of poses means: without folders, and without a suffix with a letter.
+
+    Suffixes without one are no kinds of files: ``./train/r_0.5`` is called so.
+    """
+    path = PurePosixPath(name.replace("\\", "/"))
+    return path.stem if any(sign.isalpha() for sign in path.suffix) else path.name
 
 
 def is_pinhole(camera: Any) -> bool:
@@ -236,6 +259,8 @@ def is_sound(image: Any, camera: Any, tolerance: float) -> bool:
     quaternion, translation = np.asarray(pose.rotation.quat, np.float64), np.asarray(pose.translation)
     turns = (np.abs(quaternion) <= 2).all() and abs(float(np.linalg.norm(quaternion)) - 1) <= tolerance
     bounded = (np.abs(translation) <= FARTHEST).all() and (np.abs(camera.params) <= FARTHEST).all()
+    if not len(camera.focal_length_idxs()):  # a panorama
+        return False
     inner = (camera.params[list(k)] for k in (camera.focal_length_idxs(), camera.principal_point_idxs()))
     return bool(turns and bounded) and can_be_lens((camera.width, camera.height), *inner)
 

@@ -106,10 +106,11 @@ def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
     elif size[0] > 0 and size[0] * height == size[1] * width:
         crop, step = (0.0, 0.0), size[0] / width
     else:
+        apart = geometry.stored != geometry.size
+        files = f", or of the files, {geometry.stored[0]}x{geometry.stored[1]}" if apart else ""
         raise PolarguideError(
             where,
-            expected=f"the size of the pictures, {width}x{height}, or of the files, "
-            f"{geometry.stored[0]}x{geometry.stored[1]}",
+            expected=f"the size of the pictures, {width}x{height}{files}",
             found=f"{size[0]}x{size[1]}",
             remedy="Give a model that was made from these pictures, without a crop.",
         )
@@ -138,7 +139,15 @@ Key = tuple[int, Geometry]
 
 
 class Poses:
-    """A COLMAP model and the views of a capture that it has poses for."""
+    """A COLMAP model and the views of a capture that it has poses for.
+
+    Attributes:
+        views, missing: names of the views with a pose, and without.
+        folder, files: where the model is from.
+        assumed_sizes: views whose cameras came without a size, and have that of the pictures.
+    """
+
+    assumed_sizes: frozenset[str] = frozenset()
 
     def __init__(self, model: Any, where: Path, views: list[str], files: Sequence[Path] = ()) -> None:
         """Match the images of a model with views by stem.
@@ -203,6 +212,13 @@ class Poses:
     def points(self) -> int:
         """Number of 3D points of the model."""
         return len(self._model.points3D)
+
+    def stated_size(self, view: str) -> tuple[int, int] | None:
+        """Width and height that the camera of a view was made for; None where nothing in its file tells."""
+        camera = self._model.cameras[self._images[view].camera_id]
+        size = int(camera.width), int(camera.height)
+        middle = (camera.principal_point_x, camera.principal_point_y) == (size[0] / 2, size[1] / 2)
+        return None if view in self.assumed_sizes and middle else size
 
     def developed(self, geometries: Mapping[str, Geometry]) -> dict[str, PosedCamera]:
         """Cameras of the developed pictures, including distortion, by view.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,15 +20,24 @@ from polarguide.capture.formats.arrays import finite_numbers, read_arrays, read_
 from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, decode_stored, read_picture
 from polarguide.capture.layout import index_files
 from polarguide.capture.view import listed
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, PolarguideWarning
 
 StokesImage = tuple[NDArray[np.float32], NDArray[np.bool_]]
 """Stokes vectors of a view [3, H, W, 3] in the dataset's own sense of angles; pixels at full scale in its pictures."""
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """An object mask [H, W] from a picture: where it reaches half of its maximum."""
-    return decode_mask(path, read_picture(path), any_value=False)
+    """An object mask [H, W] from a picture: where it reaches half of its maximum.
+
+    Of a cut-out, a picture of the object that is transparent around it, the mask is where it is at least half opaque.
+    """
+    data = read_picture(path)
+    pixels = decode_stored(path, data)
+    if pixels.ndim == 3 and pixels.shape[2] in (2, 4) and pixels.dtype.kind == "u":
+        alpha, full = pixels[..., -1], int(np.iinfo(pixels.dtype).max)
+        if (alpha < full).any():
+            return np.asarray(2 * alpha.astype(np.int64) >= full)
+    return decode_mask(path, data, any_value=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +48,13 @@ class Dataset:
         name: "pandora", "pisr", ...
         views: view names, sorted.
         paths: all files that are read.
-        cameras: view -> camera.
+        files: view -> a file of it, whose header has the size of the view's picture.
+        cameras: view -> camera; None where the folder has none of its own.
         read_stokes: reads the Stokes vectors of a view; None if ``mosaics`` holds raw files instead.
         masks: view -> file of its object mask, for the views that have one.
         read_mask: reads such a file, [H, W].
         sense: direction in which angles increase as displayed, "ccw" or "cw".
+        sense_known: whether the release and the programs that read it agree on the sense.
         mosaics: folder of raw mosaics, or None.
         gamma: exponent of the mosaics' stored values: stored = linear ^ gamma.
         notes: messages for the user.
@@ -51,11 +63,13 @@ class Dataset:
     name: str
     views: list[str]
     paths: list[Path]
-    cameras: Mapping[str, PosedCamera]
+    files: Mapping[str, Path]
+    cameras: Mapping[str, PosedCamera] | None
     read_stokes: Callable[[str], StokesImage] | None
     masks: Mapping[str, Path]
     read_mask: Callable[[Path], NDArray[np.bool_]] = read_mask
     sense: Sense = "ccw"
+    sense_known: bool = True
     mosaics: Path | None = None
     gamma: float = 1.0
     notes: tuple[str, ...] = ()
@@ -77,22 +91,23 @@ def stokes_dataset(
     parts: Sequence[str],
     files: Mapping[str, Sequence[Path]],
     stokes: Callable[[NDArray[np.float32]], NDArray[np.float32]],
-    cameras_file: Path,
-    cameras: Mapping[str, PosedCamera],
+    cameras_file: Path | None,
+    cameras: Mapping[str, PosedCamera] | None,
     masks: Mapping[str, Path],
     *,
     read_mask: Callable[[Path], NDArray[np.bool_]] = read_mask,
     sense: Sense = "ccw",
+    sense_known: bool = True,
     notes: tuple[str, ...] = (),
 ) -> Dataset:
     """A dataset whose Stokes vectors follow from three radiance files a view.
 
     Args:
-        name, cameras, masks, read_mask, sense, notes: as in ``Dataset``.
+        name, cameras, masks, read_mask, sense, sense_known, notes: as in ``Dataset``.
         parts: what the three files of a view are called in messages.
         files: view -> its three files.
         stokes: the Stokes vectors [3, H, W, 3], given the three pictures [3, H, W, 3].
-        cameras_file: the file of the cameras.
+        cameras_file: the file of the cameras, if there is one.
 
     Raises:
         PolarguideError: a file is missing.
@@ -106,8 +121,22 @@ def stokes_dataset(
             require_same_shape(path, plane.shape, planes[0].shape, files[view][0])
         return stokes(np.stack(planes)), np.zeros(planes[0].shape[:2], bool)
 
-    paths = [*(path for paths in files.values() for path in paths), *masks.values(), cameras_file]
-    return Dataset(name, sorted(files), paths, cameras, read_stokes, masks, read_mask, sense, notes=notes)
+    paths = [*(path for of_view in files.values() for path in of_view), *masks.values()]
+    paths += [] if cameras_file is None else [cameras_file]
+    first = {view: of_view[0] for view, of_view in files.items()}
+    return Dataset(
+        name,
+        sorted(files),
+        paths,
+        first,
+        cameras,
+        read_stokes,
+        masks,
+        read_mask,
+        sense,
+        sense_known,
+        notes=notes,
+    )
 
 
 def require_files(files: Mapping[str, Path], kind: str) -> None:
@@ -147,7 +176,7 @@ def cameras_of_views(
             path,
             expected=f"the entry {entry}{number} for view {without[0]}",
             found=f"none; {len(without)} of {len(numbers)} views have no camera ({listed(without)})",
-            remedy="Take the file from the dataset as it was published, or remove the pictures of the view.",
+            remedy="Take the file from the dataset as it was published.",
         )
     return {view: cameras[number] for view, number in numbers.items()}
 
@@ -203,29 +232,52 @@ def resized_mask(dataset: Dataset, view: str, size: tuple[int, int]) -> NDArray[
 
 
 _LARGEST_SKEW = 1e-3
+# Of IDR and the files that it was made after.
+_IDR_ENTRY = re.compile(r"(world|scale|camera)_mat_(inv_)?\d{1,6}")
 _SQUARE = ((3, 4), (4, 4))
 Matrix = NDArray[np.float64]
 
 
-def read_projections(path: Path) -> dict[int, tuple[Matrix, Matrix, Matrix]]:
+@dataclass(frozen=True, eq=False)
+class Projections:
+    """Cameras of IDR.
+
+    Attributes:
+        cameras: number -> K [3, 3] with K[2, 2] = 1, world-to-camera rotation [3, 3] and translation [3].
+        padded: whether numbers below 10 have a leading zero, as names of pictures do.
+    """
+
+    cameras: dict[int, tuple[Matrix, Matrix, Matrix]]
+    padded: bool
+
+
+def read_projections(path: Path) -> Projections:
     """Cameras of a file with ``world_mat_<i>`` and ``scale_mat_<i>`` (IDR): P = world_mat @ scale_mat.
 
-    The world of the result is the normalized one, in which the object lies in the unit sphere.
-
-    Returns:
-        Number -> K [3, 3] with K[2, 2] = 1, world-to-camera rotation [3, 3] and translation [3].
+    The world of the result is the normalized one, in which the object lies in the unit sphere. The inverses that some
+    files hold, too, say nothing else.
 
     Raises:
-        PolarguideError: the file has no camera, or a matrix is not that of a camera.
+        PolarguideError: the file has no camera, a matrix is not that of a camera, two have one number, or they project
+            to other units than pixels.
     """
     arrays = read_arrays(path)
-    found = {}
+    found: dict[int, tuple[Matrix, Matrix, Matrix]] = {}
+    padded = False
     for key in arrays:
         match = re.fullmatch(r"world_mat_(\d{1,6})", key)
         if match is None:
             continue
         number = int(match[1])
-        scale_key = f"scale_mat_{match[1]}"
+        if number in found:
+            raise wrong_camera(
+                path, f"one camera of the number {number}", "two, with and without zeros before it"
+            )
+        padded |= match[1] != str(number)
+        scale_key, inner_key = f"scale_mat_{match[1]}", f"camera_mat_{match[1]}"
+        if inner_key in arrays and not _is_identity(arrays[inner_key]):
+            found_matrix = f"{inner_key}, which scales them to a picture from -1 to 1"
+            raise wrong_camera(path, "world_mat that projects to pixels", found_matrix)
         if scale_key not in arrays:
             raise missing_entry(path, scale_key, arrays)
         world = finite_numbers(f"{path} ({key})", arrays[key], _SQUARE)
@@ -233,7 +285,22 @@ def read_projections(path: Path) -> dict[int, tuple[Matrix, Matrix, Matrix]]:
         found[number] = decompose_projection(f"{path} ({key} @ {scale_key})", (world @ scale)[:3])
     if not found:
         raise missing_entry(path, "world_mat_<i>", arrays)
-    return found
+    require_known_names(path, (key for key in arrays if _IDR_ENTRY.fullmatch(key) is None))
+    return Projections(found, padded)
+
+
+def _is_identity(matrix: NDArray[Any]) -> bool:
+    return (
+        matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and np.allclose(matrix, np.eye(len(matrix)))
+    )
+
+
+def require_known_names(path: Path, strangers: Iterable[str]) -> None:
+    """Warn of fields of a camera file that are not read, by name, if there are any."""
+    names = sorted(strangers)
+    if names:
+        text = f"{path.name} has fields that polarguide does not know and does not use: {listed(names)}."
+        warnings.warn(text, PolarguideWarning, stacklevel=2)
 
 
 def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Matrix, Matrix]:

@@ -25,12 +25,13 @@ from polarguide.capture.datasets.dataset import (
     not_as_published,
     numbered_views,
     pinhole_camera,
-    read_mask,
     read_projections,
     require_files,
+    require_known_names,
     require_same_shape,
     stokes_dataset,
 )
+from polarguide.capture.datasets.idr_readers import STOKES_FOLDERS, open_nersp, open_pandora
 from polarguide.capture.formats.arrays import (
     array_kind,
     array_size,
@@ -42,82 +43,12 @@ from polarguide.capture.formats.arrays import (
 from polarguide.capture.formats.pictures import (
     SUFFIXES,
     decode_picture,
-    decode_stored,
     linear_codes,
     read_picture,
 )
 from polarguide.capture.layout import index_files
 from polarguide.capture.view import FULL_CODE
 from polarguide.core.records import read_record
-
-_PANDORA_PARTS = ("s0", "s0p1", "s0p2")
-_PANDORA_STEM = re.compile(r"(?P<view>\d{1,6})_(?P<part>s0|s0p1|s0p2)")
-
-
-def open_pandora(root: Path) -> Dataset:
-    """Find the files and read the cameras.
-
-    Raises:
-        PolarguideError: one is missing, or the cameras are invalid.
-    """
-    folder, cameras_file = root / "images_stokes", root / "cameras.npz"
-    matches = [_PANDORA_STEM.fullmatch(stem) for stem in index_files(folder, (".hdr",))]
-    views = sorted({match["view"] for match in matches if match is not None})
-    files = {view: [folder / f"{view}_{part}.hdr" for part in _PANDORA_PARTS] for view in views}
-    masks = masks_beside(root)
-    pictures = index_files(root / "images", SUFFIXES)
-    first = 0 if any(int(view) == 0 for view in views) else 1
-    size = first_picture_size(pictures, root / "images") if views else (1, 1)
-    found = {i: pinhole_camera(size, *camera) for i, camera in read_projections(cameras_file).items()}
-    numbers = {view: int(view) - first for view in views}
-    cameras = cameras_of_views(cameras_file, numbers, found, "world_mat_")
-    notes = (f"Files count from {first}, cameras from 0.",)
-    return stokes_dataset(
-        "pandora", _PANDORA_PARTS, files, _stokes, cameras_file, cameras, masks, notes=notes
-    )
-
-
-def _stokes(planes: NDArray[np.float32]) -> NDArray[np.float32]:
-    total, plus1, plus2 = planes
-    return np.asarray(np.stack([total, plus1 - total, plus2 - total]) / np.float32(2), np.float32)
-
-
-_NERSP_PARTS = ("s0", "s1", "s2")
-_NERSP_CAMERAS = ("cameras.npz", "cameras_new.npz", "cameras_sphere.npz")
-_PICTURES = ("image", "images", "I-sum", "I_sum")
-
-
-def open_nersp(root: Path) -> Dataset:
-    """Find the files and read the cameras.
-
-    Raises:
-        PolarguideError: one is missing, or the cameras are invalid.
-    """
-    cameras_file = next(
-        (root / name for name in _NERSP_CAMERAS if (root / name).exists()), root / _NERSP_CAMERAS[0]
-    )
-    numbers = numbered_views({stem for part in _NERSP_PARTS for stem in index_files(root / part, (".npy",))})
-    files = {view: [root / part / f"{view}.npy" for part in _NERSP_PARTS] for view in numbers}
-    folder = next((root / name for name in _PICTURES if (root / name).is_dir()), root / _PICTURES[0])
-    pictures = index_files(folder, SUFFIXES)
-    maps = index_files(root / "input_azimuth_maps", (".png",))
-    size = first_picture_size(pictures, folder) if numbers else (1, 1)
-    found = {i: pinhole_camera(size, *camera) for i, camera in read_projections(cameras_file).items()}
-    cameras = cameras_of_views(cameras_file, numbers, found, "world_mat_")
-    masks, read = (maps, _last_channel) if maps else (masks_beside(root), read_mask)
-    return stokes_dataset(
-        "nersp", _NERSP_PARTS, files, _halved, cameras_file, cameras, masks, read_mask=read, sense="cw"
-    )
-
-
-def _halved(planes: NDArray[np.float32]) -> NDArray[np.float32]:
-    return planes / np.float32(2)
-
-
-def _last_channel(path: Path) -> NDArray[np.bool_]:
-    pixels = decode_stored(path, read_picture(path))
-    return np.asarray((pixels if pixels.ndim == 2 else pixels[..., -1]) > 0)
-
 
 _NEISF_PARTS = ("images_s0", "images_s1", "images_s2")
 _NEISF_STEM = re.compile(r"img_(\d{1,6})")
@@ -137,9 +68,8 @@ def open_neisf(root: Path) -> Dataset:
     cameras_file = root / "poses_bounds.npy"
     cameras = cameras_of_views(cameras_file, numbers, _llff_cameras(cameras_file), "row ")
     masks = masks_beside(root)
-    note = "The sense of NeISF's angles is not stated by its release: taken as counter-clockwise (--sense cw if not)."
     return stokes_dataset(
-        "neisf", _NEISF_PARTS, files, lambda planes: planes, cameras_file, cameras, masks, notes=(note,)
+        "neisf", _NEISF_PARTS, files, lambda planes: planes, cameras_file, cameras, masks, sense_known=False
     )
 
 
@@ -202,6 +132,7 @@ def open_gnerp(root: Path, *, transfer: str) -> Dataset:
         name="gnerp",
         views=sorted(numbers),
         paths=[*used, *masks.values(), cameras_file],
+        files={view: pictures[view] for view in numbers},
         cameras=cameras_of_views(cameras_file, numbers, _gnerp_cameras(cameras_file, size), "w2c_mat_"),
         read_stokes=read_stokes,
         masks=masks,
@@ -225,6 +156,9 @@ def _plane(path: Path, shape: tuple[int, ...], like: Path) -> NDArray[np.float32
     return np.asarray(plane, np.float32)
 
 
+_GNERP_ENTRY = re.compile(r"w2c_mat_\d{1,6}|intrinsic(_\d{1,6})?")
+
+
 def _gnerp_cameras(path: Path, size: tuple[int, int]) -> dict[int, PosedCamera]:
     """Number -> camera, from ``w2c_mat_<i>`` and ``intrinsic``, or ``intrinsic_<i>`` where there is one."""
     content: dict[str, Any] = read_record(path, dict[str, Any])
@@ -242,10 +176,13 @@ def _gnerp_cameras(path: Path, size: tuple[int, int]) -> dict[int, PosedCamera]:
         cameras[int(match[1])] = pinhole_camera(size, checked_intrinsics(where, inner), *pose)
     if not cameras:
         raise missing_entry(path, "w2c_mat_<i>", content)
+    require_known_names(path, (key for key in content if _GNERP_ENTRY.fullmatch(key) is None))
     return cameras
 
 
 PHYGAP_CAMERAS = "camera_params.npz"
+# The angle of view says again what the intrinsics and the size say.
+_PHYGAP_ENTRIES = {"intrinsics", "extrinsics", "image_width", "image_height", "fov"}
 _CHANNELS = tuple(tuple(f"S{part}.{color}" for color in "RGB") for part in range(3))
 
 
@@ -265,6 +202,7 @@ def open_phygap(root: Path) -> Dataset:
     for key in ("intrinsics", "extrinsics", "image_width", "image_height"):
         if key not in arrays:
             raise missing_entry(path, key, arrays)
+    require_known_names(path, arrays.keys() - _PHYGAP_ENTRIES)
     inner = checked_intrinsics(f"{path} (intrinsics)", finite_numbers(path, arrays["intrinsics"], ((3, 3),)))
     poses = arrays["extrinsics"]
     if poses.ndim != 3 or poses.shape[1:] not in ((3, 4), (4, 4)):
@@ -290,6 +228,7 @@ def open_phygap(root: Path) -> Dataset:
         name="phygap",
         views=sorted(numbers),
         paths=[*(files[view] for view in numbers), *masks.values(), path],
+        files={view: files[view] for view in numbers},
         cameras=cameras_of_views(path, numbers, cameras, "extrinsics "),
         read_stokes=read_stokes,
         masks=masks,
@@ -300,6 +239,8 @@ def open_phygap(root: Path) -> Dataset:
 PISR_SENSOR: Final = "IMX250MYR"
 # Size that ``camera_matrix`` was made for.
 _PISR_SIZE = (1224, 1024)
+# Poses of the calibration target and its error, which OpenCV returns with them, are of no picture here.
+_PISR_ENTRIES = {"camera_matrix", "dist_coeffs", "rvecs", "tvecs", "ret", "rms"}
 _PISR_CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 
 
@@ -319,12 +260,13 @@ def open_pisr(root: Path) -> Dataset:
     for key in ("camera_matrix", "dist_coeffs"):
         if key not in intrinsics:
             raise missing_entry(inner_file, key, intrinsics)
+    require_known_names(inner_file, intrinsics.keys() - _PISR_ENTRIES)
     where = f"{inner_file} (camera_matrix)"
     inner = checked_intrinsics(where, finite_numbers(where, intrinsics["camera_matrix"], ((3, 3),)))
     coefficients = intrinsics["dist_coeffs"]
     cameras = {
         number: distorted_camera(f"{inner_file} (dist_coeffs)", _PISR_SIZE, inner, coefficients, pose)
-        for number, (_, *pose) in read_projections(cameras_file).items()
+        for number, (_, *pose) in read_projections(cameras_file).cameras.items()
     }
     masks = masks_beside(root)
     gamma = _gamma(root)
@@ -333,6 +275,7 @@ def open_pisr(root: Path) -> Dataset:
         name="pisr",
         views=sorted(numbers),
         paths=[*files.values(), *masks.values(), inner_file, cameras_file, *_gamma_files(root)],
+        files=files,
         cameras=cameras_of_views(cameras_file, numbers, cameras, "world_mat_"),
         read_stokes=None,
         masks=masks,
@@ -362,20 +305,27 @@ def _gamma(root: Path) -> float:
 
 
 DATASETS: dict[str, tuple[tuple[str, ...], Callable[..., Dataset]]] = {
-    "pandora": (("images_stokes/",), open_pandora),
-    "pisr": (("raw/", "intrinsics.npz"), open_pisr),
     "nersp": (("s0/", "s1/", "s2/"), open_nersp),
+    "pisr": (("raw/", "intrinsics.npz"), open_pisr),
     "neisf": (("images_s0/", "images_s1/", "images_s2/"), open_neisf),
     "gnerp": (("cameras.json", "aop/", "dop/"), open_gnerp),
     "phygap": ((PHYGAP_CAMERAS,), open_phygap),
+    "pandora": ((), open_pandora),
 }
-"""By name: the files and folders that a folder with the layout has, and the function that opens it."""
+"""By name: the files and folders that a folder with the layout has, and the function that opens it. What lies in
+``images_stokes/`` tells PANDORA from RMVP3D.
+"""
 
 
 def detect_dataset(root: Path) -> str | None:
     """The dataset whose layout a folder has, or None."""
+    for folder in (root / name for name in STOKES_FOLDERS if (root / name).is_dir()):
+        archived = any(path.suffix.lower() == ".npz" for path in folder.iterdir())
+        return "nersp" if archived else "pandora"
     for name, (parts, _) in DATASETS.items():
-        if all((root / part).is_dir() if part[-1] == "/" else (root / part).is_file() for part in parts):
+        if parts and all(
+            (root / part).is_dir() if part[-1] == "/" else (root / part).is_file() for part in parts
+        ):
             return name
     return None
 

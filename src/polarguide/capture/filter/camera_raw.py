@@ -74,6 +74,26 @@ def read_camera_raw(
     return pixels, _EXIF_OF_FLIP.get(flip, 1)
 
 
+def stored_frame(path: Path) -> tuple[tuple[int, int], int]:
+    """Width and height of the pixels of a camera raw file as stored, and its EXIF orientation; nothing is developed.
+
+    Raises:
+        PolarguideError: rawpy is missing, or the file cannot be read.
+    """
+    libraw = optional_import("rawpy", str(path))
+    data = read_file(path)
+    try:
+        with libraw.imread(io.BytesIO(data)) as raw:
+            return (int(raw.sizes.width), int(raw.sizes.height)), _EXIF_OF_FLIP.get(int(raw.sizes.flip), 1)
+    except Exception as error:  # LibRaw's errors have a class each; damaged files raise others, too
+        raise PolarguideError(
+            path,
+            expected="a complete camera raw file",
+            found=f"one that cannot be opened ({_words(error)})",
+            remedy="Copy the file again, or develop it to 16-bit linear TIFF.",
+        ) from error
+
+
 def _words(error: Exception) -> str:
     """LibRaw's error message, which may be bytes, as one line."""
     said = error.args[0] if error.args else ""

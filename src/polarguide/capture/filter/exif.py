@@ -22,7 +22,8 @@ from polarguide.core.errors import optional_import
 from polarguide.core.files import read_file
 
 _MIRRORED = (2, 4, 5, 7)
-_QUARTER = (5, 6, 7, 8)
+QUARTER_TURNS = (5, 6, 7, 8)
+"""Orientations that exchange width and height."""
 TURNS = {
     2: "mirrored left to right",
     3: "turned by 180 degrees",
@@ -53,7 +54,9 @@ def apply_orientation(pixels: NDArray[Any], code: int) -> NDArray[Any]:
 
 def orientation_calibration(code: int) -> Calibration:
     """The change of polarizer angles when the stored picture is rotated or mirrored for display."""
-    return Calibration(sense="cw" if code in _MIRRORED else "ccw", zero=90.0 if code in _QUARTER else 0.0)
+    return Calibration(
+        sense="cw" if code in _MIRRORED else "ccw", zero=90.0 if code in QUARTER_TURNS else 0.0
+    )
 
 
 def tags_of(data: bytes) -> dict[int, Any]:

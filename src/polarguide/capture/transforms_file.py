@@ -1,0 +1,295 @@
+"""Cameras of ``transforms.json``: nerfstudio's, instant-ngp's and Blender's.
+
+Fields and their meaning: docs/reference/formats.md has each. A field that changes the meaning of numbers is used or
+refused; one that is not known is warned of by name.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from polarguide.capture.camera_sizes import Size, Sizes, settled_size
+from polarguide.capture.colmap.files import PosedCamera
+from polarguide.capture.colmap.model import view_of_name
+from polarguide.capture.datasets.dataset import checked_pose, require_known_names
+from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
+from polarguide.core.records import decode, read_record
+
+_SQUARE = ((3, 4), (4, 4))
+# The cameras look along -z with y up.
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_FISHEYE = "OPENCV_FISHEYE"
+MOST_FRAMES = 20_000
+# Two statements of one focal length differ by rounding; a file of pictures that were resized later by far more.
+_SAME_FOCAL = 0.01
+
+
+class _Lens(msgspec.Struct):
+    """Fields that describe a lens, for all frames or for one."""
+
+    camera_model: str | None = None
+    fl_x: float | None = None
+    fl_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    w: float | None = None
+    h: float | None = None
+    camera_angle_x: float | None = None
+    camera_angle_y: float | None = None
+    x_fov: float | None = None
+    y_fov: float | None = None
+    is_fisheye: bool | None = None
+    distortion_params: list[float] | None = None
+    k1: float | None = None
+    k2: float | None = None
+    k3: float | None = None
+    k4: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+    k5: float | None = None
+    k6: float | None = None
+    rolling_shutter: list[float] | None = None
+    ftheta_p0: float | None = None
+    latlong: Any = None
+    equirectangular: Any = None
+    fisheye_crop_radius: float | None = None
+
+
+class _Frame(_Lens):
+    file_path: str = ""
+    transform_matrix: list[list[float]] | None = None
+    transform_matrix_start: list[list[float]] | None = None
+    transform_matrix_end: list[list[float]] | None = None
+
+
+class _Transforms(_Lens):
+    frames: Annotated[list[_Frame], Meta(max_length=MOST_FRAMES)] = []
+    camera: Any = None
+    normal_mts_args: Any = None
+
+
+# What these say changes no camera: where a program puts the scene, what it trains on, depth, masks and points.
+_IRRELEVANT = {
+    "aabb", "aabb_scale", "render_aabb", "scale", "offset", "up", "applied_transform", "applied_scale",
+    "orientation_override", "auto_scale_poses_override", "centered", "ply_file_path", "n_frames",
+    "n_extra_learnable_dims", "importance_sampling", "sharpen", "envmap", "white_transparent",
+    "black_transparent", "mask_color", "fix_premult", "enable_ray_loading", "enable_depth_loading",
+    "integer_depth_scale", "depth_unit_scale_factor", "sharpness_discard_threshold", "train_filenames",
+    "val_filenames", "test_filenames", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4", "rotation",
+    "sharpness", "time", "mask_path", "depth_file_path", "depth_path", "normal_file_path", "semantics_path",
+    "segmentation_path", "colmap_im_id", "camera_id", "driver_parameters", "bg_color",
+}  # fmt: skip
+
+
+def read_transforms(path: Path, sizes: Sizes) -> dict[str, PosedCamera]:
+    """Cameras by the names of the frames' files.
+
+    Args:
+        path: the file.
+        sizes: what a view's camera may have been made for, where the file does not say.
+
+    Raises:
+        PolarguideError: the file cannot be read, or a field names a camera that is not read.
+    """
+    content = read_record(path, dict[str, Any], remedy="Export transforms.json again.")
+    record = decode(content, _Transforms, path, remedy="Export transforms.json again.")
+    names = set(content) | {name for frame in content.get("frames", ()) for name in frame}
+    known = {*_Transforms.__struct_fields__, *_Frame.__struct_fields__, *_IRRELEVANT}
+    require_known_names(path, names - known)
+    if record.camera is not None or record.normal_mts_args is not None:
+        name = "camera" if record.camera is not None else "normal_mts_args"
+        raise wrong_camera(path, "cameras that look along -z with y up (OpenGL)", f"{name}, of other axes")
+    found: dict[str, PosedCamera] = {}
+    for number, frame in enumerate(record.frames):
+        where = f"{path} (frame {number}, {frame.file_path})"
+        view = view_of_name(frame.file_path)
+        if view in found:
+            raise wrong_camera(where, f"one frame called {view}", "two")
+        lens = _lens_of(frame, record)
+        found[view] = _camera_of(where, lens, _pose_of(where, frame), functools.partial(sizes, view))
+    return found
+
+
+_FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+
+def _lens_of(frame: _Lens, record: _Lens) -> dict[str, Any]:
+    """The fields of a frame's lens: its own, else those of the file.
+
+    Focal lengths and coefficients are statements as a whole: a frame that makes one takes nothing of the file's.
+    """
+    lens = {name: getattr(frame, name) for name in _Lens.__struct_fields__}
+    whole = (_FOCAL, (*_COEFFICIENTS, "distortion_params"))
+    stated = {name for names in whole if any(lens[n] is not None for n in names) for name in names}
+    return {
+        name: getattr(record, name) if own is None and name not in stated else own
+        for name, own in lens.items()
+    }
+
+
+def _pose_of(where: str, frame: _Frame) -> Any:
+    """The matrix from the camera to the world, [4, 4], with axes right, down, forward."""
+    given = [
+        matrix
+        for matrix in (frame.transform_matrix, frame.transform_matrix_start, frame.transform_matrix_end)
+        if matrix is not None
+    ]
+    numbers = [finite_numbers(where, matrix, _SQUARE)[:3] for matrix in given or [[]]]
+    if any(not np.allclose(numbers[0], other) for other in numbers[1:]):
+        found = "transform_matrix_start and transform_matrix_end that differ"
+        raise wrong_camera(where, "a camera that stands still", found)
+    return np.vstack([numbers[0], [0, 0, 0, 1]]) @ _OPENGL
+
+
+def _camera_of(
+    where: str, lens: Mapping[str, Any], to_world: Any, sizes: Callable[[], Sequence[Size]]
+) -> PosedCamera:
+    """The camera of a frame."""
+    fisheye = _is_fisheye(where, lens)
+    coefficients = _distortion(where, lens, fisheye)
+    center = (lens["cx"], lens["cy"])
+    size = _stated_size(where, lens)
+    if size is None:
+        in_pixels = lens["fl_x"] is not None or lens["fl_y"] is not None
+        size = settled_size(where, sizes(), center, in_pixels=in_pixels)
+    focal = _focal_lengths(where, lens, size, fisheye)
+    middle = [size[k] / 2 if center[k] is None else float(center[k]) for k in range(2)]
+    return camera_to_world(where, size, (*focal, *middle), coefficients, to_world, fisheye=fisheye)
+
+
+def _is_fisheye(where: str, lens: Mapping[str, Any]) -> bool:
+    """Whether the lens is a fisheye of OpenCV.
+
+    Raises:
+        PolarguideError: it is a panorama or another lens that is not read, or fields contradict one another.
+    """
+    model = lens["camera_model"]
+    expected = f"a camera of {', '.join(_PERSPECTIVE)} or {_FISHEYE}"
+    others = ("latlong", "equirectangular", "ftheta_p0", "fisheye_crop_radius", "k5", "k6")
+    named = next((name for name in others if lens[name]), None)
+    if named is not None:
+        raise wrong_camera(where, expected, f"{named} {lens[named]}")
+    if any(lens["rolling_shutter"] or ()):
+        raise wrong_camera(where, "a shutter that opens for all rows at once", "rolling_shutter")
+    if model is not None and model not in (*_PERSPECTIVE, _FISHEYE):
+        raise wrong_camera(where, expected, model)
+    if lens["is_fisheye"] is not None and model is not None and lens["is_fisheye"] != (model == _FISHEYE):
+        found = f"{model} with is_fisheye {str(lens['is_fisheye']).lower()}"
+        raise wrong_camera(where, "camera_model and is_fisheye that agree", found)
+    return bool(lens["is_fisheye"]) or model == _FISHEYE
+
+
+def _distortion(where: str, lens: Mapping[str, Any], fisheye: bool) -> list[float]:
+    """k1, k2, p1, p2 and k3 of a perspective camera, k1 to k4 of a fisheye.
+
+    Raises:
+        PolarguideError: there are others, or two statements differ.
+    """
+    given = [lens[name] for name in _COEFFICIENTS]
+    value = [float(number or 0.0) for number in given]
+    listed = lens["distortion_params"]
+    if listed is not None:
+        if len(listed) != len(_COEFFICIENTS):
+            raise wrong_camera(
+                where, "six distortion_params: k1, k2, k3, k4, p1, p2", f"{len(listed)} numbers"
+            )
+        if any(own is not None and own != other for own, other in zip(given, listed, strict=True)):
+            found = f"{listed} beside {dict(zip(_COEFFICIENTS, given, strict=True))}"
+            raise wrong_camera(where, "distortion_params that agree with k1 to p2", found)
+        value = [float(number) for number in listed]
+    k1, k2, k3, k4, p1, p2 = value
+    if fisheye:
+        if p1 or p2:
+            raise wrong_camera(where, "a fisheye with k1 to k4 alone", f"p1 = {p1:g}, p2 = {p2:g}")
+        return [k1, k2, k3, k4]
+    if k4:
+        raise wrong_camera(
+            where, "a perspective camera with at most three radial coefficients", f"k4 = {k4:g}"
+        )
+    return [k1, k2, p1, p2, k3]
+
+
+def _stated_size(where: str, lens: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Width and height that the file states; None where it has neither.
+
+    Raises:
+        PolarguideError: it has one of them, or a size that no picture has.
+    """
+    width, height = lens["w"], lens["h"]
+    if width is None and height is None:
+        return None
+    if not width or not height or not 0 < width < 1e5 or not 0 < height < 1e5:
+        raise wrong_camera(where, "width and height, w and h", f"{width} and {height}")
+    return round(width), round(height)
+
+
+def _focal_lengths(
+    where: str, lens: Mapping[str, Any], size: tuple[int, int], fisheye: bool
+) -> tuple[float, float]:
+    """Focal lengths in x and y: in pixels, by an angle of view in radians, or in degrees.
+
+    Raises:
+        PolarguideError: there is none that is positive, or two statements differ.
+    """
+    found: list[float | None] = []
+    for axis, side in zip("xy", size, strict=True):
+        length, angle, degrees = lens[f"fl_{axis}"], lens[f"camera_angle_{axis}"], lens[f"{axis}_fov"]
+        angles = [*([angle] if angle else []), *([math.radians(degrees)] if degrees else [])]
+        by_angle = [side / 2 / math.tan(view / 2) for view in angles if 0 < view < math.pi]
+        if len(by_angle) < len(angles) or (length is not None and not length > 0):
+            raise wrong_camera(
+                where, f"a positive focal length fl_{axis}, or an angle below 180 degrees", str(length)
+            )
+        stated = [*([float(length)] if length is not None else []), *([] if fisheye else by_angle)]
+        if stated and max(stated) > (1 + _SAME_FOCAL) * min(stated):
+            others = " and ".join(f"{one:.6g}" for one in stated)
+            expected = f"fl_{axis} that agrees with camera_angle_{axis} and the width or height of {side}"
+            raise wrong_camera(where, expected, f"focal lengths of {others} pixels")
+        found.append(stated[0] if stated else None)
+    x, y = found
+    if x is None and y is None:
+        raise wrong_camera(where, "a focal length, fl_x or camera_angle_x", "none")
+    return float(x or y or 0.0), float(y or x or 0.0)
+
+
+def camera_to_world(
+    where: str,
+    size: tuple[int, int],
+    inner: tuple[float, ...],
+    coefficients: list[float],
+    to_world: Any,
+    *,
+    fisheye: bool = False,
+) -> PosedCamera:
+    """A camera from its pose in the world.
+
+    Args:
+        where: for messages. size: width and height.
+        inner: focal lengths and principal point; pixel centers at 0.5.
+        coefficients: OpenCV's k1, k2, p1, p2, k3, or k1 to k4 of a fisheye.
+        to_world: [4, 4], with axes right, down, forward; a scale is taken out.
+
+    Raises:
+        PolarguideError: the pose is none.
+    """
+    scale = abs(np.linalg.det(to_world[:3, :3])) ** (1 / 3)
+    if not 1e-6 < scale < 1e6:
+        raise wrong_camera(where, "a rotation and a translation", "a singular matrix")
+    axes, center = checked_pose(where, np.column_stack([to_world[:3, :3] / scale, to_world[:3, 3]]))
+    rotation = axes.T
+    pose = (rotation, -rotation @ center)
+    if fisheye:
+        return PosedCamera(*size, "OPENCV_FISHEYE", (*inner, *coefficients), *pose)
+    if not any(coefficients):
+        return PosedCamera(*size, "PINHOLE", tuple(inner), *pose)
+    return PosedCamera(*size, "FULL_OPENCV", (*inner, *coefficients, 0.0, 0.0, 0.0), *pose)
