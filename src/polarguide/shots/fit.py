@@ -110,7 +110,7 @@ class SetModel:
             for (i, j), values in zip(_PAIRS, sums, strict=True):
                 matrices[:, i, j] = matrices[:, j, i] = values
             spectrum = np.linalg.eigvalsh(matrices)
-            found[some] = spectrum[:, 0] >= WELL_CONDITIONED**2 * spectrum[:, -1]
+            found[some] = spectrum[:, 0] > WELL_CONDITIONED**2 * spectrum[:, -1]
         return found
 
     def _solve(self, weights: Array, values: Array) -> tuple[Array, Array]:

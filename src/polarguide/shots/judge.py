@@ -111,9 +111,9 @@ def _off(samples: SetSamples, k: int, found: _Angle) -> float:
 
 
 def _worst(samples: SetSamples, found: dict[int, _Angle]) -> tuple[int, int]:
-    """The picture whose angle is off most, and the one that the others leave most of."""
+    """The picture without which least is left of the rest, and the one whose angle is off most."""
     by_angle = max(found, key=lambda k: _off(samples, k, found[k]))
-    return by_angle, max(found, key=lambda k: found[k].residual)
+    return max(found, key=lambda k: found[k].residual), by_angle
 
 
 def _contradicts(

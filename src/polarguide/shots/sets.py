@@ -140,13 +140,14 @@ def _order(picture: SetPicture) -> tuple[bool, float, str, int]:
     return word, angle, picture.path.name, picture.frame or 0
 
 
-def angles_of_names(names: Sequence[str]) -> list[tuple[str, Angle] | None]:
+def angles_of_names(names: Sequence[str], *, folders: bool = False) -> list[tuple[str, Angle] | None]:
     """View ("" where the name is an angle alone) and angle that each name states; None where it states none.
 
     A number counts as an angle where ``prepare`` takes it for one, and where all numbers of a view are evenly spaced
-    over half a turn or a whole one: 10, 40, ..., 160, or 0 to 175 by 5.
+    over half a turn or a whole one: 10, 40, ..., 160, or 0 to 175 by 5. ``folders``: names such as I_10 are angles
+    alone, and no view I.
     """
-    found = [_stated(name) for name in names]
+    found = [_stated(name, folders) for name in names]
     numbered: dict[str, list[tuple[int, float]]] = {}
     for place, name in enumerate(names):
         match = _NUMBERED.fullmatch(name)
@@ -155,13 +156,14 @@ def angles_of_names(names: Sequence[str]) -> list[tuple[str, Angle] | None]:
     for view, places in numbered.items():
         if covers_turn([number for _, number in places]):
             for place, number in places:
-                found[place] = view, number
+                if not folders or found[place] is None:
+                    found[place] = view, number
     return found
 
 
-def _stated(name: str) -> tuple[str, Angle] | None:
+def _stated(name: str, folder: bool) -> tuple[str, Angle] | None:
     """View and angle by ``prepare``'s rule for the names of pictures, or of folders."""
-    found = split_name(name)
+    found = None if folder else split_name(name)
     if found is None and (alone := split_name(f"x_{name}")) is not None and alone[0] == "x":
         return "", alone[1]
     return found
@@ -205,7 +207,7 @@ def by_name(files: Sequence[Path]) -> tuple[list[PictureSet], list[Path]]:
 def by_folder(root: Path) -> list[PictureSet]:
     """Sets by folders named like angles, a file of each view in each; nothing where these are four at most."""
     folders = [path for path in sorted(root.iterdir()) if path.is_dir() and not path.name.startswith(".")]
-    stated = angles_of_names([path.name for path in folders])
+    stated = angles_of_names([path.name for path in folders], folders=True)
     views: dict[str, list[SetPicture]] = {}
     for folder, name in zip(folders, stated, strict=True):
         if name is not None and name[0] == "":
