@@ -78,7 +78,7 @@ def judge(samples: SetSamples, gray: Floats) -> Judgment:
     used = np.ones(count, bool)
     reasons: dict[int, str] = {}
     while gray.shape[1] >= _FEWEST:
-        found = {int(k): _predicted(rows, gray, used, k) for k in np.flatnonzero(used)}
+        found = {k: _predicted(rows, gray, used, k) for k in np.flatnonzero(used).tolist()}
         worst = next((k for k in _worst(samples, found) if _contradicts(samples, gray, used, k, found)), None)
         if worst is None:
             break
@@ -124,7 +124,7 @@ def _contradicts(
     rest[worst] = False
     if rest.sum() < 4 or not _determined(rows[rest]):
         return False
-    others = {int(k): _predicted(rows, gray, rest, k) for k in np.flatnonzero(rest)}
+    others = {k: _predicted(rows, gray, rest, k) for k in np.flatnonzero(rest).tolist()}
     typical = float(np.median([_off(samples, k, other) for k, other in others.items()]))
     left = float(np.median([other.residual for other in others.values()]))
     by_angle = _off(samples, worst, found[worst]) > max(MARKS, AGAINST * typical)

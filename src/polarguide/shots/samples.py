@@ -186,8 +186,8 @@ def _video(path: Path, frames: Sequence[int | None]) -> Iterator[Shots]:
     read = {frame: picture for frame, picture in zip(rising, read_frames(path, rising), strict=True)}
     for frame in wanted:
         picture = read[frame]
-        clipped = (picture >= _COMPRESSED_FULL).any(axis=2)
-        yield Shots(picture[None], 1, clipped[None], ~picture.any(axis=2))
+        clipped, lit = (np.asarray(mask.any(axis=2)) for mask in (picture >= _COMPRESSED_FULL, picture > 0))
+        yield Shots(picture[None], 1, clipped[None], ~lit)
 
 
 def _transfer(paths: Sequence[Path], asked: str) -> tuple[str, str]:
