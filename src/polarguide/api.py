@@ -40,9 +40,9 @@ from polarguide.results.rendering.priors import write_priors
 from polarguide.runs import train as training
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.shots.calibration.calibrate import calibrate_sensor
-from polarguide.shots.develop import require_four_pictures
 from polarguide.shots.measurement.line import measure_shots
 from polarguide.shots.options import ShotOptions
+from polarguide.shots.sets import known_places
 from polarguide.shots.write import FORMATS, WrittenShots, check_formats, write_shots, write_view_maps
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
@@ -175,7 +175,7 @@ def priors(
     if formats:
         check_formats(formats)
         for view in chosen:
-            require_four_pictures(view)
+            known_places(view.name, view.exposures)
     sheet = write_priors(
         loaded, out, run=run, views=views, refractive_index=index, threshold=threshold, reporter=reporter
     )

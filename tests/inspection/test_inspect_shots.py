@@ -15,7 +15,10 @@ from polarguide.core.errors import PolarguideError
 from polarguide.inspection.settings import InspectSettings
 from polarguide.inspection.shots import ShotFindings, shot_checks
 from polarguide.inspection.verdict import Check
+from polarguide.preparation.prepare import prepare_scene
+from polarguide.preparation.settings import PrepareSettings
 from polarguide.training.angles.polarizers import Judgment
+from tests.helpers.picture_sets import photographed, sphere, write_set
 
 TURNS = (0.0, 45.0, 90.0, 135.0)
 
@@ -58,6 +61,17 @@ def test_what_the_scene_explains_poorly_contradicts_nothing() -> None:
         check = checks(dataclasses.replace(found, judgments=judgments))["angles"]
         assert check.verdict == verdict
         assert ("v5" in check.finding) == (verdict == "warning")
+
+
+@pytest.mark.parametrize("wrong", [0, 12])
+def test_pictures_of_a_view_that_contradict_one_another(tmp_path: Path, wrong: int) -> None:
+    angles = (10, 40, 70, 100, 130, 160)
+    pictures = photographed(sphere(), [*angles[:3], 100 + wrong, *angles[4:]])
+    write_set(tmp_path / "in", [f"cup_a{angle}.png" for angle in angles], pictures)
+    prepare_scene(tmp_path / "in", tmp_path / "scene", PrepareSettings(poses="none", transfer="linear"))
+    found = polarguide.inspect(tmp_path / "scene", tmp_path / "out", device="cpu").check("agreement")
+    assert (found.verdict, found.views) == (("wrong", ("cup",)) if wrong else ("ok", ()))
+    assert ("(100 degrees) looks like 112 degrees" in found.finding) == bool(wrong)
 
 
 def test_the_other_sense() -> None:

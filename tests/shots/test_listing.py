@@ -71,11 +71,11 @@ def test_three_of_four_files_called_like_the_angles(parts: Path) -> None:
 
 
 def test_files_that_tell_no_angle(parts: Path) -> None:
-    for name in ("overview.png", "jar_60.png"):
+    for name in ("overview.png", "jar_61.png"):
         shutil.copy(parts / "cup_0.png", parts / name)
     good, bad = good_and_bad(find_shots([parts]))
     assert good == ["cup", "jar"]
-    assert bad.keys() == {"overview.png", "jar_60.png"}
+    assert bad.keys() == {"overview.png", "jar_61.png"}
     assert f"{parts / 'overview.png'}: expected raw mosaics with --sensor" in bad["overview.png"]
 
 

@@ -108,25 +108,6 @@ def find_layout(root: Path) -> Layout:
     return Layout(root, pictures, *given, tuple(warnings), others, table, sides["materials"])
 
 
-def require_four(layout: Layout, what: str) -> None:
-    """Refuse captures with views that do not have one picture each at 0, 45, 90 and 135 degrees.
-
-    Args:
-        what: what needs them, for the message.
-
-    Raises:
-        PolarguideError: there is such a view.
-    """
-    if layout.others:
-        raise PolarguideError(
-            layout.table or layout.root,
-            expected=f"views with pictures at 0, 45, 90 and 135 degrees, which {what} needs",
-            found=f"other pictures in {len(layout.others)} of {len(layout.names)} views "
-            f"({listed(sorted(layout.others))})",
-            remedy="Train on the scene: polarguide train takes any angles and checks them on the way.",
-        )
-
-
 def refuse_scene(out: Path) -> None:
     """Refuse to write into a scene, or into a folder that it is read from: what lies there means something.
 

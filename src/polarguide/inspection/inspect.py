@@ -35,7 +35,13 @@ from polarguide.inspection.picture_checks import dielectric_check, find_pairing,
 from polarguide.inspection.pose_checks import coverage_check, pose_check
 from polarguide.inspection.settings import InspectSettings
 from polarguide.inspection.short_run import LONGEST, short_run, surface_of
-from polarguide.inspection.shots import ShotFindings, find_shots, pictures_check, shot_checks
+from polarguide.inspection.shots import (
+    ShotFindings,
+    agreement_checks,
+    find_shots,
+    pictures_check,
+    shot_checks,
+)
 from polarguide.inspection.verdict import Check, Verdict, worst
 from polarguide.raster import Backend
 
@@ -143,7 +149,7 @@ def _shots(
     reporter: Reporter,
 ) -> tuple[list[Check], ShotFindings]:
     """The checks of a capture with other pictures than four angles a view, and what these tell of their polarizers."""
-    checks = [pictures_check(capture), *light_checks(capture, measurements)]
+    checks = [pictures_check(capture), *agreement_checks(capture), *light_checks(capture, measurements)]
     with reporter.track("matching features", 1):
         checks += [pose_check(capture), coverage_check(capture)]
     if len(capture.posed) < FEWEST_TO_TRAIN:

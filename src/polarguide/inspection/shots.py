@@ -15,13 +15,15 @@ from typing import Any
 import numpy as np
 
 from polarguide.capture import Scene
-from polarguide.capture.exposures import Exposure
-from polarguide.capture.view import View, listed
+from polarguide.capture.exposures import Exposure, determine_stokes
+from polarguide.capture.view import FULL_CODE, View, listed
 from polarguide.inspection.capture import Capture
 from polarguide.inspection.short_run import short_run
 from polarguide.inspection.verdict import Check, Verdict
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
+from polarguide.shots.judge import chosen_pixels, judge
+from polarguide.shots.samples import SetSamples
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers
 from polarguide.training.recipe import Recipe
 from polarguide.training.trainer import StepReport
@@ -44,6 +46,8 @@ SENSE_NEEDS = 0.95
 """Said angles whose doubled directions have a mean longer than this are too much alike to tell a sense."""
 ZERO_OFF, ZERO_WRONG = 4.0, 8.0
 """Degrees of a common offset, beyond four standard errors: for a warning, and for the verdict "wrong"."""
+REDUNDANT = 4
+"""Known angles of one view from which on they can contradict one another."""
 FEW_ANGLES = 3
 """Different angles from which on S1 and S2 can be told apart, over the capture."""
 
@@ -168,6 +172,45 @@ def pictures_check(capture: Capture) -> Check:
             "the polarization stays unseen.", figures=figures,
         )  # fmt: skip
     return Check(key, title, "ok", said, figures=figures)
+
+
+def agreement_checks(capture: Capture) -> list[Check]:
+    """Whether the pictures of a view agree with one another; nothing where no view has more than three known angles."""
+    key, title, compared, notes = "agreement", "Agreement of the angles", 0, []
+    wrong: list[str] = []
+    for view in capture.views:
+        places = [k for k, exposure in enumerate(view.exposures) if exposure.angle is not None]
+        exposures = tuple(view.exposures[k] for k in places)
+        if len(places) < REDUNDANT or not determine_stokes(exposures):
+            continue
+        files = capture.layout.files(view.name)
+        samples = SetSamples(
+            labels=tuple(files[k].name for k in places),
+            values=view.codes[places].numpy(),
+            exposures=exposures,
+            lost=np.broadcast_to(view.saturated.numpy(), (len(places), *view.saturated.shape)),
+            dark=view.black.numpy(),
+            masked=view.invalid.numpy(),
+            step=1 / FULL_CODE,
+        )
+        compared += 1
+        judged = judge(samples, samples.gray(chosen_pixels(samples)).astype(np.float64))
+        if judged.notes:
+            wrong.append(view.name)
+            notes += [f"{view.name}: {note.removesuffix(' It is left out.')}" for note in judged.notes]
+    if not compared:
+        return []
+    figures = {"views": compared, "contradicting": len(wrong)}
+    if not notes:
+        return [Check(key, title, "ok", f"The pictures of {compared} views agree.", figures=figures)]
+    return [
+        Check(
+            key, title, "wrong",
+            f"In {len(wrong)} of {compared} views, pictures contradict one another. {listed(notes)}",
+            "Correct their lines of angles.csv, or write unknown; repeat prepare without pictures that moved.",
+            tuple(wrong), figures,
+        )
+    ]  # fmt: skip
 
 
 def shot_checks(found: ShotFindings) -> list[Check]:

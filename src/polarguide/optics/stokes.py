@@ -241,20 +241,56 @@ def polarization_uncertainty(stokes: Tensor, variances: Tensor) -> Uncertainty:
     """
     check_leading(stokes, 3, "stokes")
     check_leading(variances, 4, "variances")
-    s0, s1, s2 = stokes.unbind(0)
     v0, v45, v90, v135 = variances.unbind(0)
+    c, s, d = _direction(stokes)
+    half = d / 2
+    along = (c - half) ** 2 * v0 + (s - half) ** 2 * v45 + (c + half) ** 2 * v90 + (s + half) ** 2 * v135
+    across = s * s * (v0 + v90) + c * c * (v45 + v135)
+    return _uncertainty(stokes, d, along, across)
+
+
+@for_arrays
+def fitted_uncertainty(stokes: Tensor, covariance: Tensor) -> Uncertainty:
+    """``polarization_uncertainty`` of fitted Stokes vectors, by their covariance.
+
+    Args:
+        stokes: [3, ...].
+        covariance: [6, ...], of (S0, S0), (S0, S1), (S0, S2), (S1, S1), (S1, S2) and (S2, S2), squared units of
+            ``stokes``.
+
+    Raises:
+        ValueError: the first axis of ``stokes`` is not 3 or that of ``covariance`` not 6.
+    """
+    check_leading(stokes, 3, "stokes")
+    check_leading(covariance, 6, "covariance")
+    v00, v01, v02, v11, v12, v22 = covariance.unbind(0)
+    c, s, d = _direction(stokes)
+    along = c * c * v11 + 2 * c * s * v12 + s * s * v22 - 2 * d * (c * v01 + s * v02) + d * d * v00
+    across = s * s * v11 - 2 * s * c * v12 + c * c * v22
+    return _uncertainty(stokes, d, along.clamp(min=0), across.clamp(min=0))
+
+
+def _direction(stokes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Cosine and sine of twice the AoLP, of the first direction without polarization; and the DoLP, 0 without light."""
+    s0, s1, s2 = stokes.unbind(0)
+    tiny = torch.finfo(s0.dtype).tiny
+    square = s1 * s1 + s2 * s2
+    polarized = square > tiny
+    inverse = torch.where(polarized, square, 1.0).rsqrt()
+    scale = 1 / torch.where(s0 > tiny, s0, 1.0)
+    d = (torch.where(polarized, square * inverse, 0.0) * scale).clamp(max=1)
+    return torch.where(polarized, s1 * inverse, 1.0), s2 * inverse, d
+
+
+def _uncertainty(stokes: Tensor, d: Tensor, along: Tensor, across: Tensor) -> Uncertainty:
+    """From the DoLP, and variances along and across the direction of polarization (along: of S0 times the DoLP)."""
+    s0, s1, s2 = stokes.unbind(0)
     tiny = torch.finfo(s0.dtype).tiny
     lit = s0 > tiny
     square = s1 * s1 + s2 * s2
     polarized = square > tiny
     inverse = torch.where(polarized, square, 1.0).rsqrt()
-    # Without polarization any direction will do: the first.
-    c, s = torch.where(polarized, s1 * inverse, 1.0), s2 * inverse
     scale = 1 / torch.where(lit, s0, 1.0)
-    d = (torch.where(polarized, square * inverse, 0.0) * scale).clamp(max=1)
-    half = d / 2
-    along = (c - half) ** 2 * v0 + (s - half) ** 2 * v45 + (c + half) ** 2 * v90 + (s + half) ** 2 * v135
-    across = s * s * (v0 + v90) + c * c * (v45 + v135)
     b2 = across * scale * scale
     ratio = (d * d / b2.clamp(min=tiny)).clamp(max=88.0)
     removed = b2 * -torch.expm1(-ratio) / (2 * d.clamp(min=1e-12))

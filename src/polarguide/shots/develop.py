@@ -28,13 +28,15 @@ from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_c
 from polarguide.capture.sensor.demosaic import demosaic
 from polarguide.capture.sensor.pattern import SENSOR_SIZE, SIDE, estimate_levels, tiled, unusable_samples
 from polarguide.capture.view import ANGLES, FULL_CODE, View
-from polarguide.capture.view_reader import read_view
+from polarguide.capture.view_reader import ViewData, read_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_file
 from polarguide.preparation.mosaic_source import MosaicFiles, block_intensities, sample_blocks
 from polarguide.shots.exposures import ExposureSet
 from polarguide.shots.maps import Map, NoiseModel, estimated_noise, given_noise, interpolation_factors
 from polarguide.shots.options import ShotOptions
+from polarguide.shots.samples import SetSamples, read_set, samples_of_loaded, samples_of_view
+from polarguide.shots.sets import known_places
 
 Mask = NDArray[np.bool_]
 _LARGE_IMBALANCE = 0.01
@@ -86,6 +88,23 @@ def develop(shot: ExposureSet, options: ShotOptions) -> Developed:
                 where, expected=error.expected, found=error.found, remedy=error.remedy
             ) from error
     return _filter(shot, options) if shot.kind == "filter" else _scene_view(shot, options)
+
+
+def set_samples(shot: ExposureSet, options: ShotOptions) -> SetSamples | None:
+    """The samples of a set, or of a view of a scene at other angles; None of a shot that ``develop`` takes.
+
+    Raises:
+        PolarguideError: a file is missing, cannot be read, or does not fit the others or the options.
+    """
+    if shot.fault is not None:
+        raise shot.fault
+    options.require_kind(shot.kind, shot.name)
+    if shot.kind == "set":
+        return read_set(shot.name, shot.pictures, options)
+    if shot.kind != "scene" or shot.files:
+        return None
+    data, scale = _read_view(shot, options)
+    return samples_of_view(data, scale, options)
 
 
 def check_files(options: ShotOptions) -> None:
@@ -280,59 +299,61 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
 
 
 def _scene_view(shot: ExposureSet, options: ShotOptions) -> Developed:
-    assert shot.root is not None
-    layout = find_layout(shot.root)
-    select_views(layout, [shot.view])
-    require_memory_of_each(
-        shot.paths,
-        KEPT + READ + _MAPS,
-        "a view",
-        remedy="Free memory, or prepare the scene in a smaller size.",
-    )
-    transfer = "srgb" if options.transfer == "srgb" else "linear"
-    data = read_view(layout, shot.view, factor=1, transfer=transfer)
+    data, scale = _read_view(shot, options)
     largest = int(np.iinfo(data.peak.dtype).max)
-    scale = checks.full_scale(data.histogram, largest)
     intensities = oriented(data.codes.astype(np.float32) / np.float32(FULL_CODE), options.calibration)
     saturated = np.zeros(data.black.shape, bool) if scale is None else np.asarray(data.peak >= scale)
     masks = data.black, saturated, data.invalid, data.mask
     return _undistorted(intensities, masks, 1 / largest, options)
 
 
-def develop_view(view: View, options: ShotOptions) -> Developed:
-    """The intensities of a view of a scene, as its ``codes``, masks and exposures are.
+def _read_view(shot: ExposureSet, options: ShotOptions) -> tuple[ViewData, int | None]:
+    """A view of a scene, and the stored value at which it saturates; None where it does not."""
+    assert shot.root is not None
+    layout = find_layout(shot.root)
+    select_views(layout, [shot.view])
+    require_memory_of_each(
+        shot.paths,
+        max(1, len(shot.paths) // 4) * (KEPT + READ) + _MAPS,
+        "a view",
+        remedy="Free memory, or prepare the scene in a smaller size.",
+    )
+    transfer = "srgb" if options.transfer == "srgb" else "linear"
+    data = read_view(layout, shot.view, factor=1, transfer=transfer)
+    return data, checks.full_scale(data.histogram, int(np.iinfo(data.peak.dtype).max))
 
-    Raises:
-        PolarguideError: its pictures are not four, at 0, 45, 90 and 135 degrees.
-    """
-    require_four_pictures(view)
-    intensities, codes = view.intensities(), view.codes.numpy()
+
+def develop_view(view: View, options: ShotOptions) -> Developed:
+    """The intensities of a view of a scene at 0, 45, 90 and 135 degrees, as its ``codes`` and masks are."""
+    intensities = view.intensities()
     if view.mount == "filter":  # what a sensor with analyzers behind the lens would have measured
         rays, stokes = view.camera.rays(), view.stokes()
         turned = analyzers(FOUR, rays, "sensor")[..., None, None] - analyzers(FOUR, rays, "filter")
         intensities = intensities + torch.einsum("ksyx,syxc->kyxc", turned, stokes[1:]) / 2
+    dark, lost, step = _state_of(view)
+    masks = dark, lost, view.invalid.numpy(), None if view.mask is None else view.mask.numpy()
+    return _undistorted(intensities.numpy(), masks, step, options)
+
+
+def samples_of(view: View) -> SetSamples:
+    """The samples of a view of a scene at other angles.
+
+    Raises:
+        PolarguideError: its pictures do not determine Stokes vectors.
+    """
+    known_places(view.name, view.exposures)
+    return samples_of_loaded(view, *_state_of(view))
+
+
+def _state_of(view: View) -> tuple[Mask, Mask, float]:
+    """Dark and saturated pixels of a view, and one stored value as a share of full scale."""
+    codes = view.codes.numpy()
     peak, lost = codes.max(axis=(0, 3)), view.saturated.numpy()
     # Of pixels without polarization information, those nearer to black than to the brightest of the view are dark.
     dark = (lost & (peak < peak.max() / 2)) | (peak == 0)
-    masks = dark, lost & ~dark, view.invalid.numpy(), None if view.mask is None else view.mask.numpy()
     # Codes are multiples of what one stored value is, unless they were decoded or averaged.
     step = int(np.gcd.reduce(np.flatnonzero(np.bincount(codes.ravel()))))
-    return _undistorted(intensities.numpy(), masks, max(step, 1) / FULL_CODE, options)
-
-
-def require_four_pictures(view: View) -> None:
-    """Refuse a view whose pictures are not those that maps are made of.
-
-    Raises:
-        PolarguideError: they are not four, at 0, 45, 90 and 135 degrees.
-    """
-    if view.exposures != FOUR:
-        raise PolarguideError(
-            f"view {view.name}",
-            expected="pictures at 0, 45, 90 and 135 degrees, of which maps are made",
-            found=", ".join(exposure.words for exposure in view.exposures),
-            remedy="Choose other views, or leave out the formats of maps.",
-        )
+    return dark, lost & ~dark, max(step, 1) / FULL_CODE
 
 
 def _undistorted(

@@ -1,4 +1,4 @@
-"""Find the exposure sets behind paths: mosaics, four shots through a filter, views of a scene."""
+"""Find the exposure sets behind paths: mosaics, shots through a filter at four or any angles, views of a scene."""
 
 from __future__ import annotations
 
@@ -8,24 +8,29 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from polarguide.capture.exposures import TABLE
 from polarguide.capture.filter import shots as filter_shots
 from polarguide.capture.layout import (
+    Layout,
     angle_folders,
     angle_of_folder,
     describe_contents,
     find_layout,
     list_files,
-    require_four,
 )
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
 from polarguide.core.errors import PolarguideError
+from polarguide.shots import sets
 from polarguide.shots.options import Kind, ShotOptions
+from polarguide.shots.sets import known_places
+from polarguide.shots.video import VIDEO_SUFFIXES
 
 _EXPECTED = "raw mosaics with --sensor, or shots with angles in their names"
 _REMEDY = (
-    "Raw mosaics need --sensor (IMX250MYR is color, IMX250MZR monochrome); four shots need their angles in the names, "
-    "<shot>_0, _45, _90 and _135, or folders 0, 45, 90 and 135."
+    "Raw mosaics need --sensor (IMX250MYR is color, IMX250MZR monochrome); shots need their angles in the names "
+    "(<shot>_0, _45, _90 and _135; at others <shot>_a10, _a40, ...), folders 0, 45, 90 and 135, or angles.csv with the "
+    "columns file,angle."
 )
 
 
@@ -35,12 +40,16 @@ class ExposureSet:
 
     Attributes:
         name: unique among the sets that were found together; usable in a file name.
-        kind: mosaic (one file), filter (one file an angle) or scene (a view of a scene folder).
-        files: by angle; a mosaic's under 0. Angles may be missing: ``read_shot`` says so.
+        kind: mosaic (one file), filter (one file at 0, 45, 90 and 135 degrees each), set (pictures at any angles) or
+            scene (a view of a scene folder).
+        files: by angle; a mosaic's under 0, none of a set. Angles may be missing: ``read_shot`` says so.
         root: folder of the scene; else None.
         view: its name in the scene.
         fault: why it is no shot: ``read_shot`` raises it, and the shots beside it are not concerned.
-        others: where there is a fault, files that ``files`` has no place for; or the folder that it is in.
+        others: where there is a fault, files that ``files`` has no place for; or the folder that it is in. Of a view of
+            a scene, its pictures where they are not the usual four.
+        pictures: of a set, by angle.
+        table: that states their angles; None where names do.
     """
 
     name: str
@@ -50,11 +59,26 @@ class ExposureSet:
     view: str = ""
     fault: PolarguideError | None = None
     others: tuple[Path, ...] = ()
+    pictures: tuple[sets.SetPicture, ...] = ()
+    table: Path | None = None
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The files, by angle; at least one."""
-        return (*(path for _, path in sorted(self.files.items())), *self.others)
+        """The files, by angle, and the table of a set; at least one."""
+        of_set = dict.fromkeys(picture.path for picture in self.pictures)
+        more = [] if self.table is None else [self.table]
+        return (*(path for _, path in sorted(self.files.items())), *of_set, *more, *self.others)
+
+    @property
+    def whole(self) -> bool:
+        """Whether no more pictures of a set are expected: a table lists them, or they cover half a turn evenly."""
+        angles = [picture.angle for picture in self.pictures if not isinstance(picture.angle, str)]
+        return self.table is not None or sets.covers_turn([angle % 180 for angle in angles])
+
+    @property
+    def nothing(self) -> bool:
+        """Whether there is no shot, but only a fault."""
+        return self.fault is not None and not (self.files or self.pictures)
 
 
 def find_shots(
@@ -63,7 +87,9 @@ def find_shots(
     """The exposure sets behind files and folders, in the order of the paths, sorted within a folder.
 
     A file is a mosaic if the options name a sensor; else its name tells shot and angle (``cup_0.png``, ``cup_45.png``;
-    ``I0.png`` ... in one folder; ``0/cup.png`` ...). A folder is a scene (``polar/``, or four folders of angles with a
+    ``I0.png`` ... in one folder; ``0/cup.png`` ...). Pictures of a shot at three or more other angles are a set:
+    ``cup_a10.png``, ``cup_a40.png``, ... or as ``angles.csv`` beside them says, as ``prepare`` reads it; so is a video
+    with a table ``frame,angle`` of its name. A folder is a scene (``polar/``, or four folders of angles with a
     ``sparse``), or holds mosaics or shots; one without any is looked for in its folders, one level down.
 
     What is ambiguous or tells no angle does not hide the shots beside it: it is a set with a ``fault``.
@@ -78,7 +104,7 @@ def find_shots(
             "paths", expected="at least one file or folder of shots", found="none", remedy="Name some."
         )
     found = list_shots(paths, options)
-    faults = [shot.fault for shot in found if shot.fault is not None and not shot.files]
+    faults = [shot.fault for shot in found if shot.nothing and shot.fault is not None]
     if len(faults) < len(found):
         for kind, shot in {shot.kind: shot for shot in reversed(found) if shot.fault is None}.items():
             options.require_kind(kind, shot.name)
@@ -124,6 +150,16 @@ def mosaics(files: Sequence[Path]) -> list[ExposureSet]:
 def _of_files(files: list[Path], options: ShotOptions) -> list[ExposureSet]:
     if options.sensor is not None:
         return mosaics(files)
+    found = [_of_set(one) for one in sets.videos(files)]
+    files = [path for path in files if path.suffix.lower() not in VIDEO_SUFFIXES]
+    for folder in dict.fromkeys(path.parent for path in files if (path.parent / TABLE).is_file()):
+        inside = {path.resolve() for path in files if path.parent == folder}
+        for one in sets.by_table(folder)[0]:
+            listed = {picture.path.resolve() for picture in one.pictures}
+            if listed & inside:
+                found.append(_of_set(one))
+            inside -= listed
+        files = [path for path in files if path.parent != folder or path.resolve() in inside]
     by_root: dict[Path, filter_shots.Candidates] = {}
     for path in files:
         folder = path.resolve().parent
@@ -134,9 +170,25 @@ def _of_files(files: list[Path], options: ShotOptions) -> list[ExposureSet]:
     # Files of one angle are in folders that are called so by chance.
     in_folders = [c for c in by_root.values() if all(len(angles) > 1 for angles in c.values())]
     placed = {path for c in in_folders for angles in c.values() for same in angles.values() for path in same}
-    by_name, others = filter_shots.group_files([path for path in files if path not in placed])
-    found = [shot for candidates in (*in_folders, by_name) for shot in _filter_sets(candidates)]
-    return found + _strangers(others)
+    found += [shot for candidates in in_folders for shot in _filter_sets(candidates)]
+    return found + _by_names([path for path in files if path not in placed])
+
+
+def _by_names(files: Sequence[Path]) -> list[ExposureSet]:
+    """The sets, the shots of four and the strangers among files, by their names."""
+    found, rest = sets.by_name(files)
+    by_name, others = filter_shots.group_files(rest)
+    return [*map(_of_set, found), *_filter_sets(by_name), *_strangers(others)]
+
+
+def _of_set(found: sets.PictureSet) -> ExposureSet:
+    """A set of pictures; one picture each at 0, 45, 90 and 135 degrees are a shot of four."""
+    if found.is_four and found.fault is None:
+        files = {int(p.angle): p.path for p in found.pictures if not isinstance(p.angle, str)}
+        return ExposureSet(found.name, "filter", files, table=found.table)
+    return ExposureSet(
+        found.name, "set", {}, fault=found.fault, pictures=found.pictures, table=found.table
+    )  # fmt: skip
 
 
 def _filter_sets(shots: filter_shots.Candidates) -> list[ExposureSet]:
@@ -182,7 +234,7 @@ def _or_fault(
 
 def _in_folder(root: Path, options: ShotOptions) -> list[ExposureSet]:
     found = _directly_in(root, options)
-    if not any(shot.files for shot in found):
+    if all(shot.nothing for shot in found):
         folders = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
         for folder in folders:
             inside = _or_fault(folder, options, _directly_in)
@@ -194,17 +246,46 @@ def _in_folder(root: Path, options: ShotOptions) -> list[ExposureSet]:
 
 
 def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
-    folders = angle_folders(root)
-    if (root / "polar").is_dir() or (len(folders) == len(ANGLES) and (root / "sparse").is_dir()):
-        layout = find_layout(root)
-        require_four(layout, "one shot")
-        return [ExposureSet(name, "scene", layout.pictures[name], root, name) for name in layout.names]
-    if options.sensor is not None and not folders:
+    if (root / "polar").is_dir() or ((root / "sparse").is_dir() and len(angle_folders(root)) == len(ANGLES)):
+        return _views(find_layout(root))
+    if options.sensor is not None and not angle_folders(root):
         files = list_files(root, RAW_SUFFIXES)
         dark = None if options.dark_frame is None else os.path.realpath(options.dark_frame)
         return mosaics([path for path in files if os.path.realpath(path) != dark])
-    shots, others = filter_shots.list_shots(root)
-    return _filter_sets(shots) + _strangers(others)
+    found = [_of_set(one) for one in sets.videos(list_files(root, VIDEO_SUFFIXES))]
+    if (root / TABLE).is_file():
+        listed, others = sets.by_table(root)
+        return [*found, *map(_of_set, listed), *_strangers(others)]
+    files = list_files(root, filter_shots.SHOT_SUFFIXES)
+    in_folders = [] if files else sets.by_folder(root)
+    if in_folders:
+        return [*found, *map(_of_set, in_folders)]
+    if not angle_folders(root):
+        return found + _by_names(files)
+    shots, _ = filter_shots.list_shots(root)
+    return found + _filter_sets(shots)
+
+
+def _views(layout: Layout) -> list[ExposureSet]:
+    """The views of a scene; a fault for each whose pictures do not determine Stokes vectors.
+
+    Raises:
+        PolarguideError: there is no other view.
+    """
+    found = []
+    for name in layout.names:
+        others, fault = layout.others.get(name, ()), None
+        if others:
+            try:
+                known_places(name, [exposure for _, exposure in others])
+            except PolarguideError as error:
+                fault = error
+        files, more = layout.pictures.get(name, {}), tuple(path for path, _ in others)
+        found.append(ExposureSet(name, "scene", files, layout.root, name, fault, more))
+    if found and all(shot.fault is not None for shot in found):
+        assert found[0].fault is not None
+        raise found[0].fault
+    return found
 
 
 def _named_apart(found: list[ExposureSet]) -> list[ExposureSet]:

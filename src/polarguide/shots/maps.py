@@ -54,6 +54,29 @@ class NoiseModel:
     source: str
 
 
+@dataclass(frozen=True)
+class PictureFit:
+    """One picture of a set, compared with what the others predict.
+
+    Attributes:
+        label: its file, and frame of a video.
+        angle: that was fitted with: as stated, after sense, zero and orientation, degrees.
+        gain: by which its samples were divided.
+        looks_like: angle at which the others predict it best, degrees; None where the light does not tell.
+        error: standard error of ``looks_like``, degrees; None with it.
+        residual: root mean square of what the others leave unexplained, in full scales.
+        left_out: whether it was left out of the fit.
+    """
+
+    label: str
+    angle: float
+    gain: float
+    looks_like: float | None
+    error: float | None
+    residual: float
+    left_out: bool
+
+
 @dataclass(frozen=True, eq=False)
 class ShotMaps:
     """The maps of one shot; NumPy arrays at the size of the developed picture.
@@ -65,7 +88,8 @@ class ShotMaps:
         name: of the shot.
         files: it was read from, in the order 0, 45, 90, 135 where there are four.
         intensities: [4, H, W, C] float32, linear, at 0, 45, 90 and 135 degrees, counter-clockwise as displayed; 1 is
-            full scale; noise about black may be negative. C is 3 (R, G, B) or 1 (monochrome).
+            full scale; noise about black may be negative. C is 3 (R, G, B) or 1 (monochrome). Of a set at other angles
+            those that the fitted Stokes vectors have.
         stokes: [3, H, W] float32, of the luminance. S0 is 2 where all four intensities are at full scale; a photograph
             shows S0 / 2.
         dolp: [H, W] float32 in [0, 1], as measured.
@@ -76,8 +100,15 @@ class ShotMaps:
         reason: [H, W] uint8, a ``Reason``. NOISE pixels do have an S0 and a (small) DoLP: means of these over a region
             take them in; they say nothing of an angle or a normal.
         noise: of one sample of the sensor.
-        pair_ratio: median of (I0 + I90) / (I45 + I135), which is 1 for ideal polarizers; None where it is too dark.
+        pair_ratio: median of (I0 + I90) / (I45 + I135), which is 1 for ideal polarizers; None where it is too dark, and
+            of a set at other angles.
         notes: what was assumed, for the user.
+        pictures: what the pictures of a set at any angles say of their angles; empty for others.
+        residual: [H, W] float32, of a set of more than three pictures: root mean square of what the fit leaves of all
+            its samples, in standard deviations of their noise and per degree of freedom. 1 is noise alone; motion,
+            clipping and wrong angles are more. None for others.
+        left_out: [H, W] uint8, of a set: samples that were not fitted, at full scale or against the others. None for
+            others.
     """
 
     name: str
@@ -93,6 +124,9 @@ class ShotMaps:
     noise: NoiseModel
     pair_ratio: float | None
     notes: tuple[str, ...] = ()
+    pictures: tuple[PictureFit, ...] = ()
+    residual: Map | None = None
+    left_out: NDArray[np.uint8] | None = None
 
     @property
     def s0(self) -> Map:
@@ -158,10 +192,10 @@ def estimated_noise(intensities: Any, usable: NDArray[np.bool_], step: float) ->
         off = np.abs(excess[part] - np.median(excess[part]))
         levels.append(float(mean[part].mean()))
         spreads.append(max(((1.4826 * float(np.median(off))) ** 2 - least) / 4, least))
-    return NoiseModel(*_line(np.array(levels), np.array(spreads), least), "estimated")
+    return NoiseModel(*noise_line(np.array(levels), np.array(spreads), least), "estimated")
 
 
-def _line(x: NDArray[np.float64], y: NDArray[np.float64], least: float) -> tuple[float, float]:
+def noise_line(x: NDArray[np.float64], y: NDArray[np.float64], least: float) -> tuple[float, float]:
     """Floor and slope, neither negative, of the line through variances; errors of a variance grow with it."""
     weight, floor, slope = 1 / y, float(y.mean()), 0.0
     for _ in range(3):

@@ -14,16 +14,18 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options, option_name
 from polarguide.preparation.settings import PrepareSettings
 
-Kind = Literal["mosaic", "filter", "scene"]
-"""What a shot is made of: one file, one an angle, or a view of a scene."""
+Kind = Literal["mosaic", "filter", "set", "scene"]
+"""What a shot is made of: one file, one each at 0, 45, 90 and 135 degrees, others at any angles, a view of a scene."""
 _KINDS: dict[Kind, str] = {
     "mosaic": "raw mosaics",
     "filter": "shots through a filter",
+    "set": "sets at other angles",
     "scene": "views of a scene",
 }
 _ONE: dict[Kind, str] = {
     "mosaic": "a raw mosaic",
     "filter": "a shot through a filter",
+    "set": "a set at other angles",
     "scene": "a view of a scene",
 }
 _OWNERS: dict[str, tuple[Kind, ...]] = {
@@ -34,7 +36,7 @@ _OWNERS: dict[str, tuple[Kind, ...]] = {
         ),
         ("mosaic",),
     ),
-    "transfer": ("filter", "scene"),
+    "transfer": ("filter", "set", "scene"),
     "align": ("filter",),
     "gains": ("mosaic", "filter"),
 }  # fmt: skip
@@ -62,7 +64,7 @@ class ShotOptions:
         demosaic: full, half or quarter resolution of the sensor.
         interpolation: How half and full fill in colors and angles.
         transfer: Encoding of filter shots; auto by the curvature of the response.
-        align: Estimate and correct small shifts between the four shots of a filter.
+        align: Estimate and correct small shifts between the four shots of a filter; sets at other angles are not moved.
         gains: none takes the angles as they are, auto corrects what the light of each shot tells of their gains.
         calibration: gains, order, sense and zero of the angles.
         analyzers: calibration of the sensor that polarguide calibrate wrote, for raw mosaics; takes the place of gains.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.shots.maps import REASONS, Reason, ShotMaps
-from polarguide.shots.pictures import KINDS, REASON_COLORS, drawn, stretch_of
+from polarguide.shots.pictures import REASON_COLORS, drawn, kinds_of, stretch_of
 from polarguide.shots.read import SurfaceMaps
 from polarguide.visualization import figures
 from polarguide.visualization.embedded import data_uri
@@ -33,7 +33,7 @@ def shot_page(maps: ShotMaps, surface: SurfaceMaps) -> str:
     nothing is averaged.
     """
     step = max(1, math.ceil(max(maps.size) / SIDE))
-    shown = [kind for kind in KINDS if kind.key not in _HIDDEN]
+    shown = [kind for kind in kinds_of(maps) if kind.key not in _HIDDEN]
     layers, stretches = [], []
     for kind in shown:
         values = kind.values(maps, surface)
@@ -107,7 +107,7 @@ def _facts(maps: ShotMaps, surface: SurfaceMaps) -> dict[str, str]:
     return {
         "pixels": ", ".join(f"{code.name.lower()} {counts[code]:.1%}" for code in Reason if counts[code] > 0),
         "median DoLP": f"{float(np.median(maps.dolp[maps.measured])):.4f}" if maps.measured.any() else "none",
-        "(I0 + I90) / (I45 + I135)": ratio,
+        **(_facts_of_set(maps) if maps.pictures else {"(I0 + I90) / (I45 + I135)": ratio}),
         "noise of a sample": f"{maps.noise.source}: {maps.noise.floor**0.5:.2%} of full scale in the dark{wells}",
         "refractive index": f"{surface.refractive_index:g}",
         "rays": "of a pinhole camera"
@@ -116,3 +116,17 @@ def _facts(maps: ShotMaps, surface: SurfaceMaps) -> dict[str, str]:
         "files": ", ".join(path.name for path in maps.files) or "a view of a scene",
         **({"notes": " ".join(maps.notes)} if maps.notes else {}),
     }
+
+
+def _facts_of_set(maps: ShotMaps) -> dict[str, str]:
+    """What the pictures of a set say of their angles, and how well they agree."""
+    rows = [
+        f"{fit.label}: {fit.angle:g}°"
+        + (f", looks like {fit.looks_like:.1f}°" if fit.looks_like is not None else "")
+        + (" (left out)" if fit.left_out else "")
+        for fit in maps.pictures
+    ]
+    facts = {"angles": "; ".join(rows)}
+    if maps.residual is not None and maps.measured.any():
+        facts["median residual"] = f"{float(np.median(maps.residual[maps.measured])):.2f} (1 is noise alone)"
+    return facts

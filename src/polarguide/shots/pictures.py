@@ -78,7 +78,29 @@ KINDS: tuple[MapKind, ...] = (
     MapKind("reason", "usable pixels", "0 usable, 1 noise, 2 dark, 3 saturated, 4 masked", "reason",
             lambda m, s: m.reason),
 )  # fmt: skip
-"""All maps, in the order in which they are shown."""
+"""The maps of every shot, in the order in which they are shown."""
+
+_OF_SETS: tuple[MapKind, ...] = (
+    MapKind("residual", "residual", "standard deviations of the noise", "scalar", lambda m, s: _given(m.residual),
+            "viridis", (0.0, 5.0), note="what the fit leaves of all pictures; 1 is noise alone, more is motion, "
+            "clipping or a wrong angle"),
+    MapKind("left_out", "samples left out", "samples", "scalar", lambda m, s: _given(m.left_out), "viridis",
+            note="at full scale, or against the other pictures of the set"),
+)  # fmt: skip
+ALL_KINDS = (*KINDS, *_OF_SETS)
+"""With those that only sets at other angles have."""
+
+
+def kinds_of(maps: ShotMaps) -> tuple[MapKind, ...]:
+    """The maps that a shot has."""
+    there = {"residual": maps.residual is not None, "left_out": maps.left_out is not None}
+    return tuple(kind for kind in ALL_KINDS if there.get(kind.key, True))
+
+
+def _given(values: NDArray[Any] | None) -> NDArray[Any]:
+    assert values is not None
+    return values
+
 
 REASON_COLORS: dict[Reason, tuple[int, int, int]] = {
     Reason.USABLE: (238, 240, 242),

@@ -14,14 +14,16 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture.colmap.model import fit_camera, read_model
+from polarguide.capture.exposures import FOUR
 from polarguide.capture.view import View
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import check_finite, index_of
 from polarguide.core.text import decimal
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
-from polarguide.shots.develop import Developed, develop, develop_view
+from polarguide.shots.develop import Developed, develop, develop_view, samples_of, set_samples
 from polarguide.shots.exposures import ExposureSet, find_shots
+from polarguide.shots.fit import DARK_SNR, maps_of_set
 from polarguide.shots.maps import Map, Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
 
@@ -29,8 +31,6 @@ UNREADABLE = (PolarguideError, OSError, MemoryError)
 """What one bad file may raise; others come after it."""
 _TILE = 1 << 18
 """Pixels that are worked on at a time, so that what is between stays in the processor's cache."""
-_DARK_SNR = 3.0
-"""S0 in units of its noise from which on there is light."""
 
 
 def read_shot(
@@ -40,8 +40,8 @@ def read_shot(
     """Read one exposure set: S0, DoLP, AoLP, their standard deviations, and which pixels say nothing.
 
     Args:
-        shot: of ``find_shots``; a view of a scene; or the path of a mosaic, the four paths of shots through a filter,
-            or a folder with one shot.
+        shot: of ``find_shots``; a view of a scene; or the path of a mosaic or of a video with its table, the paths of
+            shots through a filter at four or any three or more angles, or a folder with one shot.
         options: how to read it.
 
     Raises:
@@ -49,6 +49,8 @@ def read_shot(
     """
     options = (options or ShotOptions()).checked()
     if isinstance(shot, View):
+        if shot.exposures != FOUR:
+            return maps_of_set(shot.name, (), samples_of(shot), options)
         return maps_of(ExposureSet(shot.name, "scene", {}), develop_view(shot, options), options)
     if not isinstance(shot, ExposureSet):
         paths = [shot] if isinstance(shot, str | os.PathLike) else list(shot)
@@ -61,8 +63,10 @@ def read_shot(
                 remedy="find_shots lists them; read them one by one.",
             )
         shot = found[0]
-    developed = develop(shot, options)
-    return maps_of(shot, developed, options)
+    samples = set_samples(shot, options)
+    if samples is not None:
+        return maps_of_set(shot.name, shot.paths, samples, options)
+    return maps_of(shot, develop(shot, options), options)
 
 
 def fault_of(shot: ExposureSet, error: BaseException) -> PolarguideError:
@@ -110,7 +114,7 @@ def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> Sh
         # Later reasons replace earlier ones.
         why = reason[part]
         why[degree <= options.snr * spread.dolp] = Reason.NOISE
-        why[s[0] <= _DARK_SNR / 2 * variances.sum(dim=0).sqrt()] = Reason.DARK
+        why[s[0] <= DARK_SNR / 2 * variances.sum(dim=0).sqrt()] = Reason.DARK
     found = reason.numpy()
     for mask, kind in (
         (developed.dark, Reason.DARK),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ from polarguide.shots.exposures import (
 from polarguide.shots.maps import Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.page_html import PAGE, shot_page
-from polarguide.shots.pictures import KINDS, drawn, stretch_of, with_legend
+from polarguide.shots.pictures import ALL_KINDS, MapKind, drawn, kinds_of, stretch_of, with_legend
 from polarguide.shots.read import UNREADABLE, SurfaceMaps, camera_of, fault_of, read_shot, surface_maps
 from polarguide.visualization import figures
 
@@ -172,9 +173,11 @@ def write_maps(
         PolarguideError: the folder cannot be made.
     """
     make_folder(folder)
+    kinds = kinds_of(maps)
     # Without the record, files of these names are not known to be this program's.
-    earlier = _files_of(set(FORMATS) - set(formats)) if (folder / UNITS_FILE).is_file() else []
-    for kind in KINDS:
+    there = _files_of(FORMATS, ALL_KINDS) if (folder / UNITS_FILE).is_file() else []
+    earlier = [name for name in there if name not in _files_of(formats, kinds)]
+    for kind in kinds:
         values = kind.values(maps, surface)
         if "png" in formats:
             stretch = stretch_of(kind, values, maps)
@@ -194,9 +197,9 @@ def write_maps(
     return folder
 
 
-def _files_of(formats: Collection[str]) -> list[str]:
+def _files_of(formats: Collection[str], kinds: Sequence[MapKind]) -> list[str]:
     """Names of the files of formats."""
-    names = [f"{kind.key}.{suffix}" for suffix in formats if suffix != "page" for kind in KINDS]
+    names = [f"{kind.key}.{suffix}" for suffix in formats if suffix != "page" for kind in kinds]
     return [*names, PAGE] if "page" in formats else names
 
 
@@ -208,10 +211,11 @@ def _record(maps: ShotMaps, surface: SurfaceMaps) -> dict[str, Any]:
         "shot": maps.name,
         "files": [str(path) for path in maps.files],
         "size": list(maps.size),
-        "maps": {kind.key: {"unit": kind.unit, "note": kind.note} for kind in KINDS},
+        "maps": {kind.key: {"unit": kind.unit, "note": kind.note} for kind in kinds_of(maps)},
         "shares": {code.name.lower(): round(float(counts[code]), 6) for code in Reason},
         "noise": {"floor": maps.noise.floor, "slope": maps.noise.slope, "source": maps.noise.source},
         "pair_ratio": maps.pair_ratio,
+        **({"pictures": [dataclasses.asdict(fit) for fit in maps.pictures]} if maps.pictures else {}),
         "refractive_index": surface.refractive_index,
         "rays": "of a pinhole camera" if surface.perspective else "parallel",
         "notes": list(maps.notes),

@@ -56,7 +56,7 @@ class _Folder:
     _said: str = ""
 
     def shots(self) -> list[ExposureSet]:
-        """The shots that are there, the oldest first; of those of four files, parts, too."""
+        """The shots that are there, the oldest first; of those of several files, parts, too."""
         try:
             found = (
                 self._mosaics() if self.reading.sensor is not None else list_shots([self.root], self.reading)
@@ -121,11 +121,12 @@ def watch_folder(
     read is tried again as long as its format says that it is not whole; after ``patience`` seconds without a change it
     gets a line that says why, and so does what is ambiguous or has no angle in its name. A shot of fewer than four
     files is waited for: after ``patience`` seconds a warning says so, and it is among those ``waiting`` at the end. A
-    file that is written anew is another shot. The table is the memory: the same call after a stop or a kill goes on
-    with what is not in it.
+    set at other angles is measured when its angles are evenly spaced over half a turn or all files of ``angles.csv``
+    are there, any other after ``patience`` seconds without a change. A file that is written anew is another shot. The
+    table is the memory: the same call after a stop or a kill goes on with what is not in it.
 
     Args:
-        folder: of mosaics, or of shots of four files, as ``shots.exposures.find_shots`` takes it.
+        folder: of mosaics, or of shots through a filter, as ``shots.exposures.find_shots`` takes it.
         out: folder of the table.
         options, reading, watching: what is measured, how shots are read, how long is waited.
         should_stop: is asked between two shots and several times a second.
@@ -200,7 +201,9 @@ class _Watch:
         late = age >= self._options.patience
         if shot.fault is not None:  # names may still change, and a file that is too many may go
             return late
-        if shot.kind != "mosaic" and len(shot.files) < len(ANGLES):
+        if shot.kind == "set" and not late and not shot.whole:  # more angles may come
+            return False
+        if shot.kind == "filter" and len(shot.files) < len(ANGLES):
             if late and not state.said:
                 state.said = True
                 missing = [str(angle) for angle in ANGLES if angle not in shot.files]
@@ -240,5 +243,10 @@ class _Watch:
 
 
 def _is_whole(path: Path) -> bool:
-    """Whether a picture's structure is complete; of files that are no PNG, JPEG or TIFF nobody can say."""
+    """Whether a picture's structure is complete; of files that are no PNG, JPEG or TIFF nobody can say.
+
+    A table is taken as it is: what is wrong with it is a fault of its shot.
+    """
+    if path.suffix.lower() == ".csv":
+        return True
     return path.suffix.lower() in SUFFIXES and find_damage(path.read_bytes()) is None

@@ -1,0 +1,249 @@
+"""Compare each picture of a set with what the others predict: wrong angles, other exposures, motion; and the noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+from polarguide.capture.exposures import WELL_CONDITIONED, conditioning
+from polarguide.shots.maps import NoiseModel, PictureFit, noise_line
+from polarguide.shots.samples import SetSamples
+
+Floats = NDArray[np.float64]
+MARKS = 2.0
+"""Degrees to which a ring is set by its marks: an angle that is off by less is not called wrong."""
+AGAINST = 4.0
+"""Times the typical difference of the other pictures from which on one contradicts them."""
+BRIGHTER = 0.03
+"""Share of the light from which on a picture that contradicts the others is called brighter, or darker."""
+_PIXELS = 20_000
+_BINS, _FEWEST = 24, 200
+_TELLING = 1.0
+"""Degrees of standard error up to which the light tells a picture's angle."""
+_OVER_NOISE = 3.0
+"""Times what noise alone makes of it, from which on a variation of the polarization over the picture is one."""
+_REDUNDANT = 0.05
+"""Share of a sample's noise that the fit has to leave for its residual to say something."""
+
+
+@dataclass(frozen=True)
+class Judgment:
+    """Attributes:
+    pictures: each compared with the others.
+    used: [K] bool, those that are fitted.
+    notes: for the user.
+    """
+
+    pictures: tuple[PictureFit, ...]
+    used: NDArray[np.bool_]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Angle:
+    """What the others predict of a picture: angle that it looks like and its error, radians (None: untold), gain."""
+
+    angle: float | None
+    error: float
+    gain: float
+    residual: float
+
+
+def chosen_pixels(samples: SetSamples, most: int = _PIXELS) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Rows and columns of pixels that are good in every picture, spread over the picture."""
+    good = ~(samples.dark | samples.masked)
+    for lost in samples.lost:
+        good &= ~lost
+    places = np.flatnonzero(good)
+    places = places[:: max(1, len(places) // most)]
+    return np.unravel_index(places, good.shape)  # type: ignore[return-value]
+
+
+def judge(samples: SetSamples, gray: Floats) -> Judgment:
+    """Compare the pictures of a set with one another, and choose those that are fitted.
+
+    Each picture is fitted with Malus's law at an unknown angle and gain to the Stokes vectors of the others, over all
+    pixels at once. The picture that is off most is left out, as long as enough others agree without it.
+
+    Args:
+        samples: the set. gray: [K, N], its luminance at some pixels that are good in every picture.
+    """
+    rows, count = samples.rows.astype(np.float64), len(samples.labels)
+    used = np.ones(count, bool)
+    reasons: dict[int, str] = {}
+    while gray.shape[1] >= _FEWEST:
+        found = {k: _predicted(rows, gray, used, k) for k in np.flatnonzero(used).tolist()}
+        worst = next((k for k in _worst(samples, found) if _contradicts(samples, gray, used, k, found)), None)
+        if worst is None:
+            break
+        used[worst], reasons[worst] = False, _reason(samples, worst, found[worst])
+    fits = tuple(_picture(samples, k, _predicted(rows, gray, used, k), bool(used[k])) for k in range(count))
+    notes = [reasons[k] for k in sorted(reasons)]
+    off_by = [abs(_apart(f.looks_like, f.angle)) for f in fits if f.looks_like is not None and not f.left_out]
+    if count > 3 and off_by and np.median(off_by) > MARKS:
+        notes.append(
+            f"The angles contradict one another by {np.median(off_by):.0f} degrees (median); "
+            f"{int(used.sum())} pictures do not tell which are wrong."
+        )
+    return Judgment(fits, used, tuple(notes))
+
+
+def _determined(rows: Floats) -> bool:
+    return conditioning(torch.from_numpy(2 * rows[:, 1:])) >= WELL_CONDITIONED
+
+
+def _apart(angle: float, other: float) -> float:
+    """Difference of two angles in degrees modulo 180, in [-90, 90)."""
+    return (angle - other + 90.0) % 180.0 - 90.0
+
+
+def _off(samples: SetSamples, k: int, found: _Angle) -> float:
+    """How far a picture's angle is off, degrees; 0 where the light does not tell."""
+    if found.angle is None:
+        return 0.0
+    return abs(_apart(math.degrees(found.angle), samples.exposures[k].angle or 0.0))
+
+
+def _worst(samples: SetSamples, found: dict[int, _Angle]) -> tuple[int, int]:
+    """The picture without which least is left of the rest, and the one whose angle is off most."""
+    by_angle = max(found, key=lambda k: _off(samples, k, found[k]))
+    return max(found, key=lambda k: found[k].residual), by_angle
+
+
+def _contradicts(
+    samples: SetSamples, gray: Floats, used: NDArray[np.bool_], worst: int, found: dict[int, _Angle]
+) -> bool:
+    """Whether the others agree with one another far better than a picture does with them, by angle or residual."""
+    rows, rest = samples.rows.astype(np.float64), used.copy()
+    rest[worst] = False
+    if rest.sum() < 4 or not _determined(rows[rest]):
+        return False
+    others = {k: _predicted(rows, gray, rest, k) for k in np.flatnonzero(rest).tolist()}
+    typical = float(np.median([_off(samples, k, other) for k, other in others.items()]))
+    left = float(np.median([other.residual for other in others.values()]))
+    by_angle = _off(samples, worst, found[worst]) > max(MARKS, AGAINST * typical)
+    return by_angle or found[worst].residual > AGAINST * left
+
+
+def _reason(samples: SetSamples, k: int, found: _Angle) -> str:
+    """What is wrong with a picture, for the user."""
+    head = f"{samples.labels[k]} ({samples.exposures[k].angle or 0.0:g} degrees)"
+    if _off(samples, k, found) > MARKS:
+        looks = f"{math.degrees(found.angle or 0.0) % 180:.0f} degrees"
+        return f"{head} looks like {looks}: its angle is probably wrong. It is left out."
+    if abs(found.gain - 1) > BRIGHTER:
+        return f"{head} is {found.gain - 1:+.0%} as bright as the others predict (exposure or light). It is left out."
+    return f"{head} contradicts the others (motion, light or a wrong angle). It is left out."
+
+
+def _predicted(rows: Floats, gray: Floats, used: NDArray[np.bool_], k: int) -> _Angle:
+    """One picture as the others predict it: by least squares over angle and gain.
+
+    With m = (1, cos 2t, sin 2t) / 2 times the Stokes vector, the angle t has the least sum of (I - g m)^2. Moments of
+    the Stokes vectors are taken without what noise adds to them, or unpolarized light would tell an angle.
+    """
+    others = used.copy()
+    others[k] = False
+    inverse = np.linalg.pinv(rows[others])
+    stokes, picture = inverse @ gray[others], gray[k]
+    pixels = picture.size
+    left = gray[others] - rows[others] @ stokes
+    freedom = int(others.sum()) - 3
+    off = picture - rows[k] @ stokes
+    leverage = float(((rows[k] @ inverse) ** 2).sum())
+    residual = math.sqrt(float(np.mean(off**2)) / (1 + leverage))
+    # Robust: a few pixels that moved do not make all of them noisy. Without redundancy, the picture's own residual.
+    noise = residual**2 if freedom < 1 else _typical((left**2).sum(axis=0), freedom)
+    extra = noise * inverse @ inverse.T / 4
+    moments = stokes @ stokes.T / (4 * pixels) - extra
+    product = stokes @ picture / (2 * pixels)
+    turns = np.radians(np.arange(0.0, 180.0, 0.1))
+    forms = np.stack([np.ones_like(turns), np.cos(2 * turns), np.sin(2 * turns)])
+    along = np.maximum((forms * (moments @ forms)).sum(axis=0), 1e-30)
+    gain = product @ forms / along
+    best = int(np.argmax(np.where(gain > 0, gain * (product @ forms), -np.inf)))
+    form = forms[:, best]
+    slope = 2 * np.array([0.0, -form[2], form[1]])
+    spread = float(slope @ moments @ slope - (slope @ moments @ form) ** 2 / along[best])
+    shown = spread > _OVER_NOISE * float(slope @ extra @ slope) and spread > 0
+    error = math.sqrt(noise * (1 + leverage) / (pixels * spread)) / float(gain[best]) if shown else math.inf
+    told = math.degrees(error) < _TELLING
+    return _Angle(float(turns[best]) if told else None, error, float(gain[best]), residual)
+
+
+def _typical(squares: Floats, freedom: int) -> float:
+    """The variance of which sums of ``freedom`` squares are, by their median."""
+    return float(np.median(squares)) / float(2 * gammaincinv(freedom / 2, 0.5))
+
+
+def _picture(samples: SetSamples, k: int, angle: _Angle, used: bool) -> PictureFit:
+    exposure = samples.exposures[k]
+    told = angle.angle is not None
+    return PictureFit(
+        label=samples.labels[k],
+        angle=exposure.angle or 0.0,
+        gain=exposure.gain,
+        looks_like=round(math.degrees(angle.angle or 0.0) % 180, 1) if told else None,
+        error=math.degrees(angle.error) if told else None,
+        residual=angle.residual,
+        left_out=not used,
+    )
+
+
+def estimated_set_noise(samples: SetSamples, gray: Floats, used: NDArray[np.bool_]) -> NoiseModel:
+    """Fit ``floor + slope * intensity`` to what least squares leaves of the pictures of a set.
+
+    The expected sum of squared residuals of a pixel is the sum of (1 - h) times the variances of its samples, h being
+    their leverages; so it tells the noise at the mean intensity with these weights. Its median in bins of brightness
+    counts, so that moved edges hardly do.
+
+    Args:
+        samples: the set. gray: [K, N], its luminance at some pixels. used: [K], the pictures that are fitted.
+    """
+    least = samples.step**2 / 12 / samples.values.shape[-1]
+    rows = samples.rows[used].astype(np.float64)
+    hat = rows @ np.linalg.pinv(rows)
+    free = 1 - np.diag(hat)
+    freedom = int(used.sum()) - 3
+    if freedom < 1 or gray.shape[1] < _FEWEST or free.max() < _REDUNDANT:
+        return NoiseModel(least, 0.0, "estimated")
+    gains = samples.gains[used].astype(np.float64)
+    fitted = hat @ gray[used]
+    squares = ((gray[used] - fitted) ** 2).sum(axis=0)
+    flat = float((free / gains**2).sum())
+    level = (free / gains) @ np.maximum(fitted, 0) / flat
+    parts = np.array_split(np.argsort(level), min(_BINS, max(1, len(level) // _FEWEST)))
+    levels = np.array([level[part].mean() for part in parts])
+    variances = np.array([max(_typical(squares[part], freedom) * freedom / flat, least) for part in parts])
+    return NoiseModel(*noise_line(levels, variances, least), "estimated")
+
+
+def neighbor_noise(samples: SetSamples) -> NoiseModel:
+    """Fit ``floor + slope * intensity`` to differences of neighboring pixels, for sets that leave no residual.
+
+    A pixel less the mean of those left and right of it has 3/2 of its variance; texture adds to it, so that the noise
+    is stated rather too large.
+    """
+    least = samples.step**2 / 12 / samples.values.shape[-1]
+    height, width = samples.dark.shape
+    step = max(1, height // max(1, 20 * _PIXELS // max(width, 1)))
+    levels, differences = [], []
+    for k, picture in enumerate(samples.gray(np.s_[::step]).astype(np.float64)):
+        bad = samples.lost[k, ::step] | samples.dark[::step] | samples.masked[::step]
+        good = ~(bad[:, :-2] | bad[:, 1:-1] | bad[:, 2:])
+        gain = float(samples.gains[k])
+        levels.append(gain * picture[:, 1:-1][good])
+        differences.append(gain * (picture[:, 1:-1] - (picture[:, :-2] + picture[:, 2:]) / 2)[good])
+    level, apart = np.concatenate(levels), np.concatenate(differences)
+    if len(level) < _FEWEST:
+        return NoiseModel(least, 0.0, "estimated")
+    parts = np.array_split(np.argsort(level), min(_BINS, max(1, len(level) // _FEWEST)))
+    means = np.array([max(float(level[part].mean()), 0.0) for part in parts])
+    variances = np.array([max(_typical(apart[part] ** 2, 1) / 1.5, least) for part in parts])
+    return NoiseModel(*noise_line(means, variances, least), "estimated")

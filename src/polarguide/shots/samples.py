@@ -1,0 +1,278 @@
+"""From the files of a set to the samples that are fitted: linear values of its pictures, their angles and exposures."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from polarguide.capture.calibration import ANGLES, Calibration
+from polarguide.capture.exposures import Angle, Exposure, analyzers, nominal, turned
+from polarguide.capture.filter.camera_raw import is_camera_raw
+from polarguide.capture.filter.exif import apply_orientation, orientation_calibration, read_taken
+from polarguide.capture.filter.shots import Shots, read_stack
+from polarguide.capture.formats.pictures import linear_codes
+from polarguide.capture.memory import require_memory
+from polarguide.capture.view import FULL_CODE, View
+from polarguide.capture.view_reader import ViewData, require_alike
+from polarguide.core.errors import PolarguideError
+from polarguide.shots.options import ShotOptions
+from polarguide.shots.sets import SetPicture, known_places
+from polarguide.shots.video import read_frames
+
+Mask = NDArray[np.bool_]
+_JPEG = (".jpg", ".jpeg")
+# Compression smears the edge of clipped areas over a few values.
+_COMPRESSED_FULL = 250
+_FITTED = 4 * (4 * 3 + 3 + 7)
+"""Bytes for each pixel of what is fitted: intensities, Stokes vectors and maps."""
+_UNEQUAL = 1.03
+"""Ratio of exposures in the files from which on they count: shutters and apertures have nominal values."""
+
+
+@dataclass(frozen=True, eq=False)
+class SetSamples:
+    """The pictures of a set, before anything is fitted.
+
+    Attributes:
+        labels: of the pictures, for messages.
+        values: [K, H, W, C] linear, uint16 codes or float32 intensities; C is 1 where all pictures are gray.
+        exposures: of the pictures: the angle in degrees, counter-clockwise as displayed, and the gain.
+        lost: [K, H, W], samples at full scale.
+        dark: [H, W], 0 in all pictures. masked: [H, W].
+        step: one stored value as a share of full scale.
+        notes: for the user.
+    """
+
+    labels: tuple[str, ...]
+    values: NDArray[Any]
+    exposures: tuple[Exposure, ...]
+    lost: Mask
+    dark: Mask
+    masked: Mask
+    step: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def rows(self) -> NDArray[np.float32]:
+        """Malus's law as a matrix [K, 3]: the intensity of a picture is its row times the Stokes vector."""
+        pairs = nominal(self.exposures).numpy()
+        return np.asarray(np.concatenate((np.ones_like(pairs[:, :1]), pairs), axis=1) / 2, np.float32)
+
+    @property
+    def gains(self) -> NDArray[np.float32]:
+        """By what the samples of each picture are divided, [K]."""
+        return np.array([exposure.gain for exposure in self.exposures], np.float32)
+
+    def intensities(self, at: Any) -> NDArray[np.float32]:
+        """Linear intensities on one exposure of some pixels, [K, ..., C]; ``at`` indexes [H, W]."""
+        chosen = self.values[(slice(None), *at)] if isinstance(at, tuple) else self.values[:, at]
+        scale = np.float32(FULL_CODE) if self.values.dtype == np.uint16 else np.float32(1)
+        gains = self.gains.reshape(-1, *[1] * (chosen.ndim - 1))
+        return np.asarray(chosen.astype(np.float32) / (scale * gains))
+
+    def gray(self, at: Any) -> NDArray[np.float32]:
+        """The same of the luminance, the plain mean of the colors: [K, ...]."""
+        found = self.intensities(at)
+        return luminance(found)
+
+
+def luminance(colors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The plain mean of one or three colors [..., C], contiguous: [...]. Written out: NumPy's mean of three is slow."""
+    if colors.shape[-1] == 1:
+        return np.ascontiguousarray(colors[..., 0])
+    return np.asarray((colors[..., 0] + colors[..., 1] + colors[..., 2]) / np.float32(3))
+
+
+def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) -> SetSamples:
+    """Read the pictures of a set, one after the other.
+
+    Raises:
+        PolarguideError: one cannot be read, they differ in size, depth or orientation, or they do not fit into memory.
+    """
+    require_no_order(options.calibration, name)
+    unused = len(pictures)
+    pictures = [picture for picture in pictures if not isinstance(picture.angle, str)]
+    unused -= len(pictures)
+    transfer, note = _transfer([picture.path for picture in pictures], options.transfer)
+    count = len(pictures)
+    values: NDArray[Any] | None = None
+    lost: NDArray[Any] | None = None
+    dark: Mask | None = None
+    code, step, gray = 1, 0.0, True
+    for place, shot in enumerate(_read_each(pictures)):
+        stored = shot.pictures[0]
+        gray = gray and bool((stored[..., :1] == stored).all())
+        if values is None or lost is None or dark is None:
+            code, step = shot.orientation, 1 / float(np.iinfo(stored.dtype).max)
+            needed = (count * (2 * (1 if gray else 3) + 1) + _FITTED) * stored[..., 0].size
+            remedy = "Make the pictures smaller, all by the same factor."
+            require_memory(pictures[0].path, needed, f"{count} pictures of {name}", remedy=remedy)
+            values = np.empty((count, *stored.shape[:2], 1 if gray else 3), np.uint16)
+            lost, dark = np.empty(values.shape[:3], bool), np.ones(values.shape[1:3], bool)
+        elif not gray and values.shape[3] == 1:
+            values = np.repeat(values, 3, axis=3)
+        values[place] = linear_codes(stored[..., : values.shape[3]], transfer)
+        lost[place] = shot.clipped[0]
+        dark &= shot.dark
+    assert values is not None
+    assert lost is not None
+    assert dark is not None
+    gains, words = _gains(pictures)
+    turn = orientation_calibration(code)
+    return SetSamples(
+        labels=tuple(picture.label for picture in pictures),
+        values=apply_orientation(values.transpose(1, 2, 0, 3), code).transpose(2, 0, 1, 3),
+        exposures=tuple(
+            Exposure(_degrees(turned(turned(picture.angle, options.calibration), turn)), gain=gain)
+            for picture, gain in zip(pictures, gains, strict=True)
+        ),
+        lost=apply_orientation(lost.transpose(1, 2, 0), code).transpose(2, 0, 1),
+        dark=apply_orientation(dark, code),
+        masked=np.zeros(apply_orientation(dark, code).shape, bool),
+        step=step,
+        notes=(note, *words, *_unused(unused)),
+    )
+
+
+def require_no_order(calibration: Calibration, name: str) -> None:
+    """Refuse what a calibration says of pictures called 0, 45, 90 and 135 for pictures at other angles.
+
+    Raises:
+        PolarguideError: it has gains or another order.
+    """
+    for field, given in (("gains", calibration.gains is not None), ("order", calibration.order != ANGLES)):
+        if given:
+            raise PolarguideError(
+                f"calibration ({field})",
+                expected="pictures at 0, 45, 90 and 135 degrees, which it is for",
+                found=f"{name}, a set of pictures at other angles",
+                remedy="Leave it out; sense and zero apply, and angles.csv has a column gain.",
+            )
+
+
+def _read_each(pictures: Sequence[SetPicture]) -> Iterator[Shots]:
+    """Each picture as read; all of one size, depth and orientation.
+
+    Raises:
+        PolarguideError: one cannot be read, or differs.
+    """
+    first: Shots | None = None
+    for path, group in itertools.groupby(pictures, key=lambda picture: picture.path):
+        frames = [picture.frame for picture in group]
+        for shot in _video(path, frames) if frames[0] is not None else [read_stack([path])] * len(frames):
+            first = first or shot
+            require_alike(path, shot.pictures[0], pictures[0].path, first.pictures[0])
+            if shot.orientation != first.orientation:
+                raise PolarguideError(
+                    path,
+                    expected=f"EXIF orientation {first.orientation} like {pictures[0].path.name}",
+                    found=str(shot.orientation),
+                    remedy="Keep the camera still between the pictures of a set, or export them all alike.",
+                )
+            yield shot
+
+
+def _video(path: Path, frames: Sequence[int | None]) -> Iterator[Shots]:
+    """Frames of a video, in the order that is asked for, as pictures are read."""
+    wanted = [frame for frame in frames if frame is not None]
+    rising = sorted(wanted)
+    read = {frame: picture for frame, picture in zip(rising, read_frames(path, rising), strict=True)}
+    for frame in wanted:
+        picture = read[frame]
+        clipped, lit = (np.asarray(mask.any(axis=2)) for mask in (picture >= _COMPRESSED_FULL, picture > 0))
+        yield Shots(picture[None], 1, clipped[None], ~lit)
+
+
+def _transfer(paths: Sequence[Path], asked: str) -> tuple[str, str]:
+    """How the files are encoded, and why: as ``prepare`` takes photographs at any angles."""
+    if all(map(is_camera_raw, paths)):
+        return "linear", "Transfer linear: camera raw, developed without tone curve."
+    if asked != "auto":
+        return asked, f"Transfer {asked}, as given."
+    pictures = {path.suffix.lower() for path in paths}
+    kind = "video" if pictures.isdisjoint((*_JPEG, ".png", ".tif", ".tiff")) else "JPEG"
+    kind = kind if kind == "video" or pictures <= set(_JPEG) else "PNG and TIFF"
+    usual = "linear" if kind == "PNG and TIFF" else "srgb"
+    return usual, f"Transfer {usual}, as {kind} files usually are (--transfer sets it)."
+
+
+def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:
+    """The gain of each picture: as the table states, else as the files state their exposure; and notes."""
+    given = [picture.gain for picture in pictures]
+    light = [None if picture.frame is not None else read_taken(picture.path).light for picture in pictures]
+    known = [value for value in light if value is not None]
+    if any(gain is not None for gain in given) or len(known) < len(light):
+        return [1.0 if gain is None else gain for gain in given], []
+    usual = float(np.median(known))
+    if max(known) < _UNEQUAL * min(known):
+        return [1.0] * len(pictures), []
+    ratio = f"The files state exposures that differ by a factor of {max(known) / min(known):.3g}; corrected."
+    return [value / usual for value in known], [ratio]
+
+
+def samples_of_view(data: ViewData, full: int | None, options: ShotOptions) -> SetSamples:
+    """The samples of a view of a scene as stored, at other angles than the usual four; ``full``: where it saturates.
+
+    Raises:
+        PolarguideError: its known pictures do not determine Stokes vectors.
+    """
+    require_no_order(options.calibration, data.name)
+    places = known_places(data.name, data.exposures)
+    saturated = np.zeros(data.black.shape, bool) if full is None else np.asarray(data.peak >= full)
+    return SetSamples(
+        labels=tuple(f"picture {k + 1}" for k in places),
+        values=data.codes[places],
+        exposures=tuple(
+            replace(e, angle=_degrees(turned(e.angle or 0.0, options.calibration)))
+            for e in (data.exposures[k] for k in places)
+        ),
+        lost=np.broadcast_to(saturated, (len(places), *saturated.shape)),
+        dark=data.black,
+        masked=data.invalid if data.mask is None else data.invalid | ~data.mask,
+        step=1 / float(np.iinfo(data.peak.dtype).max),
+        notes=_unused(len(data.exposures) - len(places)),
+    )
+
+
+def samples_of_loaded(view: View, dark: Mask, saturated: Mask, step: float) -> SetSamples:
+    """The samples of a view as loaded: with its mask, its exposures, and rays through a filter before the lens.
+
+    Raises:
+        PolarguideError: its known pictures do not determine Stokes vectors.
+    """
+    places = known_places(view.name, view.exposures)
+    exposures = [replace(view.exposures[k], gain=1.0) for k in places]
+    intensities = view.intensities()[places]
+    if view.mount == "filter":  # what a polarizer behind the lens would have measured
+        rays, stokes = view.camera.rays(), view.stokes()
+        more = analyzers(exposures, rays, "sensor")[..., None, None] - analyzers(exposures, rays, "filter")
+        intensities = intensities + torch.einsum("ksyx,syxc->kyxc", more, stokes[1:]) / 2
+    invalid = view.invalid.numpy()
+    return SetSamples(
+        labels=tuple(f"picture {k + 1}" for k in places),
+        values=intensities.numpy(),
+        exposures=tuple(exposures),
+        lost=np.broadcast_to(saturated, (len(places), *saturated.shape)),
+        dark=dark,
+        masked=invalid if view.mask is None else invalid | ~view.mask.numpy(),
+        step=step,
+        notes=_unused(len(view.exposures) - len(places)),
+    )
+
+
+def _degrees(angle: Angle) -> float:
+    """An angle that is known to be a number."""
+    assert not isinstance(angle, str)
+    return angle
+
+
+def _unused(count: int) -> tuple[str, ...]:
+    """The note about pictures that a fit cannot use."""
+    return (f"{count} pictures without a known angle are not used.",) if count else ()

@@ -1,0 +1,311 @@
+"""Find sets of pictures at any polarizer angles: by names, folders, a table, or frames of a video."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from polarguide.capture.exposures import (
+    TABLE,
+    WELL_CONDITIONED,
+    Angle,
+    Exposure,
+    Line,
+    angle_text,
+    conditioning,
+    nominal,
+    normalized,
+    read_table,
+)
+from polarguide.capture.filter.shots import SHOT_SUFFIXES, split_name
+from polarguide.capture.layout import ambiguous, list_files
+from polarguide.capture.view import ANGLES, listed
+from polarguide.core.errors import PolarguideError
+from polarguide.shots.video import VIDEO_SUFFIXES, frame_table, read_frame_table
+
+FEWEST = 3
+"""Different angles that determine a Stokes vector."""
+_NUMBERED = re.compile(r"(?:(?P<view>.+?)[-_ .]+)?(?P<number>\d{1,3}(?:\.\d+)?)")
+_SMALLEST_STEP = 2.0
+"""Degrees: numbers that rise by one may count pictures."""
+_ALIKE = 1e-6
+
+
+@dataclass(frozen=True)
+class SetPicture:
+    """One picture of a set.
+
+    Attributes:
+        path: of the picture, or of the video.
+        angle: of the polarizer as the user counts it, degrees; "unknown", or "none" without a polarizer: not used.
+        gain: exposure relative to the others, where a table states it.
+        frame: of the video, from 0; None for a picture file.
+    """
+
+    path: Path
+    angle: Angle
+    gain: float | None = None
+    frame: int | None = None
+
+    @property
+    def label(self) -> str:
+        """What messages call it."""
+        return self.path.name if self.frame is None else f"{self.path.name} frame {self.frame}"
+
+
+@dataclass(frozen=True)
+class PictureSet:
+    """Pictures of one view at known angles.
+
+    Attributes:
+        name: of the view.
+        pictures: sorted by angle.
+        table: that states the angles, if one does.
+        fault: why nothing can be measured with them.
+    """
+
+    name: str
+    pictures: tuple[SetPicture, ...]
+    table: Path | None = None
+    fault: PolarguideError | None = None
+
+    @property
+    def is_four(self) -> bool:
+        """Whether it is one picture each at 0, 45, 90 and 135 degrees, as the four-angle path takes them."""
+        plain = all(p.gain is None and p.frame is None for p in self.pictures)
+        return plain and sorted(str(p.angle) for p in self.pictures) == sorted(str(float(a)) for a in ANGLES)
+
+
+def require_determined(where: object, angles: Sequence[Angle]) -> None:
+    """Refuse angles that do not determine a Stokes vector, or hardly.
+
+    Raises:
+        PolarguideError: fewer than three known angles differ modulo 180 degrees, or all are too much alike.
+    """
+    words = listed([angle_text(angle) for angle in angles], 12)
+    exposures = [Exposure(normalized(angle)) for angle in angles if not isinstance(angle, str)]
+    different = len({round(e.angle or 0.0, 6) % 180 for e in exposures})
+    if different < FEWEST:
+        raise PolarguideError(
+            where,
+            expected="pictures at three or more different angles (modulo 180 degrees)",
+            found=f"{different} ({words})",
+            remedy="Add pictures: 0, 60 and 120 degrees are enough.",
+        )
+    condition = conditioning(nominal(exposures))
+    if condition < WELL_CONDITIONED:
+        raise PolarguideError(
+            where,
+            expected=f"angles spread over half a turn, with a conditioning of {WELL_CONDITIONED:g} or more",
+            found=f"{condition:.2g} ({words})",
+            remedy="Turn the polarizer further: 0, 60 and 120 degrees have 0.71.",
+        )
+
+
+def known_places(view: str, exposures: Sequence[Exposure]) -> list[int]:
+    """The places of the pictures of a view at known angles.
+
+    Raises:
+        PolarguideError: they do not determine Stokes vectors.
+    """
+    angles: list[Angle] = [
+        e.angle if e.angle is not None else "unknown" if e.filtered else "none" for e in exposures
+    ]
+    require_determined(f"view {view}", angles)
+    return [place for place, angle in enumerate(angles) if not isinstance(angle, str)]
+
+
+def _made(
+    name: str,
+    pictures: Iterable[SetPicture],
+    table: Path | None = None,
+    fault: PolarguideError | None = None,
+) -> PictureSet:
+    """A set with its pictures in order, and its fault if its angles determine nothing."""
+    mine = tuple(sorted(pictures, key=_order))
+    if fault is None:
+        try:
+            require_determined(f"{(table or mine[0].path.parent)} ({name})", [p.angle for p in mine])
+        except PolarguideError as error:
+            fault = error
+    return PictureSet(name, mine, table, fault)
+
+
+def _order(picture: SetPicture) -> tuple[bool, float, str, int]:
+    word = isinstance(picture.angle, str)
+    angle = 0.0 if isinstance(picture.angle, str) else picture.angle
+    return word, angle, picture.path.name, picture.frame or 0
+
+
+def angles_of_names(names: Sequence[str], *, folders: bool = False) -> list[tuple[str, Angle] | None]:
+    """View ("" where the name is an angle alone) and angle that each name states; None where it states none.
+
+    A number counts as an angle where ``prepare`` takes it for one, and where all numbers of a view are evenly spaced
+    over half a turn or a whole one: 10, 40, ..., 160, or 0 to 175 by 5. ``folders``: names such as I_10 are angles
+    alone, and no view I.
+    """
+    found = [_stated(name, folders) for name in names]
+    numbered: dict[str, list[tuple[int, float]]] = {}
+    for place, name in enumerate(names):
+        match = _NUMBERED.fullmatch(name)
+        if match is not None:
+            numbered.setdefault(match["view"] or "", []).append((place, float(match["number"])))
+    for view, places in numbered.items():
+        if covers_turn([number for _, number in places]):
+            for place, number in places:
+                if not folders or found[place] is None:
+                    found[place] = view, number
+    return found
+
+
+def _stated(name: str, folder: bool) -> tuple[str, Angle] | None:
+    """View and angle by ``prepare``'s rule for the names of pictures, or of folders."""
+    found = None if folder else split_name(name)
+    if found is None and (alone := split_name(f"x_{name}")) is not None and alone[0] == "x":
+        return "", alone[1]
+    return found
+
+
+def covers_turn(angles: Sequence[float]) -> bool:
+    """Whether angles in degrees are evenly spaced over half a turn or a whole one, its end included or not."""
+    different = sorted(set(angles))
+    if len(different) < FEWEST:
+        return False
+    steps = [b - a for a, b in itertools.pairwise(different)]
+    step, count = steps[0], len(different)
+    even = step >= _SMALLEST_STEP and all(abs(other - step) < _ALIKE for other in steps)
+    return even and any(abs(span - turn) < _ALIKE for span in (step * count, step * (count - 1))
+                        for turn in (180.0, 360.0))  # fmt: skip
+
+
+def by_name(files: Sequence[Path]) -> tuple[list[PictureSet], list[Path]]:
+    """Sets by the names of files, and the files that are none of a set: of four angles at most, or without an angle.
+
+    Files named like angles alone are one set, called like their folder, where there is nothing else among the files.
+    """
+    sets: list[PictureSet] = []
+    rest: list[Path] = []
+    for folder in dict.fromkeys(path.parent for path in files):
+        inside = [path for path in files if path.parent == folder]
+        stated = angles_of_names([path.stem for path in inside])
+        alone = all(name is not None and name[0] == "" for name in stated)
+        views: dict[str, list[SetPicture]] = {}
+        for path, name in zip(inside, stated, strict=True):
+            if name is None or (name[0] == "" and not alone):
+                rest.append(path)
+            else:
+                views.setdefault(name[0] or folder.resolve().name, []).append(SetPicture(path, name[1]))
+        more, four = _any_angles(folder, views)
+        sets += more
+        rest += four
+    return sets, rest
+
+
+def by_folder(root: Path) -> list[PictureSet]:
+    """Sets by folders named like angles, a file of each view in each; nothing where these are four at most."""
+    folders = [path for path in sorted(root.iterdir()) if path.is_dir() and not path.name.startswith(".")]
+    stated = angles_of_names([path.name for path in folders], folders=True)
+    views: dict[str, list[SetPicture]] = {}
+    for folder, name in zip(folders, stated, strict=True):
+        if name is not None and name[0] == "":
+            for path in list_files(folder, SHOT_SUFFIXES):
+                views.setdefault(path.stem, []).append(SetPicture(path, name[1]))
+    if all(picture.angle in ANGLES for mine in views.values() for picture in mine):
+        return []
+    return [_named_set(root, view, mine) for view, mine in sorted(views.items())]
+
+
+def _any_angles(folder: Path, views: dict[str, list[SetPicture]]) -> tuple[list[PictureSet], list[Path]]:
+    """The sets of a folder; and the files of views at 0, 45, 90 and 135 degrees, or some of them."""
+    sets, four = [], []
+    for view, mine in sorted(views.items()):
+        if all(picture.angle in ANGLES for picture in mine):
+            four += [picture.path for picture in mine]
+        else:
+            sets.append(_named_set(folder, view, mine))
+    return sets, four
+
+
+def _named_set(folder: Path, view: str, pictures: Sequence[SetPicture]) -> PictureSet:
+    """A set by names: two files that state the same number are one picture too many."""
+    seen: dict[Angle, Path] = {}
+    for picture in pictures:
+        if picture.angle in seen:
+            what = f"one picture of {view} at {angle_text(picture.angle)} degrees"
+            return _made(view, pictures, fault=ambiguous(folder, what, seen[picture.angle], picture.path))
+        seen[picture.angle] = picture.path
+    return _made(view, pictures)
+
+
+def by_table(root: Path) -> tuple[list[PictureSet], list[Path]]:
+    """Sets that the table ``angles.csv`` of a folder lists, and the pictures of the folder that it does not list.
+
+    Lines with one view are a set. Lines without a view are sets by the names of their files where all of these state a
+    view, else one set called like the folder. Doubles are taken as they are.
+
+    Raises:
+        PolarguideError: the table cannot be read, or names files outside of the folder or of other kinds.
+    """
+    table = root / TABLE
+    lines = read_table(table)
+    base = root.resolve()
+    for line in lines:
+        path = root / line.file
+        inside = path.resolve().is_relative_to(base)
+        if not inside or path.suffix.lower() not in SHOT_SUFFIXES:
+            raise PolarguideError(
+                f"{table} (line {line.number})",
+                expected=f"a picture in {root} ({', '.join(SHOT_SUFFIXES)})",
+                found=line.file,
+                remedy="Copy or convert the file, or remove the line.",
+            )
+    views: dict[str, list[Line]] = {}
+    for line, view in zip(lines, _views_of(root, lines), strict=True):
+        views.setdefault(view, []).append(line)
+    taken = {(root / line.file).resolve() for line in lines}
+    others = [path for path in list_files(root, SHOT_SUFFIXES) if path.resolve() not in taken]
+    return [_of_lines(root, table, view, mine) for view, mine in sorted(views.items())], others
+
+
+def _views_of(root: Path, lines: Sequence[Line]) -> list[str]:
+    """The view of each line."""
+    without = [line for line in lines if line.view is None]
+    named = angles_of_names([Path(line.file).stem for line in without])
+    all_named = all(name is not None and name[0] for name in named)
+    of_file = {
+        line.file: name[0] if all_named and name is not None else root.resolve().name
+        for line, name in zip(without, named, strict=True)
+    }
+    return [of_file[line.file] if line.view is None else line.view for line in lines]
+
+
+def _of_lines(root: Path, table: Path, view: str, lines: Sequence[Line]) -> PictureSet:
+    pictures = [SetPicture(root / line.file, line.angle, line.gain) for line in lines]
+    missing = [picture.path for picture in pictures if not picture.path.is_file()]
+    if not missing:
+        return _made(view, pictures, table)
+    fault = PolarguideError(
+        table,
+        expected=f"the file {missing[0]}",
+        found="nothing of this name",
+        remedy="Correct the name, or remove the line.",
+    )
+    there = [picture for picture in pictures if picture.path.is_file()]
+    return _made(view, there, table, fault)
+
+
+def videos(files: Sequence[Path]) -> list[PictureSet]:
+    """Each video as a set, with the frames that the table beside it lists."""
+    return [_video(path) for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
+
+
+def _video(path: Path) -> PictureSet:
+    table = frame_table(path)
+    try:
+        pictures = [SetPicture(path, angle, None, frame) for frame, angle in read_frame_table(table, path)]
+    except PolarguideError as error:
+        return _made(path.stem, [SetPicture(path, "unknown")], None, error)
+    return _made(path.stem, pictures, table)
