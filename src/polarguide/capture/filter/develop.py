@@ -156,12 +156,12 @@ def rounding_of_bytes(transfer: str, smallest: float) -> Rounding:
     return rounding_of(FULL_CODE * smallest * (srgb_decode_array(shown) if transfer == "srgb" else shown))
 
 
-def decide_transfer(shots: Sequence[Shots], *, jpeg: bool) -> TransferDecision:
+def decide_transfer(shots: Sequence[Shots], *, lossy: bool) -> TransferDecision:
     """The transfer by the curvature of the response (``checks.encoding``), as ``inspect`` judges it.
 
     Args:
         shots: some views, aligned well enough (as from a tripod).
-        jpeg: whether the files are JPEG, for the default where the curvature does not decide.
+        lossy: whether the files are JPEG or WebP, for the default where the curvature does not decide.
     """
     measures = [
         checks.measure(linear_codes(view.pictures, "linear"), ~(view.clipped.any(axis=0) | view.dark))
@@ -174,6 +174,6 @@ def decide_transfer(shots: Sequence[Shots], *, jpeg: bool) -> TransferDecision:
         said = f"the curvature of the response is {slope:+.2f}; linear files have 0, sRGB about -0.6"
     if found is not None:
         return TransferDecision(found, f"{found}: {said}")
-    fallback = "srgb" if jpeg else "linear"
-    kind = "JPEG files" if jpeg else "PNG and TIFF files"
+    fallback = "srgb" if lossy else "linear"
+    kind = "JPEG and WebP files" if lossy else "PNG, TIFF and BMP files"
     return TransferDecision(fallback, f"{fallback}, as {kind} usually are: {said} (--transfer sets it)")
