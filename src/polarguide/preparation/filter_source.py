@@ -248,6 +248,7 @@ class FilterSource(ShotsSource):
         turned = np.stack([apply_orientation(picture, code) for picture in linear])
         record = {
             "shifts": [[shift.x, shift.y] for shift in found.shifts],
+            "warps": [shift.warp for shift in found.shifts],
             "shifts_corrected": [shift.corrected for shift in found.shifts],
             "pair_ratio": ratio,
             "light": [round(value, 6) for value in exposed.gains],
@@ -284,7 +285,11 @@ def development_of(paths: Sequence[Path], settings: PrepareSettings) -> tuple[fl
 def shift_notes(view: str, shifts: list[Shift]) -> list[str]:
     """Notes about shots that were shifted, and about shots without a reliable estimate."""
     named = list(zip(ANGLES, shifts, strict=True))
-    moved = [f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f})" for angle, shift in named if shift.corrected]
+    moved = [
+        f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f}){'' if shift.warp is None else ' and turned'}"
+        for angle, shift in named
+        if shift.corrected
+    ]
     doubtful = [str(angle) for angle, shift in named if not shift.trusted]
     notes = [f"{view}: shots moved, in pixels: {', '.join(moved)}."] if moved else []
     if doubtful:

@@ -50,8 +50,8 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
 
     Args:
         path: where ``data`` came from, for messages.
-        data: the whole file: PNG, JPEG, WebP, BMP, PGM, PPM or TIFF with 8 or 16 bits a channel, gray or color; TIFF
-            of floating-point numbers from 0 to 1, which become 16 bits (larger ones are at full scale). Samples of fewer
+        data: the whole file: PNG, JPEG, WebP, BMP, PGM, PPM or TIFF of 8 or 16 bits a channel, gray or color; TIFF
+            of floating-point numbers from 0 to 1, which become 16 bits (larger ones are at full scale). Those of fewer
             bits (10 to 14 in TIFF, PGM of another full scale) are brought to the full scale of 8 or 16. Alpha is
             dropped, an orientation tag is not applied (poses belong to the stored pixels).
 

@@ -13,12 +13,14 @@ _BEYOND_NOISE = 6.0
 _OF_LIGHT = 0.5
 """Light that raises one analyzer raises the two at 45 degrees to it by as much together; a defect does not."""
 _BINS = 16
-_AGREE = 0.5
-"""Share of the views in which a sample has to stand out: light moves from view to view, defects stay."""
+_AGREE, _SAME_SIGN = 0.5, 0.75
+"""Shares of the views in which a sample has to stand out, and to lie on one side (views above less views below): light
+moves from view to view, defects stay."""
 
 
-def outliers(values: NDArray[Any], period: int) -> NDArray[np.bool_]:
-    """Samples of one mosaic that stand out from all alike, [H, W].
+def outliers(values: NDArray[Any], period: int) -> tuple[NDArray[np.bool_], NDArray[np.int8]]:
+    """Samples of one mosaic that stand out from all alike, [H, W]; and where samples lie above (1) or below (-1) the
+    median of those alike by more than noise explains.
 
     A sample stands out if it lies beyond its eight neighbors behind one analyzer and color by more than these differ
     among themselves and than noise explains, while the other analyzers of its cell see nothing of it. The noise is that
@@ -40,8 +42,8 @@ def outliers(values: NDArray[Any], period: int) -> NDArray[np.bool_]:
     rise = values - middle
     beyond = np.abs(rise) - np.maximum(around.max(axis=0) - middle, middle - around.min(axis=0))
     noise = _noise(rise, middle)
-    found = (beyond > spread) & (np.abs(rise) > _BEYOND_NOISE * noise)
-    return np.asarray(found & _alone(rise))
+    off = np.abs(rise) > _BEYOND_NOISE * noise
+    return np.asarray(off & (beyond > spread) & _alone(rise)), (np.sign(rise) * off).astype(np.int8)
 
 
 def _noise(rise: NDArray[np.float32], middle: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -69,12 +71,15 @@ def _alone(rise: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def defects(mosaics: Iterable[NDArray[Any]], period: int) -> NDArray[np.bool_]:
-    """The samples that stand out in at least half of the mosaics of a capture, one or more, [H, W]."""
+    """The samples that stand out in at least half of the mosaics of a capture and are off in nearly all, [H, W]."""
     votes: NDArray[np.int32] | None = None
+    signs: NDArray[np.int32] | None = None
     count = 0
     for values in mosaics:
-        found = outliers(values, period)
-        votes = found.astype(np.int32) if votes is None else votes + found
+        out, sign = outliers(values, period)
+        votes = out.astype(np.int32) if votes is None else votes + out
+        signs = sign.astype(np.int32) if signs is None else signs + sign
         count += 1
     assert votes is not None
-    return np.asarray(votes >= _AGREE * count)
+    assert signs is not None
+    return np.asarray((votes >= _AGREE * count) & (np.abs(signs) >= _SAME_SIGN * count))
