@@ -158,8 +158,8 @@ _TURN_SIDE = 1024
 
 
 def _turn(reference: NDArray[np.float32], other: NDArray[np.float32], shift: Shift) -> Shift:
-    """The shift and rotation of a shot whose camera was turned, beginning with its shift; the shift itself where none converges, or
-    where it moves no corner otherwise.
+    """The shift and rotation of a shot whose camera was turned, beginning with its shift; the shift itself where none
+    converges, or where no corner moves otherwise.
     """
     height, width = reference.shape
     if min(height, width) < 2:

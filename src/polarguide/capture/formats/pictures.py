@@ -100,7 +100,8 @@ def _codes_of_floats(path: Path, pixels: NDArray[Any]) -> NDArray[np.uint16]:
             found=found,
             remedy="Divide by the value at which the camera saturates, or save 16-bit whole numbers.",
         )
-    return np.rint(np.clip(pixels, 0.0, 1.0) * FULL_CODE).astype(np.uint16)
+    # Half precision ends at 65504, below the largest code.
+    return np.rint(np.clip(pixels.astype(np.float64), 0.0, 1.0) * FULL_CODE).astype(np.uint16)
 
 
 def decode_mask(path: Path, data: bytes, *, any_value: bool) -> NDArray[np.bool_]:

@@ -29,8 +29,8 @@ def unpack(data: bytes, width: int, height: int, packing: str) -> NDArray[Any]:
 
     ``8`` and ``16`` are whole bytes, the low one first. ``10p`` and ``12p`` are little-endian bit streams, low bits
     first: bit b of pixel k is bit ``bits * k + b`` of the file (GenICam PFNC). In ``12packed`` (GigE
-    Vision) bytes 0 and 2 are the high eight bits of two pixels, the low nibble of byte 1 the low four bits of the first,
-    its high nibble those of the second.
+    Vision) bytes 0 and 2 are the high eight bits of two pixels, the low nibble of byte 1 the low four bits of the
+    first, its high nibble those of the second.
 
     Args:
         data: exactly ``packed_size`` bytes.
