@@ -53,6 +53,7 @@ class _Scene(msgspec.Struct):
     refractive_index: Index | None = None
     objects: list[_Object] = []
     prepare: Any = None
+    sensor: Any = None
 
 
 class _Polarizer(msgspec.Struct):
@@ -187,3 +188,15 @@ def applied_calibration(path: Path, data: bytes | None) -> Calibration | None:
     for correction in scene.corrections:
         found = None if found is None else combined(found, correction.calibration())
     return found
+
+
+def of_mosaics(path: Path, data: bytes | None) -> bool:
+    """Whether ``prepare`` made a scene of the mosaics of a sensor.
+
+    Args:
+        path: ``scene.json``, for messages. data: its content, or None if there is no such file.
+    """
+    if data is None:
+        return False
+    scene = decode(data, _Scene, path, remedy="Prepare the scene again.")
+    return scene.prepare is not None and isinstance(scene.sensor, str)

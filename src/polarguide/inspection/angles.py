@@ -243,6 +243,16 @@ class Hypothesis:
     log_odds: float
 
 
+MOSAICS = {
+    (1, 45): "--flip x (Reverse X)",
+    (1, 135): "--flip y (Reverse Y)",
+    (1, 90): "--flip xy (Reverse X and Y), or --offset-x 1 --offset-y 1",
+    (-1, 135): "--offset-x 1",
+    (-1, 45): "--offset-y 1",
+}
+"""Sense and zero that geometry finds -> what makes such angles of the mosaics of a sensor."""
+
+
 @dataclass(frozen=True, eq=False)
 class AngleFindings:
     """The findings on the polarizer angles by geometry.
@@ -251,12 +261,14 @@ class AngleFindings:
         pairing: index into ``PAIRINGS``, from the pair sums. sources: the evidence.
         posterior: of all usable evidence together; None if there is none.
         applied: what ``prepare`` took the angles for; None for a scene of another origin.
+        mosaic: whether ``prepare`` made the pictures of mosaics of a sensor.
     """
 
     pairing: int
     sources: tuple[Evidence, ...]
     posterior: OrderPosterior | None
     applied: Calibration | None = None
+    mosaic: bool = False
 
     def correction(self, offset: float) -> str:
         """What to do about a decided order and an offset beside it: the whole calibration, not the difference."""
@@ -264,12 +276,28 @@ class AngleFindings:
             return ""
         if self.applied is None:
             return f"{FIX}."
+        mirrored = self._mirrored(offset)
+        if mirrored:
+            return mirrored
         whole = combined(self.applied, Calibration(order=self.files, zero=round(offset, 1)))
         if whole is None:
             return f"{FIX}."
         return (
             f"{FIX}, or repeat prepare with {whole.options()} and a new --out. That is the whole calibration; the "
             f"scene was prepared with {self.applied.options()}."
+        )
+
+    def _mirrored(self, offset: float) -> str:
+        """What to do where the order is that of a sensor's mosaic that was mirrored, or cut at odd pixels."""
+        straight = self.applied is not None and self.applied.true_angles() == (ANGLES, 0.0)
+        if not self.mosaic or not straight or self.order is None or abs(offset) > ZERO_OFF:
+            return ""
+        options = MOSAICS.get((self.order.sense, self.order.zero))
+        if options is None:
+            return ""
+        return (
+            f"A sensor's angles are fixed: the camera mirrored the mosaics, or their region begins elsewhere. Repeat "
+            f"prepare with {options} and a new --out."
         )
 
     @property
@@ -328,11 +356,11 @@ class AngleFindings:
 
 
 def combine_evidence(
-    sources: Sequence[Evidence], pairing: int, applied: Calibration | None = None
+    sources: Sequence[Evidence], pairing: int, applied: Calibration | None = None, *, mosaic: bool = False
 ) -> AngleFindings:
-    """Combine the usable sources of evidence; ``applied`` as in ``AngleFindings``."""
+    """Combine the usable sources of evidence; ``applied`` and ``mosaic`` as in ``AngleFindings``."""
     usable = [posterior(evidence) for evidence in sources if evidence.usable]
-    return AngleFindings(pairing, tuple(sources), combine(usable) if usable else None, applied)
+    return AngleFindings(pairing, tuple(sources), combine(usable) if usable else None, applied, mosaic)
 
 
 def order_check(angles: AngleFindings) -> Check:

@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from polarguide import optics
 from polarguide.capture import checks
-from polarguide.capture.view import FULL_CODE, listed
+from polarguide.capture.pair_sums import MeasuredGains, measured_gains, pair_moments
+from polarguide.capture.view import ANGLES, FULL_CODE, listed
 from polarguide.inspection.angles import PAIRINGS, swaps
 from polarguide.inspection.capture import POLARIZED, Capture, ViewMeasurements
 from polarguide.inspection.evidence import ZENITH_MARGIN, SurfaceSamples
@@ -21,6 +23,9 @@ PAIR_ERROR = 0.05
 """Median |I0 + I90 - I45 - I135| / S0 of a view above which its four pictures are inconsistent."""
 UNEQUAL, VERY_UNEQUAL = 0.01, 0.04
 """Deviations of the pair ratio from 1. A picture exposed 5 % longer gives 0.025; real sensors have about 0.02."""
+OTHERWISE, VERY_OTHERWISE = 0.08, 0.17
+"""Largest difference of the logarithms of the gains of two angles. Angles that are marked to two degrees leave 0.07,
+real sensors 0.04; a picture that was exposed by a third of a stop otherwise gives 0.23."""
 UNSTEADY = 0.01
 """Deviation of a view's pair ratio from the capture's."""
 SATURATED, BLOWN = 0.05, 0.3
@@ -40,20 +45,32 @@ def find_pairing(capture: Capture) -> int | None:
     residuals = residuals[residuals.max(axis=1) > 0]
     if len(residuals) == 0:
         return None
+    exposed = measured_exposures(capture)
+    if exposed is not None and exposed.pairing is not None and max(exposed.errors) < OTHERWISE / 3:
+        return exposed.pairing  # whatever the exposures are
     medians = np.median(residuals, axis=0)
     best = int(medians.argmin())
     others = np.delete(medians, best)
     return best if medians[best] < 0.5 * float(others.min()) else None
 
 
+def measured_exposures(capture: Capture) -> MeasuredGains | None:
+    """The exposures of the four angles by the pair sums of all views; None where they are too dark."""
+    moments = [
+        pair_moments(view.intensities().mean(dim=-1).numpy(), view.usable.numpy()) for view in capture.views
+    ]
+    return measured_gains(np.concatenate(moments))
+
+
 def picture_checks(
     capture: Capture, measurements: Sequence[ViewMeasurements], pairing: int | None
 ) -> list[Check]:
     """All checks of this file, in their order on the page."""
+    exposed = measured_exposures(capture)
     return [
         _pairs(capture, measurements, pairing),
         _encoding(capture, pairing),
-        _exposure(measurements, pairing),
+        _exposure(measurements, pairing, exposed),
         _saturation(capture, measurements),
         _noise(measurements),
         _polarization(measurements),
@@ -89,26 +106,73 @@ def _pairs(capture: Capture, measurements: Sequence[ViewMeasurements], pairing: 
     return Check(key, title, "ok", said, figures=figures)
 
 
+BENT, WRONG = 0.05, 0.1
+"""Curvatures of the response: a gamma of 0.9 has -0.056, of 0.83 -0.1; DoLP is then off by as much as the gamma."""
+
+
 def _encoding(capture: Capture, pairing: int | None) -> Check:
     key, title = "encoding", "Linear encoding"
     slope = checks.curvature([view.measures for view in capture.views])
     if slope is None or pairing not in (None, 0):
         why = "too few pixels are polarized" if slope is None else "the pictures are paired wrongly"
         return Check(key, title, "n/a", f"The curvature of the response cannot be measured: {why}.")
-    figures = {"curvature": slope}
+    bend = response_curvature(capture)
+    figures = {"curvature": slope} if bend is None else {"curvature": bend[0], "curvature_error": bend[1]}
+    slope = slope if bend is None else bend[0]
+    sure = bend is not None and abs(slope) > _SURE_BEND * bend[1]
     said = f"Curvature of the response {slope:+.2f}; linear files have 0, sRGB read as linear about -0.6."
     low, high = (abs(slope) > abs((checks.ENCODED if slope < 0 else checks.DECODED)[k]) for k in (0, 1))
+    low, high = low or (sure and abs(slope) > BENT), high or (sure and abs(slope) > WRONG)
     if not low:
         return Check(key, title, "ok", said, figures=figures)
+    gamma = 1 / (1 - 2 * slope)
     remedy = (
-        "The files seem display-encoded (gamma): export linear ones, or read them with --transfer srgb."
+        "The files seem display-encoded (gamma): export linear ones, or read them with --transfer srgb; mosaics of a "
+        f"camera with gamma are prepared with --gamma (here about {gamma:.2f})."
         if slope < 0
         else "The files seem linear but are decoded (or have another tone curve): try --transfer linear."
     )
     return Check(key, title, "wrong" if high else "warning", said, remedy, figures=figures)
 
 
-def _exposure(measurements: Sequence[ViewMeasurements], pairing: int | None) -> Check:
+_SURE_BEND = 4.0
+_GROUPS = 16
+
+
+def response_curvature(capture: Capture) -> tuple[float, float] | None:
+    """Curvature of the response and its standard error; None where too few pixels are polarized.
+
+    The slope of ``checks.Measures``, with S1/S0 and S2/S0 beside it in the regression: gains that differ, and angles
+    that are off, bend nothing. The error is a jackknife over groups of pixels that lie together.
+    """
+    groups: list[NDArray[np.float64]] = []
+    for view in capture.views:
+        gray = view.intensities().mean(dim=-1).numpy().astype(np.float64)
+        good = view.usable.numpy() & (gray.min(axis=0) > 1 / 256)
+        i0, i45, i90, i135 = gray[:, good]
+        s0 = (i0 + i45 + i90 + i135) / 2
+        x, y = (i0 - i90) / s0, (i45 - i135) / s0
+        rows = np.stack([np.ones_like(x), x, y, x * x - y * y, (i0 + i90 - i45 - i135) / s0])
+        groups += [
+            part @ part.T for part in np.array_split(rows, max(2, _GROUPS // len(capture.views)), axis=1)
+        ]
+    total = np.sum(groups, axis=0)
+
+    def slope(moments: NDArray[np.float64]) -> float:
+        return float(np.linalg.lstsq(moments[:4, :4], moments[:4, 4], rcond=None)[0][3])
+
+    count = total[0, 0]
+    if count < 1000 or total[3, 3] / count - (total[0, 3] / count) ** 2 < 0.005**2:
+        return None
+    found = slope(total)
+    without = np.array([slope(total - part) for part in groups])
+    error = math.sqrt(float(((without - found) ** 2).sum()) * (len(groups) - 1) / len(groups))
+    return found, error
+
+
+def _exposure(
+    measurements: Sequence[ViewMeasurements], pairing: int | None, exposed: MeasuredGains | None
+) -> Check:
     key, title = "exposure", "Equal exposure of the angles"
     known = [r for r in measurements if r.pair_ratio is not None]
     if not known or pairing not in (None, 0):
@@ -125,6 +189,19 @@ def _exposure(measurements: Sequence[ViewMeasurements], pairing: int | None) -> 
         remedy = (
             "Let prepare estimate the gains (it does by default), or measure them on unpolarized light and give "
             "--calibration. The pair sums do not show which of the four deviates."
+        )
+    apart = 0.0 if exposed is None else float(np.ptp(exposed.logs))
+    if exposed is not None and apart > max(OTHERWISE, 3 * max(exposed.errors)):
+        figures["exposures"] = list(np.exp(exposed.logs))
+        wrong = verdict == "wrong" or apart > max(VERY_OTHERWISE, 3 * max(exposed.errors))
+        verdict = "wrong" if wrong else "warning"
+        each = ", ".join(
+            f"{angle}°: {value:.2f}" for angle, value in zip(ANGLES, np.exp(exposed.logs), strict=True)
+        )
+        said += f" Pixel by pixel, they agree if the angles were exposed by {each}."
+        remedy = (
+            "Prepare the original files, whose EXIF says the exposure, with --gains auto; or give gains with "
+            "--calibration. An angle that is off by several degrees looks alike."
         )
     if off:
         verdict = "warning" if verdict == "ok" else verdict

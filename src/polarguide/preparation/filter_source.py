@@ -6,11 +6,12 @@ import itertools
 import math
 import warnings
 from collections import Counter
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,19 +44,27 @@ from polarguide.capture.filter.shots import (
     read_stack,
     require_four_shots,
 )
-from polarguide.capture.formats.pictures import read_picture, stated_size
+from polarguide.capture.formats.pictures import is_lossy, read_picture, stated_size
 from polarguide.capture.memory import require_memory_of_each
+from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.write import EXACT, Rounding
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.progress import Advance
 from polarguide.preparation.settings import PrepareSettings, white_gains
+from polarguide.preparation.shot_exposures import (
+    ShotExposures,
+    exposure_notes,
+    exposures_of_view,
+    stated_exposures,
+)
+from polarguide.preparation.shot_levels import levels_of_shots
 from polarguide.preparation.source import DevelopedView, Source, Stored
 
 _JUDGED_VIEWS = 8
 # Bytes for each pixel of a shot: as stored and stacked, linear, aligned or turned, written.
 _WORKED = 3 * (2 + 2 + 4 + 4 + 4)
-_JPEG = (".jpg", ".jpeg")
+LOSSY = "JPEG or WebP"
 _RAW = "Transfer linear: camera raw, developed without tone curve, alike for all shots."
 
 
@@ -108,10 +117,16 @@ class ShotsSource(Source):
             return EXACT
         return rounding_of_bytes(transfer, smallest)
 
-    def _linear(self, view: str, transfer: str, *, align: bool) -> _Linear:
+    def _name(self, path: Path) -> str:
+        """A photograph's name in its folder."""
+        return path.relative_to(self._root).as_posix()
+
+    def _linear(self, view: str, measured: dict[str, Any], *, align: bool) -> _Linear:
         """The shots of a view: validity, transfer, and shifts where there are four to align."""
-        shots = read_stack(self._of_view[view], self._white)
-        linear, bad = linear_intensities(shots.pictures, transfer), shots.clipped | shots.dark
+        levels = None if measured.get("levels") is None else msgspec.convert(measured["levels"], Levels)
+        shots = read_stack(self._of_view[view], self._white, levels)
+        linear = linear_intensities(shots.pictures, measured["transfer"])
+        bad = shots.clipped | shots.dark
         shifts, notes = [Shift(0.0, 0.0, True)] * len(linear), []
         if align:
             shifts = estimate_shifts(linear)
@@ -164,9 +179,10 @@ class FilterSource(ShotsSource):
     """Shots of an ordinary camera through a rotating linear polarizer."""
 
     kind = "filter"
-    needs = ("transfer", "scale")
+    needs = ("transfer", "scale", "light")
 
     def __init__(self, root: Path, settings: PrepareSettings) -> None:
+        self._root = root
         shots = find_shots(root, nested=True)
         require_four_shots(root, shots)
         unused = [path.name for path in list_shots(root, nested=True)[1]]
@@ -186,15 +202,16 @@ class FilterSource(ShotsSource):
         if transfer == "auto" and all(map(is_camera_raw, self.paths)):
             transfer = "linear"
             notes.append(_RAW)
+        levels, counted = levels_of_shots(self._shots, self._white, self._settings)
+        notes += counted
         if transfer == "auto":
             step = max(1, math.ceil(len(self.views) / _JUDGED_VIEWS))
-            judged = []
-            for view in self.views[::step]:
-                judged.append(read_stack(self._of_view[view], self._white))
-                advance(len(judged) * step)
-            decision = decide_transfer(judged, jpeg=self.paths[0].suffix.lower() in _JPEG)
+            judged = [read_stack(self._of_view[view], self._white, levels) for view in self.views[::step]]
+            decision = decide_transfer(judged, lossy=is_lossy(self.paths[0]))
             transfer = decision.transfer
             notes.append(f"Transfer {decision.reason}.")
+        stated = stated_exposures(self._of_view, advance) if asked.gains == "auto" else {}
+        notes += exposure_notes(stated, len(self.views))
         # One scale for all shots, with room for the largest gain that is corrected.
         room = math.sqrt(1.0 - LARGEST_IMBALANCE)
         if gains is None and asked.gains == "auto":
@@ -203,14 +220,34 @@ class FilterSource(ShotsSource):
             asked.calibration.peak
         )
         smallest = scale / (max(gains) if gains is not None else 1.0 / room)
-        rounding = self._rounding(transfer, smallest)
-        return {"transfer": transfer, "scale": scale, "rounding": rounding, "notes": notes}
+        every = [value for of_view in stated.values() for value in of_view] or [1.0]
+        return {
+            "transfer": transfer,
+            "scale": scale * min(1.0, *every),
+            "rounding": self._rounding(transfer, smallest * min(1.0, *every) / max(1.0, *every)),
+            "levels": None if levels is None else asdict(levels),
+            "light": {self._name(path): value for path, value in self._by_file(stated)},
+            "notes": notes,
+        }
+
+    def _by_file(self, stated: dict[str, list[float]]) -> Iterator[tuple[Path, float]]:
+        """The exposures of views by file."""
+        for view, values in stated.items():
+            yield from zip(self._of_view[view], values, strict=True)
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
-        """Read the four shots: validity, transfer, shifts, gains, the sense of the angles, then the turn."""
+        """Read the four shots: validity, transfer, shifts, exposures, gains, the sense of the angles, then the turn."""
         asked = self._settings
-        found = self._linear(view, measured["transfer"], align=asked.align)
-        ratio = pair_ratio(found.linear.mean(axis=3), ~found.invalid)
+        found = self._linear(view, measured, align=asked.align)
+        usable, paths = ~found.invalid, self._of_view[view]
+        light = [measured["light"].get(self._name(path), 1.0) for path in paths]
+        exposed = ShotExposures(UNIT_GAINS)
+        if asked.gains == "auto":
+            exposed = exposures_of_view(paths, found.linear.mean(axis=3), usable, light)
+        if exposed.warning:
+            warnings.warn(f"{view}: {exposed.warning}", PolarguideWarning, stacklevel=2)
+        linear = found.linear / np.asarray(exposed.gains, np.float32)[:, None, None, None]
+        ratio = pair_ratio(linear.mean(axis=3), usable)
         gains = asked.calibration.gains or UNIT_GAINS
         if asked.calibration.gains is None and asked.gains == "auto":
             balance = balancing_gains(ratio)
@@ -222,14 +259,19 @@ class FilterSource(ShotsSource):
                     else f"is off by {ratio - 1:+.1%}, too much for gains"
                 )
                 found.notes.append(f"{view}: (I0 + I90)/(I45 + I135) {why}; not corrected.")
+        # A shot that the pair sums brighten beyond what its file states may exceed full scale: it counts as clipped.
         factors = np.asarray(measured["scale"] / np.asarray(gains), np.float32)
-        linear = oriented(found.linear * factors[:, None, None, None], asked.calibration)
+        linear = linear * factors[:, None, None, None]
+        found.invalid |= np.asarray((linear > 1.0).any(axis=(0, 3)))
+        linear = oriented(np.minimum(linear, 1.0), asked.calibration)
         code = found.orientation
         turned = np.stack([apply_orientation(picture, code) for picture in linear])
         record = {
             "shifts": [[shift.x, shift.y] for shift in found.shifts],
+            "warps": [shift.warp for shift in found.shifts],
             "shifts_corrected": [shift.corrected for shift in found.shifts],
             "pair_ratio": ratio,
+            "light": [round(value, 6) for value in exposed.gains],
             "gains": list(gains),
         }
         return self._developed(found, oriented(turned, orientation_calibration(code)), record)
@@ -263,7 +305,11 @@ def development_of(paths: Sequence[Path], settings: PrepareSettings) -> tuple[fl
 def shift_notes(view: str, shifts: list[Shift]) -> list[str]:
     """Notes about shots that were shifted, and about shots without a reliable estimate."""
     named = list(zip(ANGLES, shifts, strict=True))
-    moved = [f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f})" for angle, shift in named if shift.corrected]
+    moved = [
+        f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f}){'' if shift.warp is None else ' and turned'}"
+        for angle, shift in named
+        if shift.corrected
+    ]
     doubtful = [str(angle) for angle, shift in named if not shift.trusted]
     notes = [f"{view}: shots moved, in pixels: {', '.join(moved)}."] if moved else []
     if doubtful:
@@ -306,6 +352,7 @@ class SinglesSource(ShotsSource):
                 sizes.setdefault(f"{max(size)}x{min(size)}", path)
         self._require_one(sizes, "size", "Export all pictures of one camera alike, without a crop.")
         transfer, reason = self._transfer()
+        levels, counted = levels_of_shots(self._shots, self._white, self._settings)
         light: dict[str, float] = {}
         cameras: dict[str, Path] = {}
         for number, view in enumerate(self.views, 1):
@@ -324,15 +371,16 @@ class SinglesSource(ShotsSource):
             "transfer": transfer,
             "scale": 1.0,
             "rounding": self._rounding(transfer, 1.0),
+            "levels": None if levels is None else asdict(levels),
             "light": light,
-            "notes": [self._summary(), reason, f"{stating} files state their exposure (EXIF)."],
+            "notes": [self._summary(), reason, *counted, f"{stating} files state their exposure (EXIF)."],
         }
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read the shots of a view: validity, transfer, shifts of the usual four, the turn of pictures and angles."""
         asked, mine = self._settings, self._singles[view]
         usual = [shot.angle for shot in mine] == list(ANGLES)
-        found = self._linear(view, measured["transfer"], align=asked.align and usual)
+        found = self._linear(view, measured, align=asked.align and usual)
         code = found.orientation
         turn = orientation_calibration(code)
         angles = [turned(turned(shot.angle, asked.calibration), turn) for shot in mine]
@@ -347,10 +395,6 @@ class SinglesSource(ShotsSource):
         ]
         upright = np.stack([apply_orientation(picture, code) for picture in found.linear])
         return self._developed(found, upright, {"exposures": exposures}, angles)
-
-    def _name(self, path: Path) -> str:
-        """A photograph's name in its folder."""
-        return path.relative_to(self._root).as_posix()
 
     def _require_one(self, found: dict[str, Path], what: str, remedy: str) -> None:
         """Refuse photographs of two cameras or sizes: the first photograph of each, by its name.
@@ -372,7 +416,7 @@ class SinglesSource(ShotsSource):
         """
         asked = self._settings.transfer
         kinds = {
-            "camera raw" if is_camera_raw(path) else "JPEG" if path.suffix.lower() in _JPEG else "PNG or TIFF"
+            "camera raw" if is_camera_raw(path) else LOSSY if is_lossy(path) else "PNG, TIFF or BMP"
             for path in self._shots
         }
         if len(kinds) > 1:
@@ -387,7 +431,7 @@ class SinglesSource(ShotsSource):
             return "linear", _RAW
         if asked != "auto":
             return asked, f"Transfer {asked}, as given."
-        usual = "srgb" if kind == "JPEG" else "linear"
+        usual = "srgb" if kind == LOSSY else "linear"
         return usual, f"Transfer {usual}, as {kind} files usually are (--transfer sets it)."
 
     def _summary(self) -> str:

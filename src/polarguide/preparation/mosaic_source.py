@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -19,13 +20,16 @@ from polarguide.capture.layout import index_files
 from polarguide.capture.memory import require_memory, require_memory_of_each
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import spread_to_cells
+from polarguide.capture.sensor.defects import defects
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
 from polarguide.capture.sensor.pattern import (
+    FULL_16,
     SENSORS,
     SIDE,
     Levels,
     Pattern,
     estimate_levels,
+    level_notes,
     require_kind,
     sensor_pattern,
     tiled,
@@ -73,7 +77,7 @@ class MosaicFiles:
         self.pattern = pattern.shifted(*self.crop)
 
     def read(self, path: Path) -> NDArray[Any]:
-        """The stored values of a whole mosaic, [H, W].
+        """The values of a whole mosaic as the sensor lies, [H, W]: as stored, but for mirroring by the camera.
 
         Raises:
             PolarguideError: the file cannot be read, is too small, or does not fit into memory when it is developed.
@@ -85,7 +89,13 @@ class MosaicFiles:
         elif raw.width is not None and raw.height is not None:
             what = f"a mosaic of {raw.width}x{raw.height}"
             require_memory(path, worked * raw.width * raw.height, what, remedy=remedy)
-        return read_mosaic(path, self._raw, least=SMALLEST)
+        return self._unmirrored(read_mosaic(path, self._raw, least=SMALLEST))
+
+    def _unmirrored(self, values: NDArray[Any]) -> NDArray[Any]:
+        """A stored mosaic without the mirroring that ``flip`` names."""
+        flip = self._settings.flip
+        values = values[:, ::-1] if flip in ("x", "xy") else values
+        return values[::-1] if flip in ("y", "xy") else values
 
     def container(self, path: Path, values: NDArray[Any]) -> int:
         """Bits that a pixel takes in the file."""
@@ -105,7 +115,7 @@ class MosaicFiles:
         """The dark frame, cut like the mosaics."""
         if self._settings.dark_frame is None:
             return None
-        dark = read_mosaic(self._settings.dark_frame, self._raw)
+        dark = self._unmirrored(read_mosaic(self._settings.dark_frame, self._raw))
         if dark.shape != shape:
             raise PolarguideError(
                 self._settings.dark_frame,
@@ -117,6 +127,8 @@ class MosaicFiles:
 
 
 _BLOCKS = 1024
+_JUDGED = 8
+"""Mosaics of a capture that are looked through for defects of the sensor."""
 
 
 def sample_blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
@@ -219,6 +231,7 @@ class MosaicSource(Source):
         self._crop, self._pattern = self._mosaics.crop, self._mosaics.pattern
         self._corner = (settings.offset_x + self._crop[0], settings.offset_y + self._crop[1])
         self._white = white_gains(settings.white_balance)
+        self._defective: NDArray[np.bool_] | None = None
         if self._pattern.colors is None and settings.white_balance != "none":
             raise PolarguideError(
                 "--white-balance",
@@ -240,7 +253,7 @@ class MosaicSource(Source):
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """Levels, gains of the angles and white balance of the capture; every file is read once."""
-        largest = used = 0
+        counts = np.zeros(FULL_16 + 1, np.int64)
         container, shape = 0, None
         samples: list[NDArray[Any]] = []
         blocks: list[NDArray[Any]] = []
@@ -252,18 +265,19 @@ class MosaicSource(Source):
                 offset = (self._settings.offset_x, self._settings.offset_y)
                 self._analyzers.require_region(offset, values.shape[::-1], self._settings.analyzers)
             container = self._mosaics.container(path, values)
-            largest, used = max(largest, int(values.max())), used | int(np.bitwise_or.reduce(values, None))
+            counts += np.bincount(values.ravel(), minlength=len(counts))
             samples.append(sample_blocks(self._mosaics.cut(values), 2 * self._pattern.period))
             blocks.append(sample_blocks(self._mosaics.cut(values), SIDE))
             advance(count)
         assert shape is not None
         asked = self._settings
+        occurring = np.flatnonzero(counts)
         levels = estimate_levels(
-            largest, used, container, bits=asked.bits, black=asked.black_level, saturation=asked.saturation
-        )
-        if self._dataset is not None:
-            levels = replace(levels, gamma=self._dataset.gamma)
-        else:
+            int(occurring[-1]), int(np.bitwise_or.reduce(occurring)), container,
+            bits=asked.bits, black=asked.black_level, saturation=asked.saturation, counts=counts,
+        )  # fmt: skip
+        levels = replace(levels, gamma=asked.gamma if self._dataset is None else self._dataset.gamma)
+        if self._dataset is None:
             self._mosaics.require_kind(np.concatenate(blocks), levels)
         dark = self._mosaics.dark(shape[0])
         floor = None if dark is None else sample_blocks(dark, 2 * self._pattern.period)
@@ -279,9 +293,13 @@ class MosaicSource(Source):
         ratio = pair_ratio(angles, usable)
         gains, notes = self._gains(ratio)
         notes += [] if self._dataset is None else self._dataset.notes
-        if asked.bits is None and container == 16:
+        notes += level_notes(levels, counts, container, asked.bits)
+        standing_out = int(self._defects(levels).sum())
+        if standing_out:
+            share = standing_out / (shape[0][0] * shape[0][1])
             notes.append(
-                f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale."
+                f"{standing_out} samples ({share:.3%}) stand out from all alike beside them (hot or dead pixels): "
+                "invalid."
             )
         white = self._white or gray_world(colors[:, usable])
         peak = max(white) / min(gains) * asked.calibration.peak * brighter
@@ -295,8 +313,20 @@ class MosaicSource(Source):
             "white_balance": list(white),
             "scale": 1.0 / max(1.0, peak),
             "rounding": self._rounding(levels, min(white) / max(gains) / max(1.0, peak)),
+            "defects": standing_out,
             "notes": notes,
         }
+
+    def _defects(self, levels: Levels) -> NDArray[np.bool_]:
+        """The samples of a mosaic, cut to whole cells, that are no measure of light; saturated ones are told later."""
+        if self._defective is None:
+            files = list(self._files.values())
+            judged = files[:: max(1, math.ceil(len(files) / _JUDGED))]
+            mosaics = (
+                np.minimum(self._mosaics.cut(self._mosaics.read(path)), levels.white) for path in judged
+            )
+            self._defective = defects(mosaics, self._pattern.period)
+        return self._defective
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read one mosaic: validity, levels, gains, then demosaicing, then the sense of the angles."""
@@ -306,7 +336,7 @@ class MosaicSource(Source):
         values = self._mosaics.cut(stored)
         levels = msgspec.convert(measured["levels"], Levels)
         saturated, black = unusable_samples(values, levels, dark)
-        bad, linear = saturated | black, levels.linear(values, dark)
+        bad, linear = saturated | black | self._defects(levels), levels.linear(values, dark)
         if self._analyzers is not None:
             linear, bad = self._analyzers.apply(linear, offset=self._corner), spread_to_cells(bad)
         linear = linear * self._sample_gains(values.shape, measured)

@@ -26,13 +26,14 @@ ORIGINS = ("auto", "dataset", "sfm", "none")
 _MOSAIC_ONLY = (
     "sensor", "packing", "width", "height", "bits", "offset_x", "offset_y", "black_level", "dark_frame",
     "saturation", "white_balance", "demosaic", "interpolation", "register", "analyzers", "precision",
+    "gamma", "flip",
 )  # fmt: skip
 # Options that mean something for some formats only.
 _OPTIONS = {
     "mosaic": _MOSAIC_ONLY,
     "pisr": _MOSAIC_ONLY,
-    "filter": ("transfer", "align", "white_balance", "precision"),
-    "singles": ("transfer", "align", "white_balance", "precision", "angles"),
+    "filter": ("transfer", "align", "white_balance", "precision", "bits", "saturation"),
+    "singles": ("transfer", "align", "white_balance", "precision", "bits", "saturation", "angles"),
     "gnerp": ("transfer",),
 }
 _NotNegative = Annotated[int, Meta(ge=0, le=1 << 20)]
@@ -50,7 +51,10 @@ class PrepareSettings:
         packing: Packing of .raw files (two different 12-bit packings exist; never guessed).
         width: Width of .raw files in pixels.
         height: Height of .raw files in pixels.
-        bits: Bits of a sensor value in 16-bit files; without it 12 if no value exceeds 4095, else 16.
+        bits: Bits of a sensor value in 16-bit files; without it those of the value at which samples pile up, else 12 if
+            no value exceeds 4095, else 16.
+        gamma: Gamma that the camera applied to mosaics: stored = light ^ gamma.
+        flip: Which way the camera mirrored the mosaics (Reverse X, Reverse Y): undone before anything else.
         offset_x: Column of the sensor at which the region of interest starts.
         offset_y: Row of the sensor at which it starts.
         black_level: Stored value without light.
@@ -84,10 +88,12 @@ class PrepareSettings:
 
     format: Literal["auto", "mosaic", "filter", "singles"] | Dataset = "auto"
     sensor: Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"] | None = None
-    packing: Literal["10p", "12p", "12packed"] | None = None
+    packing: Literal["8", "16", "10p", "12p", "12packed"] | None = None
     width: _Positive | None = None
     height: _Positive | None = None
     bits: Annotated[int, Meta(ge=8, le=16)] | None = None
+    gamma: Annotated[float, Meta(ge=0.1, le=4.0)] = 1.0
+    flip: Literal["none", "x", "y", "xy"] = "none"
     offset_x: _NotNegative = 0
     offset_y: _NotNegative = 0
     black_level: Annotated[float, Meta(ge=0)] = 0.0

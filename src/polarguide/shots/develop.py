@@ -21,6 +21,7 @@ from polarguide.capture.filter.develop import (
 )
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import read_shots, require_four_shots
+from polarguide.capture.formats.pictures import is_lossy
 from polarguide.capture.layout import find_layout, select_views
 from polarguide.capture.memory import KEPT, READ, require_memory_of_each
 from polarguide.capture.sensor.analyzer_file import read_analyzers
@@ -256,8 +257,7 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
     notes: list[str] = []
     transfer: str = options.transfer
     if transfer == "auto":
-        suffix = shot.files[0].suffix.lower()
-        decision = decide_transfer([shots], jpeg=suffix in (".jpg", ".jpeg"))
+        decision = decide_transfer([shots], lossy=is_lossy(shot.files[0]))
         transfer = decision.transfer
         notes.append(f"Transfer {decision.reason}.")
     linear = linear_intensities(shots.pictures, transfer)

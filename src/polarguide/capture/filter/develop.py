@@ -29,16 +29,24 @@ _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
 
 @dataclass(frozen=True)
 class Shift:
-    """Shift of a shot relative to the first, in pixels right and down, and whether the estimate is reliable."""
+    """How a shot lies relative to the first.
+
+    Attributes:
+        x, y: shift in pixels right and down; of the middle of the picture where there is a ``warp``.
+        trusted: whether the estimate is reliable.
+        warp: where the camera was turned between the shots: the matrix [2, 3] from pixels of the first shot to those of
+            this one (the middle of the first pixel is 0), row by row.
+    """
 
     x: float
     y: float
     trusted: bool
+    warp: tuple[float, ...] | None = None
 
     @property
     def corrected(self) -> bool:
         """Whether the shift is corrected: reliable and large enough."""
-        return self.trusted and max(abs(self.x), abs(self.y)) >= SMALLEST
+        return self.trusted and (self.warp is not None or max(abs(self.x), abs(self.y)) >= SMALLEST)
 
 
 def estimate_shifts(linear: NDArray[np.float32]) -> list[Shift]:
@@ -47,20 +55,26 @@ def estimate_shifts(linear: NDArray[np.float32]) -> list[Shift]:
     Phase correlation of the logarithms' fine detail finds a start (brightness and polarization change slowly
     across a surface, edges stay); maximizing the enhanced correlation coefficient refines it to a fraction of
     a pixel. Edges of polarization can mislead both, so the shifts are trusted only if with them
-    I0 + I90 = I45 + I135 holds better than without.
+    I0 + I90 = I45 + I135 holds better than without. If the camera was turned, pair sums agree still better with a
+    rotation beside the shift. A homography agrees with them better still, but less with the truth.
 
     Args:
         linear: [4, H, W, 3] linear intensities.
     """
     detail = [_detail(shot) for shot in linear]
     shifts = [Shift(0.0, 0.0, True), *(_shift(detail[0], other) for other in detail[1:])]
-    if not any(shift.corrected for shift in shifts):
-        return shifts
     whole = np.zeros(linear.shape[:3], bool)
-    after = _disagreement(*align_shots(linear, whole, shifts))
-    if after < _BETTER * _disagreement(linear, whole):
-        return shifts
-    return [shifts[0], *(replace(shift, trusted=False) for shift in shifts[1:])]
+    least = _disagreement(linear, whole)
+    if any(shift.corrected for shift in shifts):
+        after = _disagreement(*align_shots(linear, whole, shifts))
+        if after < _BETTER * least:
+            least = after
+        else:
+            shifts = [shifts[0], *(replace(shift, trusted=False) for shift in shifts[1:])]
+    turned = [shifts[0], *(_turn(detail[0], detail[k], shifts[k]) for k in (1, 2, 3))]
+    if turned != shifts and _disagreement(*align_shots(linear, whole, turned)) < _BETTER * least:
+        return turned
+    return shifts
 
 
 def _disagreement(linear: NDArray[np.float32], bad: NDArray[np.bool_]) -> float:
@@ -91,7 +105,12 @@ def align_shots(
         if not shift.corrected:
             continue
         y, x = np.mgrid[:height, :width].astype(np.float32)
-        x, y = x + np.float32(shift.x), y + np.float32(shift.y)
+        if shift.warp is None:
+            x, y = x + np.float32(shift.x), y + np.float32(shift.y)
+        else:
+            places = np.stack([x.ravel(), y.ravel()], axis=-1)[:, None]
+            matrix = np.array(shift.warp, np.float64).reshape(2, 3)
+            x, y = cv2.transform(places, matrix)[:, 0].T.reshape(2, height, width)
         moved[index] = cv2.remap(linear[index], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         bad[index] = remapped_mask(clipped[index], x, y)
     return moved, bad
@@ -116,7 +135,8 @@ def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
     if min(height, width) < 2:  # a window that fades out on both sides has no middle there
         return Shift(0.0, 0.0, False)
     window = cv2.createHanningWindow((width, height), cv2.CV_32F)
-    (x, y), _ = cv2.phaseCorrelate(reference, other, window)
+    # It may write into its arguments: where their size needs no padding, it fades them out in place.
+    (x, y), _ = cv2.phaseCorrelate(reference.copy(), other.copy(), window)
     limit = LARGEST_SHARE * width
     if max(abs(x), abs(y)) > limit:
         x = y = 0.0
@@ -131,6 +151,47 @@ def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
     x, y = (float(value) for value in np.asarray(found)[:, 2])
     trusted = score > 0.3 and max(abs(x), abs(y)) <= limit and bool(np.isfinite([x, y]).all())
     return Shift(round(x, 3), round(y, 3), trusted)
+
+
+_TURN_SIDE = 1024
+"""Pixels of the longer side at which turns are estimated, to a fraction of a pixel."""
+
+
+def _turn(reference: NDArray[np.float32], other: NDArray[np.float32], shift: Shift) -> Shift:
+    """The shift and rotation of a shot whose camera was turned, beginning with its shift; the shift itself where none
+    converges, or where no corner moves otherwise.
+    """
+    height, width = reference.shape
+    if min(height, width) < 2:
+        return shift
+    factor = max(1, -(-max(height, width) // _TURN_SIDE))
+    small = [
+        cv2.resize(d, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
+        for d in (reference, other)
+    ]
+    half = (factor - 1) / 2  # of the middle of a small picture's first pixel from that of the large one's
+    large = np.array([[factor, 0, half], [0, factor, half], [0, 0, 1]], np.float64)
+    start = np.eye(3)
+    start[:2, 2] = (shift.x, shift.y) if shift.trusted else (0.0, 0.0)
+    start = (np.linalg.inv(large) @ start @ large).astype(np.float32)
+    everywhere = np.ones(small[0].shape, np.uint8)
+    try:
+        score, start[:2] = cv2.findTransformECC(
+            small[0], small[1], start[:2].copy(), cv2.MOTION_EUCLIDEAN, _CRITERIA, everywhere, 5
+        )
+    except cv2.error:  # it does not converge where there is no detail to compare
+        return shift
+    warp = large @ start.astype(np.float64) @ np.linalg.inv(large)
+    corners = np.array([[x, y] for x in (0, width - 1) for y in (0, height - 1)], np.float64)
+    moved = cv2.transform(corners[:, None], warp[:2])[:, 0] - corners
+    middle = moved.mean(axis=0)
+    limit = LARGEST_SHARE * width
+    if not (np.isfinite(moved).all() and score > 0.3 and np.abs(moved).max() <= limit):
+        return shift
+    if np.abs(moved - middle).max() < SMALLEST:
+        return shift
+    x, y = (round(float(value), 3) for value in middle)
+    return Shift(x, y, True, tuple(float(f"{value:.9g}") for value in warp[:2].ravel()))
 
 
 @dataclass(frozen=True)
@@ -156,12 +217,12 @@ def rounding_of_bytes(transfer: str, smallest: float) -> Rounding:
     return rounding_of(FULL_CODE * smallest * (srgb_decode_array(shown) if transfer == "srgb" else shown))
 
 
-def decide_transfer(shots: Sequence[Shots], *, jpeg: bool) -> TransferDecision:
+def decide_transfer(shots: Sequence[Shots], *, lossy: bool) -> TransferDecision:
     """The transfer by the curvature of the response (``checks.encoding``), as ``inspect`` judges it.
 
     Args:
         shots: some views, aligned well enough (as from a tripod).
-        jpeg: whether the files are JPEG, for the default where the curvature does not decide.
+        lossy: whether the files are JPEG or WebP, for the default where the curvature does not decide.
     """
     measures = [
         checks.measure(linear_codes(view.pictures, "linear"), ~(view.clipped.any(axis=0) | view.dark))
@@ -174,6 +235,6 @@ def decide_transfer(shots: Sequence[Shots], *, jpeg: bool) -> TransferDecision:
         said = f"the curvature of the response is {slope:+.2f}; linear files have 0, sRGB about -0.6"
     if found is not None:
         return TransferDecision(found, f"{found}: {said}")
-    fallback = "srgb" if jpeg else "linear"
-    kind = "JPEG files" if jpeg else "PNG and TIFF files"
+    fallback = "srgb" if lossy else "linear"
+    kind = "JPEG and WebP files" if lossy else "PNG, TIFF and BMP files"
     return TransferDecision(fallback, f"{fallback}, as {kind} usually are: {said} (--transfer sets it)")

@@ -18,6 +18,7 @@ from polarguide.capture.calibration import Calibration
 from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.formats.integrity import ORIENTATION, TIFF, jpeg_segments, png_chunks
 from polarguide.capture.formats.pictures import read_picture
+from polarguide.capture.formats.plain import is_webp, webp_chunks
 from polarguide.core.errors import optional_import
 from polarguide.core.files import read_file
 
@@ -60,7 +61,7 @@ def orientation_calibration(code: int) -> Calibration:
 
 
 def tags_of(data: bytes) -> dict[int, Any]:
-    """The EXIF tags of a JPEG, PNG or TIFF file and of camera raw that is built like TIFF; none where they are damaged.
+    """The EXIF tags of a picture file and of camera raw that is built like TIFF; none where they are damaged.
 
     Pillow reads tags only: of pictures with 16 bits a channel it would return 8.
     """
@@ -70,6 +71,9 @@ def tags_of(data: bytes) -> dict[int, Any]:
         tiff = next((content[6:] for content in contents if content.startswith(b"Exif\0\0")), b"")
     elif data.startswith(b"\x89PNG"):
         tiff = next((data[at + 8 : end - 4] for kind, at, end in png_chunks(data) if kind == b"eXIf"), b"")
+    elif is_webp(data):
+        tiff = next((data[at:end] for kind, at, end in webp_chunks(data) if kind == b"EXIF"), b"")
+        tiff = tiff.removeprefix(b"Exif\0\0")
     if tiff[:4] not in TIFF:
         return {}
     exif = Image.Exif()
@@ -101,7 +105,7 @@ class Taken:
 
 
 def read_taken(path: Path) -> Taken:
-    """What a file says about its exposure: EXIF of JPEG, PNG, TIFF and camera raw that is built like TIFF; else LibRaw.
+    """What a file says about its exposure: EXIF of pictures and of camera raw that is built like TIFF; else LibRaw.
 
     Raises:
         PolarguideError: the file cannot be read, or LibRaw is needed and missing.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,10 @@ from numpy.typing import NDArray
 from polarguide.capture.exposures import TABLE, Angle, Line, angle_text, parse_angle, read_table
 from polarguide.capture.filter.camera_raw import CAMERA_RAW, is_camera_raw, read_camera_raw
 from polarguide.capture.filter.exif import orientation
-from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, read_picture
+from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, is_lossy, read_picture, rescaled
 from polarguide.capture.layout import ambiguous, angle_folders, index_files, list_files, require_angle_folders
 from polarguide.capture.memory import require_memory_of_each
+from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.view_reader import require_alike
@@ -30,7 +32,7 @@ _SUFFIX = re.compile(
 )
 _BARE = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE)
 # Compression smears the edge of clipped areas over a few values.
-_JPEG_FULL = 250
+_LOSSY_FULL = 250
 # Bytes that a pixel of four shots takes at least: as decoded, and stacked.
 _READ = 4 * 3 * (2 + 2)
 
@@ -95,7 +97,29 @@ def list_shots(root: Path, *, nested: bool = False) -> tuple[Candidates, list[Pa
     for angle, folder in folders.items():
         for path in list_files(folder, SHOT_SUFFIXES):
             shots.setdefault(path.stem, {}).setdefault(angle, []).append(path)
+    if not shots:
+        _refuse_strangers(folders.values())
     return shots, []
+
+
+def _refuse_strangers(folders: Iterable[Path]) -> None:
+    """Refuse folders of angles whose files are all of kinds that are not read.
+
+    Raises:
+        PolarguideError: there are such files.
+    """
+    for folder in folders:
+        files = [
+            path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")
+        ]
+        kinds = Counter(path.suffix.lower() or "no suffix" for path in files)
+        if kinds:
+            raise PolarguideError(
+                folder,
+                expected=f"shots in a format that is read ({', '.join(SHOT_SUFFIXES)})",
+                found=", ".join(f"{count} of {kind}" for kind, count in kinds.most_common(3)),
+                remedy="Export them as 16-bit TIFF, linear if possible, or as JPEG of the highest quality.",
+            )
 
 
 def group_files(files: Sequence[Path]) -> tuple[Candidates, list[Path]]:
@@ -153,7 +177,7 @@ def require_four_shots(root: Path, shots: dict[str, dict[int, Path]]) -> None:
 
 
 def read_shots(files: dict[int, Path], gains: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Shots:
-    """Read the four shots of a view; ``gains`` of R, G and B are for camera raw files.
+    """Read the four shots of a view, as ``read_stack`` does.
 
     Raises:
         PolarguideError: one cannot be read, or they differ in size, depth or orientation.
@@ -163,8 +187,16 @@ def read_shots(files: dict[int, Path], gains: tuple[float, float, float] = (1.0,
     return read_stack([files[angle] for angle in ANGLES], gains)
 
 
-def read_stack(paths: Sequence[Path], gains: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Shots:
-    """Read the shots of a view, any number; ``gains`` of R, G and B are for camera raw files.
+def read_stack(
+    paths: Sequence[Path],
+    gains: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    levels: Levels | None = None,
+) -> Shots:
+    """Read the shots of a view, any number.
+
+    Args:
+        paths: the files. gains: of R, G and B, for camera raw files.
+        levels: of their stored values; those of the files if None. Full scale becomes that of the files.
 
     Raises:
         PolarguideError: one cannot be read, or they differ in size, depth or orientation.
@@ -185,9 +217,12 @@ def read_stack(paths: Sequence[Path], gains: tuple[float, float, float] = (1.0, 
                 remedy="Keep the camera still between the shots of a view, or export them all alike.",
             )
     stack = np.stack(pictures)
-    jpeg = paths[0].suffix.lower() in (".jpg", ".jpeg")
-    full = _JPEG_FULL if jpeg else int(np.iinfo(stack.dtype).max)
+    full = _LOSSY_FULL if is_lossy(paths[0]) else int(np.iinfo(stack.dtype).max)
+    if levels is not None:
+        full = min(full, levels.saturation)
     clipped, lit = np.asarray((stack >= full).any(axis=3)), np.asarray(stack.any(axis=(0, 3)))
+    if levels is not None and levels.white != np.iinfo(stack.dtype).max:
+        stack = rescaled(stack, levels.white)
     return Shots(stack, codes[0], clipped, ~lit)
 
 

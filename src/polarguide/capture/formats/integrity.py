@@ -6,13 +6,20 @@ part. Parsing the structure first gives the same answer with every decoder.
 
 from __future__ import annotations
 
-import contextlib
 import re
 import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
+from polarguide.capture.formats.plain import (
+    BMP,
+    PNM,
+    is_webp,
+    plain_damage,
+    plain_head,
+    webp_size,
+)
 from polarguide.core.errors import PolarguideError
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -29,12 +36,9 @@ MOST_ENTRIES = 4096
 """Entries of a TIFF directory that are read: files have some thirty, and a count of BigTIFF may claim 2^64."""
 # Of a progressive JPEG file. Encoders write ten or so; each is decoded over the whole picture, be it empty or not.
 _MOST_SCANS = 200
-_MOST_PICTURES = 1000
 LARGEST_PIXELS = 150_000_000
 """More pixels than any camera has: a file that claims more is refused before memory is taken for it."""
-_SUBFILE, _OLD_SUBFILE, _PHOTOMETRIC = 254, 255, 262
-_NO_PICTURE, _REDUCED = 1 | 4, 2
-"""A smaller copy, or a mask of transparency; a smaller copy as the older tag has it."""
+_HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif")
 _TIFF_STRIPS = ((273, 279), (324, 325))
 
 
@@ -44,7 +48,7 @@ def damaged(path: Path, expected: str, found: str) -> PolarguideError:
 
 
 def find_damage(data: bytes) -> str | None:
-    """What is wrong with a PNG, JPEG or TIFF file as far as its structure tells, or None.
+    """What is wrong with a picture file as far as its structure tells, or None.
 
     Args:
         data: the whole file.
@@ -61,18 +65,32 @@ def find_damage(data: bytes) -> str | None:
     if data[:4] in TIFF:
         if not _tiff_is_complete(data):
             return f"a TIFF file cut short (it ends after {len(data)} bytes)"
-        return _tiff_oddity(data) if _tiff_size(data) is not None else "a TIFF file without one plain size"
+        return None if _tiff_size(data) is not None else "a TIFF file without one plain size"
     if data[:4] in BIG_TIFF:  # the decoder finds what is cut short
         return None if declared_size(data) is not None else "a BigTIFF file without one plain size"
+    if data[:2] == BMP or data[:2] in PNM or is_webp(data):
+        return plain_damage(data)
+    if is_heif(data):
+        return "a HEIC or AVIF file"
     return "a file that is none of these"
 
 
+def is_heif(data: bytes) -> bool:
+    """Whether a file is one of telephones, HEIC or AVIF, by its first twelve bytes."""
+    return data[4:8] == b"ftyp" and data[8:12] in _HEIF_BRANDS
+
+
 def declared_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the header of a PNG, JPEG or TIFF file; None where decoders might see others, or none."""
+    """Width and height in the header of a picture file; None where decoders might see others, or none."""
     if data.startswith(_PNG_SIGNATURE):
         return struct.unpack_from(">II", data, 16) if data[12:16] == b"IHDR" and len(data) >= 24 else None
     if data.startswith(b"\xff\xd8"):
         return _jpeg_size(data)
+    if is_webp(data):
+        return webp_size(data)
+    if data[:2] == BMP or data[:2] in PNM:
+        head = plain_head(data)
+        return None if head is None else head.size
     return _tiff_size(data) if data[:4] in (*TIFF, *BIG_TIFF) else None
 
 
@@ -129,20 +147,6 @@ def tiff_entries(data: bytes, start: int | None = None) -> Iterator[tuple[int, i
         yield *struct.unpack_from(order + head, data, at), at + place
 
 
-def without_orientation(data: bytes) -> bytes:
-    """A picture file that passed ``find_damage``, where OpenCV finds no orientation to apply.
-
-    It turns the pixels of TIFF files even where it is asked for them unchanged, but not those of JPEG and PNG.
-    """
-    if data[:4] in (*TIFF, *BIG_TIFF):
-        for tag, kind, _, at in tiff_entries(data):
-            if tag == ORIENTATION and kind in _TIFF_CODES:
-                changed = bytearray(data)
-                struct.pack_into(tiff_order(data) + _TIFF_CODES[kind], changed, at, 1)
-                return bytes(changed)
-    return data
-
-
 def tiff_order(data: bytes) -> str:
     """The order of bytes of a TIFF file, for ``struct``."""
     return "<" if data[:2] == b"II" else ">"
@@ -169,27 +173,6 @@ def _tiff_size(data: bytes) -> tuple[int, int] | None:
     except (struct.error, OverflowError):
         return None
     return (sides[256], sides[257]) if len(sides) == 2 else None
-
-
-def _tiff_oddity(data: bytes) -> str | None:
-    """What decoders pass over without a word: white that is stored as 0, and all pictures but the first."""
-    order, pictures = tiff_order(data), 0
-    directories: set[int] = set()
-    (start,) = struct.unpack_from(order + "I", data, 4)
-    with contextlib.suppress(struct.error):
-        while start and start not in directories and len(directories) < _MOST_PICTURES:
-            directories.add(start)
-            entries = list(tiff_entries(data, start))
-            tags = {
-                tag: struct.unpack_from(order + _TIFF_CODES[kind], data, at)[0]
-                for tag, kind, _, at in entries
-                if tag in (_SUBFILE, _OLD_SUBFILE, _PHOTOMETRIC) and kind in _TIFF_CODES
-            }
-            if len(directories) == 1 and tags.get(_PHOTOMETRIC) == 0:
-                return "a TIFF file whose white is 0"
-            pictures += not (tags.get(_SUBFILE, 0) & _NO_PICTURE or tags.get(_OLD_SUBFILE) == _REDUCED)
-            (start,) = struct.unpack_from(order + "I", data, start + 2 + 12 * len(entries))
-    return f"a TIFF file of {pictures} pictures" if pictures > 1 else None
 
 
 def _png_damage(data: bytes) -> str | None:

@@ -22,15 +22,18 @@ from polarguide.capture.formats.integrity import (
     damaged,
     declared_size,
     find_damage,
+    tiff_entries,
     tiff_order,
-    without_orientation,
 )
+from polarguide.capture.formats.plain import plain_head, plain_pixels
+from polarguide.capture.formats.tiff import UnreadableTiffError, decode_tiff
 from polarguide.capture.view import FULL_CODE
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import LARGEST_FILE, read_file
 from polarguide.optics.color import srgb_decode_array
 
-SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".webp")
+_LOSSY = (".jpg", ".jpeg", ".webp")
 TRANSFERS = ("linear", "srgb")
 # Bytes of a pixel: four channels of 16 bits, and as much for what a decoder works on.
 _DECODED = 16
@@ -47,9 +50,10 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
 
     Args:
         path: where ``data`` came from, for messages.
-        data: the whole file: PNG, JPEG or TIFF with 8 or 16 bits a channel, gray or color, or TIFF of floating-point
-            numbers from 0 to 1, which become 16 bits (larger ones are at full scale). Alpha is dropped, an orientation
-            tag is not applied (poses belong to the stored pixels).
+        data: the whole file: PNG, JPEG, WebP, BMP, PGM, PPM or TIFF of 8 or 16 bits a channel, gray or color; TIFF
+            of floating-point numbers from 0 to 1, which become 16 bits (larger ones are at full scale). Those of fewer
+            bits (10 to 14 in TIFF, PGM of another full scale) are brought to the full scale of 8 or 16. Alpha is
+            dropped, an orientation tag is not applied (poses belong to the stored pixels).
 
     Returns:
         [H, W, 3] uint8 or uint16, RGB, as stored. A gray picture becomes three equal channels.
@@ -57,9 +61,11 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
     Raises:
         PolarguideError: the file is damaged, cut short, of another kind, or transparent somewhere.
     """
-    pixels = decode_stored(path, data)
+    pixels, full = _decoded(path, data)
     if pixels.dtype.kind == "f":
         pixels = _codes_of_floats(path, pixels)
+    elif pixels.dtype.kind == "u" and full < np.iinfo(pixels.dtype).max:
+        pixels = rescaled(pixels, full)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise PolarguideError(
             path,
@@ -94,7 +100,8 @@ def _codes_of_floats(path: Path, pixels: NDArray[Any]) -> NDArray[np.uint16]:
             found=found,
             remedy="Divide by the value at which the camera saturates, or save 16-bit whole numbers.",
         )
-    return np.rint(np.clip(pixels, 0.0, 1.0) * FULL_CODE).astype(np.uint16)
+    # Half precision ends at 65504, below the largest code.
+    return np.rint(np.clip(pixels.astype(np.float64), 0.0, 1.0) * FULL_CODE).astype(np.uint16)
 
 
 def decode_mask(path: Path, data: bytes, *, any_value: bool) -> NDArray[np.bool_]:
@@ -170,27 +177,103 @@ def _table(full: int, transfer: str) -> NDArray[np.uint16]:
     return np.rint(shown * FULL_CODE).astype(np.uint16)
 
 
+def rescaled(pixels: NDArray[Any], full: int) -> NDArray[Any]:
+    """Whole numbers of which ``full`` is full scale, as such of the whole range of their type."""
+    whole = np.iinfo(pixels.dtype).max
+    table = np.rint(np.minimum(np.arange(whole + 1) * (whole / full), whole)).astype(pixels.dtype)
+    return np.asarray(table[pixels])
+
+
 def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
     """Decode a picture exactly as stored: [H, W] or [H, W, C] in OpenCV's channel order, any value type.
 
     Raises:
-        PolarguideError: the file is damaged, cut short, or of another kind.
+        PolarguideError: the file is damaged, cut short, of another kind, or has samples that are no picture's.
+    """
+    return _decoded(path, data)[0]
+
+
+def _decoded(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
+    """The same, and the value of full scale.
+
+    TIFF goes to tifffile, PNG, JPEG and WebP to OpenCV once their structure is known to be whole, and to no other
+    decoder: Pillow would return 8 bits of 16-bit color.
     """
     damage = find_damage(data)
     size = None if damage is not None else declared_size(data)
     if size is not None and size[0] * size[1] > LARGEST_PIXELS:
         damage = f"one of {size[0]}x{size[1]} pixels, more than any camera takes"
-    pixels = None
-    if damage is None:
-        with contextlib.suppress(cv2.error):
-            stored = np.frombuffer(without_orientation(data), np.uint8)
-            pixels = cv2.imdecode(stored, cv2.IMREAD_UNCHANGED)
-        if pixels is None:
-            _require_room(path, size)
-            damage = "one that cannot be decoded"
     if damage is not None:
-        raise damaged(path, "a complete PNG, JPEG or TIFF file", damage)
-    return np.asarray(pixels)
+        raise _unreadable(path, damage)
+    pixels, full = None, 0
+    head = plain_head(data)
+    if data[:4] in (*TIFF, *BIG_TIFF):
+        try:
+            pixels, bits = decode_tiff(data)
+            full = (1 << bits) - 1
+        except UnreadableTiffError as error:
+            raise _unreadable(path, str(error)) from None
+        except Exception:  # tifffile and its codecs raise what they please for damaged files
+            pixels = None
+    elif head is not None:
+        return plain_pixels(data, head), head.full
+    else:
+        with contextlib.suppress(cv2.error):
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        _require_room(path, size)
+        raise _unreadable(path, "one that cannot be decoded")
+    if full == 0 and pixels.dtype.kind == "u":
+        full = int(np.iinfo(pixels.dtype).max)
+    return np.asarray(pixels), full
+
+
+def _unreadable(path: Path, found: str) -> PolarguideError:
+    """The error that a file is none that is read; ``found``: a noun phrase."""
+    if "HEIC" in found:
+        return PolarguideError(
+            path,
+            expected="a PNG, JPEG, WebP, BMP, PGM or TIFF file",
+            found=found,
+            remedy="Export it as 16-bit TIFF or JPEG of the highest quality; telephones can be set to JPEG or raw.",
+        )
+    return damaged(path, "a complete PNG, JPEG or TIFF file (or WebP, BMP, PGM)", found)
+
+
+def is_lossy(path: Path) -> bool:
+    """Whether a file is of a kind that loses detail, and that is sRGB by custom: JPEG or WebP, by its suffix."""
+    return path.suffix.lower() in _LOSSY
+
+
+_BITS, _FORMAT, _UNSIGNED = 258, 339, 1
+
+
+def may_use_fewer_bits(path: Path) -> bool:
+    """Whether the whole numbers of a picture file may fill fewer than the 16 bits that its samples take.
+
+    Cameras of 10 to 14 bits write PNG and TIFF files of 16 bits, which do not say so.
+    """
+    with contextlib.suppress(struct.error, OverflowError, OSError), open(path, "rb") as file:
+        start = file.read(32)
+        if start.startswith(b"\x89PNG"):
+            return start[24] == 16
+        if start[:4] not in (*TIFF, *BIG_TIFF):
+            return False
+        head = _directory(file, start[:16])
+        bits, kind = 0, _UNSIGNED
+        for tag, _, count, at in tiff_entries(head):
+            if tag in (_BITS, _FORMAT):
+                inline = count <= (4 if start[:4] in BIG_TIFF else 2)
+                at_value = at if inline else None
+                if at_value is None:
+                    place = tiff_order(head) + ("Q" if start[:4] in BIG_TIFF else "I")
+                    file.seek(struct.unpack_from(place, head, at)[0])
+                    (value,) = struct.unpack(tiff_order(head) + "H", file.read(2))
+                else:
+                    (value,) = struct.unpack_from(tiff_order(head) + "H", head, at_value)
+                bits, kind = (value, kind) if tag == _BITS else (bits, value)
+        return bits == 16 and kind == _UNSIGNED
+    return False
 
 
 def _require_room(path: Path, size: tuple[int, int] | None) -> None:
@@ -221,7 +304,7 @@ ROOM = 1 << 26
 def stated_size(path: Path) -> tuple[int, int] | None:
     """Width and height in the header of a picture or an array; None where there is none to be read.
 
-    PNG, JPEG, TIFF, Radiance HDR, OpenEXR and ``.npy`` state them; other files do not.
+    PNG, JPEG, WebP, BMP, PGM, TIFF, Radiance HDR, OpenEXR and ``.npy`` state them; other files do not.
     """
     if not path.is_file():  # a pipe, a folder, a link to nowhere: whoever reads it says so
         return None
@@ -237,7 +320,7 @@ def stated_size(path: Path) -> tuple[int, int] | None:
 
 
 def read_picture(path: Path) -> bytes:
-    """The bytes of a PNG, JPEG or TIFF file, unless it is far larger than its pixels could be.
+    """The bytes of a picture file, unless it is far larger than its pixels could be.
 
     Raises:
         PolarguideError: that, or it cannot be read.

@@ -87,6 +87,10 @@ def sensor_pattern(sensor: str) -> Pattern:
     return Pattern(np.tile(_CELL, (2, 2)), np.kron(_BAYER, np.ones((2, 2), int)))
 
 
+FULL_16 = (1 << 16) - 1
+"""Largest value of 16-bit files."""
+
+
 @dataclass(frozen=True)
 class Levels:
     """Radiometric levels of a capture, in stored values.
@@ -120,13 +124,20 @@ class Levels:
 
 
 def estimate_levels(
-    largest: int, used: int, container: int, *, bits: int | None, black: float, saturation: int | None
+    largest: int,
+    used: int,
+    container: int,
+    *,
+    bits: int | None,
+    black: float,
+    saturation: int | None,
+    counts: NDArray[np.int64] | None = None,
 ) -> Levels:
     """Estimate the full scale of a capture.
 
-    Without ``bits``: 8 in 8-bit files; in 16-bit files 12 if no value exceeds 4095 (the sensors' converters
-    have 12 bits), else 16. Values whose low bits are never used (12 bits shifted to the top of 16) end at the
-    last value that can occur.
+    Without ``bits``: 8 in 8-bit files; in 16-bit files those of the value at which samples pile up, else 12 if no value
+    exceeds 4095 (the sensors' converters have 12 bits), else 16. Values whose low bits are never used (12 bits shifted
+    to the top of 16) end at the last value that can occur.
 
     Args:
         largest: the largest stored value of the capture.
@@ -135,12 +146,14 @@ def estimate_levels(
         bits: bits of a sensor value, or None.
         black: black level in stored values.
         saturation: stored value at which the sensor saturates, or None for full scale.
+        counts: how often each stored value occurs, from 0 on.
 
     Raises:
         PolarguideError: a value exceeds the range, or the levels are not in order.
     """
+    clipped = None if counts is None or container != 16 else clipping_bits(counts)
     if bits is None:
-        bits = 12 if container == 16 and largest < 4096 else container
+        bits = clipped or (12 if container == 16 and largest < 4096 else container)
     if largest >= 1 << bits:
         raise PolarguideError(
             "--bits",
@@ -150,9 +163,10 @@ def estimate_levels(
         )
     white = (1 << bits) - 1
     unused = (used & -used).bit_length() - 1 if used else 0
-    if bits == 16 and 0 < unused <= 8:
+    if container == 16 and 0 < unused <= 8:
         white -= (1 << unused) - 1
-    top = white if saturation is None else saturation
+    top = white if clipped is None else min(white, largest)
+    top = top if saturation is None else saturation
     if not 0 <= black < top <= white:
         raise PolarguideError(
             "--black-level" if not 0 <= black < white else "--saturation",
@@ -161,6 +175,45 @@ def estimate_levels(
             remedy=f"Give both in stored values, for {bits} bits.",
         )
     return Levels(bits, white, top, float(black))
+
+
+_FEWEST_CLIPPED = 3
+_PILE = 3
+_BESIDE = 50
+"""A pile of clipped samples: as many at least; times as many as any value has that is smaller by a fiftieth or less."""
+
+
+def clipping_bits(counts: NDArray[np.int64]) -> int | None:
+    """Bits of a sensor whose clipped samples pile up at the largest value of 16-bit files; None where they do not.
+
+    A converter of b bits clips at 2^b - 1. Other values at which samples pile up may be those of a bright surface.
+
+    Args:
+        counts: how often each stored value occurs, from 0 on.
+    """
+    occurring = np.flatnonzero(counts)
+    top = int(occurring[-1]) if len(occurring) else 0
+    bits = top.bit_length()
+    if bits < 8 or top != (1 << bits) - 1:
+        return None
+    beside = int(counts[top - max(1, top // _BESIDE) : top].max(initial=0))
+    return bits if counts[top] >= max(_FEWEST_CLIPPED, _PILE * beside + 1) else None
+
+
+def level_notes(levels: Levels, counts: NDArray[np.int64], container: int, bits: int | None) -> list[str]:
+    """What was assumed of the levels of 16-bit files, for the user; ``bits``: as given, or None."""
+    if container != 16:
+        return []
+    notes = []
+    if bits is None:
+        notes.append(f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale.")
+    if clipping_bits(counts) is not None and levels.saturation < FULL_16:
+        share = float(counts[levels.saturation :].sum() / counts.sum())
+        notes.append(
+            f"Values pile up at {int(np.flatnonzero(counts)[-1])} ({share:.1%} of the samples): taken as saturated "
+            "(--bits and --saturation say otherwise)."
+        )
+    return notes
 
 
 def unusable_samples(

@@ -14,7 +14,7 @@ from polarguide.capture.formats.pictures import decode_stored, read_picture
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
 
-PACKINGS = {"10p": (5, 4, 10), "12p": (3, 2, 12), "12packed": (3, 2, 12)}
+PACKINGS = {"8": (1, 1, 8), "16": (2, 1, 16), "10p": (5, 4, 10), "12p": (3, 2, 12), "12packed": (3, 2, 12)}
 """Bytes of a group, pixels of a group, bits of a pixel."""
 
 
@@ -24,12 +24,13 @@ def packed_size(width: int, height: int, packing: str) -> int:
     return -(-width * height // pixels) * group
 
 
-def unpack(data: bytes, width: int, height: int, packing: str) -> NDArray[np.uint16]:
+def unpack(data: bytes, width: int, height: int, packing: str) -> NDArray[Any]:
     """Unpack a picture.
 
-    ``10p`` and ``12p`` are little-endian bit streams, low bits first: bit b of pixel k is bit ``bits * k + b``
-    of the file (GenICam PFNC). In ``12packed`` (GigE Vision) bytes 0 and 2 are the high eight bits of two
-    pixels, the low nibble of byte 1 the low four bits of the first, its high nibble those of the second.
+    ``8`` and ``16`` are whole bytes, the low one first. ``10p`` and ``12p`` are little-endian bit streams, low bits
+    first: bit b of pixel k is bit ``bits * k + b`` of the file (GenICam PFNC). In ``12packed`` (GigE
+    Vision) bytes 0 and 2 are the high eight bits of two pixels, the low nibble of byte 1 the low four bits of the
+    first, its high nibble those of the second.
 
     Args:
         data: exactly ``packed_size`` bytes.
@@ -37,8 +38,11 @@ def unpack(data: bytes, width: int, height: int, packing: str) -> NDArray[np.uin
         packing: a key of ``PACKINGS``.
 
     Returns:
-        [height, width] values from 0 to 2^bits - 1.
+        [height, width] values from 0 to 2^bits - 1, uint16 but for ``8``.
     """
+    if packing in ("8", "16"):
+        kind = np.dtype("u1" if packing == "8" else "<u2")
+        return np.frombuffer(data, kind).astype(kind.newbyteorder("=")).reshape(height, width)
     group, pixels, _ = PACKINGS[packing]
     parts = np.frombuffer(data, np.uint8).reshape(-1, group).astype(np.uint16)
     values = np.empty((len(parts), pixels), np.uint16)
@@ -56,7 +60,7 @@ def unpack(data: bytes, width: int, height: int, packing: str) -> NDArray[np.uin
     return values.reshape(-1)[: width * height].reshape(height, width)
 
 
-RAW_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".raw")
+RAW_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm", ".npy", ".raw")
 
 
 @dataclass(frozen=True)
@@ -104,6 +108,7 @@ def _read_plain(path: Path, raw: RawFormat) -> NDArray[Any]:
     values = read_array(path) if suffix == ".npy" else decode_stored(path, read_picture(path))
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
+    values = values.astype(values.dtype.newbyteorder("="), copy=False)
     if values.ndim != 2 or values.dtype not in (np.uint8, np.uint16) or 0 in values.shape:
         raise PolarguideError(
             path,
@@ -123,7 +128,7 @@ def _read_plain(path: Path, raw: RawFormat) -> NDArray[Any]:
     return values
 
 
-def _read_packed(path: Path, data: bytes, raw: RawFormat) -> NDArray[np.uint16]:
+def _read_packed(path: Path, data: bytes, raw: RawFormat) -> NDArray[Any]:
     if raw.width is None or raw.height is None or raw.packing is None:
         flags = {"--width": raw.width, "--height": raw.height, "--packing": raw.packing}
         raise PolarguideError(
@@ -140,4 +145,60 @@ def _read_packed(path: Path, data: bytes, raw: RawFormat) -> NDArray[np.uint16]:
             found=f"{len(data)}",
             remedy="Check --width, --height and --packing; a file that is too short may be cut off.",
         )
-    return unpack(data, raw.width, raw.height, raw.packing)
+    values = unpack(data, raw.width, raw.height, raw.packing)
+    _require_alike_neighbors(path, data, values, raw.packing)
+    return values
+
+
+_APART = 4
+"""Pixels after which analyzer and color are the same on every sensor."""
+_ROUGHER = 2.0
+"""A reading whose neighbors differ this many times as much as those of another one is not how the file was written."""
+
+
+def roughness(values: NDArray[Any]) -> float:
+    """Mean difference of neighbors behind one analyzer, as a share of that of samples that have nothing in common; of
+    the even or the odd columns, whichever is larger: a wrong packing may leave every other sample nearly right.
+    """
+    return max(_roughness(values[:, column::2]) for column in (0, 1))
+
+
+def _roughness(columns: NDArray[Any]) -> float:
+    apart = _APART // 2
+    rows = columns[: len(columns) // (2 * _APART) * 2 * _APART].astype(np.float32)
+    rows = rows.reshape(-1, 2 * _APART, columns.shape[1])[:, [0, _APART]]
+    if not len(rows) or columns.shape[1] <= apart:
+        return 0.0
+    near = (
+        np.abs(rows[..., apart:] - rows[..., :-apart]).mean() + np.abs(rows[:, 1] - rows[:, 0]).mean()
+    ) / 2
+    ordered = np.sort(rows, axis=None)
+    # The mean difference of any two of n samples, by their places in order (Gini).
+    place = np.arange(1, ordered.size + 1, dtype=np.float64)
+    spread = 2 * float((2 * place - ordered.size - 1) @ ordered) / ordered.size**2
+    return float(near / spread) if spread > 0 else 0.0
+
+
+def _require_alike_neighbors(path: Path, data: bytes, values: NDArray[Any], packing: str) -> None:
+    """Refuse a packing or a size that makes noise of a picture, where another one of the same bytes does not.
+
+    Raises:
+        PolarguideError: there is such a one.
+    """
+    height, width = values.shape
+    others = {
+        f"--packing {other}": (width, height, other)
+        for other in PACKINGS
+        if other != packing and packed_size(width, height, other) == len(data)
+    }
+    if width != height:
+        others[f"--width {height} --height {width}"] = (height, width, packing)
+    mine = roughness(values)
+    for options, (w, h, other) in others.items():
+        if mine > _ROUGHER * roughness(unpack(data, w, h, other)) > 0:
+            raise PolarguideError(
+                path,
+                expected="a picture, in which neighbors behind one analyzer are alike",
+                found=f"noise with --packing {packing} at {width}x{height}",
+                remedy=f"Read the file with {options}.",
+            )

@@ -1,0 +1,108 @@
+"""Exposures of the four shots of a view: as their files state, and as their pair sums measure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.calibration import Gains
+from polarguide.capture.filter.exif import read_taken
+from polarguide.capture.pair_sums import measured_gains, pair_moments
+from polarguide.core.progress import Advance
+from polarguide.geometry.polarizer import ANGLES
+
+# Logarithm of a ratio of exposures that are the same: files state three digits.
+_EQUAL = 1e-3
+
+
+def stated_exposures(views: Mapping[str, Sequence[Path]], advance: Advance) -> dict[str, list[float]]:
+    """Relative exposures that the files of views state (EXIF), their geometric mean over all of these views 1.
+
+    Args:
+        views: the files of each.
+        advance: told how many views are read.
+
+    Returns:
+        Those of the views whose files all state one; nothing where all state the same.
+
+    Raises:
+        PolarguideError: a file cannot be read.
+    """
+    logs: dict[str, list[float]] = {}
+    for number, (view, paths) in enumerate(views.items(), 1):
+        light = [read_taken(path).light for path in paths]
+        if all(value is not None for value in light):
+            logs[view] = [math.log(value) for value in light if value is not None]
+        advance(number)
+    every = [value for of_view in logs.values() for value in of_view]
+    if not every or max(every) - min(every) < _EQUAL:
+        return {}
+    mean = sum(every) / len(every)
+    return {view: [math.exp(value - mean) for value in of_view] for view, of_view in logs.items()}
+
+
+def exposure_notes(stated: Mapping[str, Sequence[float]], views: int) -> list[str]:
+    """What the files state, for the user."""
+    if not stated:
+        return []
+    every = [value for of_view in stated.values() for value in of_view]
+    stops = math.log2(max(every) / min(every))
+    within = sum(math.log(max(mine) / min(mine)) >= _EQUAL for mine in stated.values())
+    known = "" if len(stated) == views else f" (stated for {len(stated)} of {views} views)"
+    return [
+        f"Exposures differ by up to {stops:.2f} stops by EXIF{known}, in {within} views from shot to shot: taken back "
+        "(--gains none leaves them)."
+    ]
+
+
+@dataclass(frozen=True)
+class ShotExposures:
+    """Exposures of the shots of a view.
+
+    Attributes:
+        gains: by which the shots are divided.
+        warning: where the pair sums contradict what the files state; empty where they do not.
+    """
+
+    gains: Gains
+    warning: str = ""
+
+
+def exposures_of_view(
+    paths: Sequence[Path], gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_], stated: Sequence[float]
+) -> ShotExposures:
+    """The exposures of four shots: as their files state, unless their pair sums surely say otherwise.
+
+    Args:
+        paths: the files, for messages.
+        gray: linear intensities [4, H, W]. usable: [H, W].
+        stated: exposures that the files state, or ones.
+    """
+    logs = np.log(np.asarray(stated, np.float64))
+    mean = float(logs.mean())
+    measured = measured_gains(pair_moments(gray, usable))
+    off = {} if measured is None else measured.deviating(list(logs - mean))
+    if measured is None or not off:
+        return ShotExposures(_gains(logs))
+    differ = float(np.ptp(logs)) >= _EQUAL
+    named = ", ".join(
+        f"{paths[ANGLES.index(angle)].name} ({angle} degrees) by {factor - 1:+.0%}"
+        for angle, factor in off.items()
+    )
+    than = "than their EXIF exposures say" if differ else "than the other shots of the view"
+    warning = (
+        f"exposed otherwise {than}, by the pair sums: {named}. The pair sums are believed. Automatic exposure, edited "
+        "pictures, or a filter that was not turned?"
+    )
+    return ShotExposures(_gains(np.asarray(measured.logs) + mean), warning)
+
+
+def _gains(logs: NDArray[np.float64]) -> Gains:
+    first, second, third, fourth = (float(value) for value in np.exp(logs))
+    return first, second, third, fourth
