@@ -34,6 +34,8 @@ from polarguide.capture.calibration import Calibration
 from polarguide.capture.formats.pictures import decode_mask
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.polarizer import ANGLES
+from polarguide.inspection.capture import measure_view, read_capture
+from polarguide.inspection.picture_checks import picture_checks
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 
@@ -87,6 +89,10 @@ def test_light_and_masks(tmp_path: Path, name: str) -> None:
         assert not read_invalid(tmp_path / "out", view).any()
     assert found["pair_sums"].startswith("n/a")
     assert any("Four-angle sum check: n/a" in text for text in heard.said)
+    capture = read_capture(tmp_path / "out")
+    measured = [measure_view(inspected, 1.5) for inspected in capture.views]
+    verdicts = {check.key: check.verdict for check in picture_checks(capture, measured, None)}
+    assert [verdicts[key] for key in ("pair_sums", "encoding", "exposure", "noise")] == ["n/a"] * 4
     assert found["calibration"]["sense"] == ("cw" if name == "nersp" else "ccw")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -54,6 +54,7 @@ class _Scene(msgspec.Struct):
     objects: list[_Object] = []
     prepare: Any = None
     sensor: Any = None
+    pair_sums: Any = None
 
 
 class _Polarizer(msgspec.Struct):
@@ -190,13 +191,20 @@ def applied_calibration(path: Path, data: bytes | None) -> Calibration | None:
     return found
 
 
-def of_mosaics(path: Path, data: bytes | None) -> bool:
-    """Whether ``prepare`` made a scene of the mosaics of a sensor.
+Origin = Literal["mosaics", "stokes", "other"]
+
+
+def origin_of(path: Path, data: bytes | None) -> Origin:
+    """The files that ``prepare`` made a scene of: mosaics of a sensor, a dataset's Stokes vectors, or others.
 
     Args:
         path: ``scene.json``, for messages. data: its content, or None if there is no such file.
     """
     if data is None:
-        return False
+        return "other"
     scene = decode(data, _Scene, path, remedy="Prepare the scene again.")
-    return scene.prepare is not None and isinstance(scene.sensor, str)
+    if scene.prepare is None:
+        return "other"
+    if scene.pair_sums is not None:  # noted where the four intensities were computed
+        return "stokes"
+    return "mosaics" if isinstance(scene.sensor, str) else "other"

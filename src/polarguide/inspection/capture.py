@@ -20,7 +20,13 @@ from polarguide.capture.colmap.model import ColmapModel, read_model
 from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.formats.pictures import decode_picture, read_picture
 from polarguide.capture.layout import Layout, find_layout, select_views
-from polarguide.capture.metadata import applied_calibration, indices_of, of_mosaics, refractive_index_of
+from polarguide.capture.metadata import (
+    Origin,
+    applied_calibration,
+    indices_of,
+    origin_of,
+    refractive_index_of,
+)
 from polarguide.capture.reader import StoredViews, check_transfer, read_views
 from polarguide.capture.view import FULL_CODE
 from polarguide.core.files import read_file
@@ -80,7 +86,7 @@ class Capture:
         factor: side of the averaged pixel boxes. transfer: how the files were read.
         bits: of the files. size: width and height of the pictures as stored.
         digest: SHA-256 over the stored pictures.
-        mosaic: whether ``prepare`` made the pictures of mosaics of a sensor.
+        origin: the files that ``prepare`` made the pictures of.
     """
 
     root: Path
@@ -95,7 +101,7 @@ class Capture:
     bits: int
     size: tuple[int, int]
     digest: str
-    mosaic: bool = False
+    origin: Origin = "other"
 
     @property
     def four(self) -> bool:
@@ -150,7 +156,7 @@ def read_capture(
         bits=8 if stored.largest_value == 255 else 16,
         size=stored.data[0].size,
         digest=hashlib.sha256("\n".join(lines).encode()).hexdigest(),
-        mosaic=of_mosaics(metadata, said),
+        origin=origin_of(metadata, said),
     )
 
 

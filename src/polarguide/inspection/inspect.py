@@ -185,11 +185,11 @@ def _angles(
     """Order, sense and zero by what geometry there is; and the pixels with normals if there are any."""
     sources: list[Evidence] = []
     if capture.model is None or len(capture.posed) < 2:
-        return combine_evidence(sources, pairing, capture.applied, mosaic=capture.mosaic), None
+        return combine_evidence(sources, pairing, capture.applied, mosaic=capture.origin == "mosaics"), None
     with reporter.track("weighing points", 1):
         evidence, pixels = point_evidence(capture.posed, capture.model, index, pairing)
     sources.append(evidence)
-    angles = combine_evidence(sources, pairing, capture.applied, mosaic=capture.mosaic)
+    angles = combine_evidence(sources, pairing, capture.applied, mosaic=capture.origin == "mosaics")
     sure = angles.posterior is not None and max(angles.posterior.probabilities) >= SURE
     if settings.normals == "points" or (settings.normals == "auto" and sure):
         return angles, pixels
@@ -197,7 +197,7 @@ def _angles(
         return angles, pixels
     pixels = _trained_pixels(capture, out, settings, pairing, index, backend, reporter)
     sources.append(normal_evidence(pixels, index))
-    return combine_evidence(sources, pairing, capture.applied, mosaic=capture.mosaic), pixels
+    return combine_evidence(sources, pairing, capture.applied, mosaic=capture.origin == "mosaics"), pixels
 
 
 def _trained_pixels(

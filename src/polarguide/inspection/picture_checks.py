@@ -35,6 +35,8 @@ LITTLE, ALMOST_NONE = 0.05, 0.005
 NOISY = 0.03
 """Noise of one intensity as a share of S0 / 2: three times its DoLP noise is then 0.13."""
 
+PAIRS_TITLE, ENCODING_TITLE = "Consistency of the four angles", "Linear encoding"
+EXPOSURE_TITLE, NOISE_TITLE = "Equal exposure of the angles", "Noise"
 UNDEREXPOSED = 0.01
 """99th percentile of the values below which the exposure of a view was too short."""
 
@@ -66,10 +68,25 @@ def picture_checks(
     capture: Capture, measurements: Sequence[ViewMeasurements], pairing: int | None
 ) -> list[Check]:
     """All checks of this file, in their order on the page."""
-    exposed = measured_exposures(capture)
+    if capture.origin == "stokes":
+        computed = "The four pictures were computed from Stokes vectors: their sums agree by construction."
+        checks_of_four = (
+            ("pair_sums", PAIRS_TITLE),
+            ("encoding", ENCODING_TITLE),
+            ("exposure", EXPOSURE_TITLE),
+        )
+        return [
+            *(Check(key, title, "n/a", computed) for key, title in checks_of_four),
+            _saturation(capture, measurements),
+            Check("noise", NOISE_TITLE, "n/a", computed),
+            _polarization(measurements),
+        ]
+    encoding = _encoding(capture, pairing)
+    # A bent response looks like exposures that differ.
+    exposed = measured_exposures(capture) if encoding.verdict == "ok" else None
     return [
         _pairs(capture, measurements, pairing),
-        _encoding(capture, pairing),
+        encoding,
         _exposure(measurements, pairing, exposed),
         _saturation(capture, measurements),
         _noise(measurements),
@@ -83,7 +100,7 @@ def light_checks(capture: Capture, measurements: Sequence[ViewMeasurements]) -> 
 
 
 def _pairs(capture: Capture, measurements: Sequence[ViewMeasurements], pairing: int | None) -> Check:
-    key, title = "pair_sums", "Consistency of the four angles"
+    key, title = "pair_sums", PAIRS_TITLE
     error = float(np.median([r.sum_error for r in measurements]))
     figures = {"median_error": error, "pairing": None if pairing is None else list(PAIRINGS[pairing])}
     if pairing is not None and pairing > 0:
@@ -111,7 +128,7 @@ BENT, WRONG = 0.05, 0.1
 
 
 def _encoding(capture: Capture, pairing: int | None) -> Check:
-    key, title = "encoding", "Linear encoding"
+    key, title = "encoding", ENCODING_TITLE
     slope = checks.curvature([view.measures for view in capture.views])
     if slope is None or pairing not in (None, 0):
         why = "too few pixels are polarized" if slope is None else "the pictures are paired wrongly"
@@ -173,13 +190,13 @@ def response_curvature(capture: Capture) -> tuple[float, float] | None:
 def _exposure(
     measurements: Sequence[ViewMeasurements], pairing: int | None, exposed: MeasuredGains | None
 ) -> Check:
-    key, title = "exposure", "Equal exposure of the angles"
+    key, title = "exposure", EXPOSURE_TITLE
     known = [r for r in measurements if r.pair_ratio is not None]
     if not known or pairing not in (None, 0):
         return Check(key, title, "n/a", "The pair sums cannot be compared.")
     ratio = float(np.median([r.pair_ratio for r in known]))
     off = tuple(r.view for r in known if abs((r.pair_ratio or ratio) - ratio) > UNSTEADY)
-    figures = {"pair_ratio": ratio, "unsteady_views": len(off)}
+    figures: dict[str, Any] = {"pair_ratio": ratio, "unsteady_views": len(off)}
     said = f"(I0 + I90) / (I45 + I135) is {ratio:.3f} (median); ideal analyzers have 1."
     verdict: Verdict = "ok"
     remedy = ""
@@ -242,7 +259,7 @@ def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> C
 
 
 def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
-    key, title = "noise", "Noise"
+    key, title = "noise", NOISE_TITLE
     share, bright = (
         float(np.median([getattr(r, k) for r in measurements])) for k in ("noise_share", "bright")
     )
