@@ -6,7 +6,7 @@ import itertools
 import math
 import warnings
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -107,8 +107,10 @@ class ShotsSource(Source):
         Raises:
             PolarguideError: the largest is too large.
         """
-        pixel = max(map(len, self._of_view.values())) * _WORKED
-        remedy = "Make the pictures smaller, all by the same factor."
+        pixel, remedy = (
+            max(map(len, self._of_view.values())) * _WORKED,
+            "Make all pictures smaller by the same factor.",
+        )
         require_memory_of_each(self._shots, pixel, what, remedy=remedy)
 
     def _rounding(self, transfer: str, smallest: float) -> Rounding:
@@ -227,14 +229,13 @@ class FilterSource(ShotsSource):
             "scale": scale * min(1.0, *every),
             "rounding": self._rounding(transfer, smallest * min(1.0, *every) / max(1.0, *every)),
             "levels": None if levels is None else asdict(levels),
-            "light": {self._name(path): value for path, value in self._by_file(stated)},
+            "light": {
+                self._name(path): value
+                for view, values in stated.items()
+                for path, value in zip(self._of_view[view], values, strict=True)
+            },
             "notes": notes,
         }
-
-    def _by_file(self, stated: dict[str, list[float]]) -> Iterator[tuple[Path, float]]:
-        """The exposures of views by file."""
-        for view, values in stated.items():
-            yield from zip(self._of_view[view], values, strict=True)
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read the four shots: validity, transfer, shifts, exposures, gains, the sense of the angles, then the turn."""
