@@ -136,7 +136,9 @@ def test_what_is_written_is_of_the_views_of_the_scene_that_is_given(demo_scene: 
     assert not (maps["masked"]["reason"][:, 10:] == Reason.MASKED).all()
     np.testing.assert_allclose(maps["darker"]["S0"], stokes[0] / 2, atol=1e-3)
     one = replace(scene, views=tuple(view.changed(lambda codes: codes[:1], FOUR[:1]) for view in scene.views))
-    with pytest.raises(PolarguideError, match="view v000: expected pictures at three or more different angles"):
+    with pytest.raises(
+        PolarguideError, match="view v000: expected pictures at three or more different angles"
+    ):
         polarguide.priors(one, tmp_path / "one", views="v000", formats=["npy"])
     assert not (tmp_path / "one").exists()
 
