@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
-from polarguide.geometry.polarizer import malus
+from polarguide.geometry.polarizer import ANGLES, malus
 from polarguide.shots.maps import Reason, interpolation_factors
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import read_shot
@@ -62,6 +62,21 @@ def test_sigma_of_a_mosaic_is_the_spread_of_its_maps(tmp_path: Path, sensor: str
     assert stated == pytest.approx(spread, rel=0.08)
     off = np.angle(np.exp(2j * (maps.aolp[inner] - 0.4))) / 2
     assert float(np.sqrt(np.mean(maps.sigma_aolp[inner] ** 2))) == pytest.approx(float(off.std()), rel=0.08)
+
+
+@pytest.mark.parametrize("colors", [1, 3])
+def test_sigma_of_shots_is_the_spread_of_their_maps(tmp_path: Path, colors: int) -> None:
+    """Of gray files, too, whose three colors are one sample."""
+    rng, well = np.random.default_rng(6), 5000.0
+    for angle in ANGLES:
+        clean = np.full((256, 256, colors), malus((0.7, 0.7 * 0.25, 0.0), math.radians(angle)))
+        cv2.imwrite(
+            str(tmp_path / f"a_{angle}.png"),
+            np.rint(rng.poisson(clean * well) / well * 65535).astype(np.uint16),
+        )
+    files = [tmp_path / f"a_{angle}.png" for angle in ANGLES]
+    maps = read_shot(files, ShotOptions(transfer="linear", align=False, full_well=well))
+    assert float(maps.sigma_dolp.mean()) == pytest.approx(float(maps.dolp_debiased.std()), rel=0.05)
 
 
 def test_interpolated_values_have_less_noise() -> None:

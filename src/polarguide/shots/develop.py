@@ -280,8 +280,10 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
         linear = linear / np.asarray(gains, np.float32)[:, None, None, None]
         gray = linear.mean(axis=3)
     noise = given_noise(options, lsb)
-    factor = 1.0 if noise is None else 1 / 3
-    noise = noise or estimated_noise(gray, ~(saturated | dark), lsb / 3**0.5)
+    # The luminance is the mean of three samples, whose noise is independent but in gray files, where they are copies.
+    samples = 1 if (shots.pictures[..., :1] == shots.pictures).all() else 3
+    factor = 1.0 if noise is None else 1 / samples
+    noise = noise or estimated_noise(gray, ~(saturated | dark), lsb / samples**0.5)
     turned = np.stack(
         [apply_orientation(p, shots.orientation) for p in oriented(linear, options.calibration)]
     )
