@@ -399,7 +399,7 @@ class SinglesSource(ShotsSource):
         return self._developed(found, upright, {"exposures": exposures}, angles)
 
     def _require_one(self, found: dict[str, Path], what: str, remedy: str) -> None:
-        """Refuse photographs of two cameras or sizes: the first photograph of each, by its name.
+        """Refuse photographs of two cameras, sizes or kinds of files: the first photograph of each, by its name.
 
         Raises:
             PolarguideError: there are two.
@@ -417,17 +417,11 @@ class SinglesSource(ShotsSource):
             PolarguideError: they are of several kinds.
         """
         asked = self._settings.transfer
-        kinds = {
-            "camera raw" if is_camera_raw(path) else LOSSY if is_lossy(path) else "PNG, TIFF or BMP"
-            for path in self._shots
-        }
-        if len(kinds) > 1:
-            raise PolarguideError(
-                self._root,
-                expected="photographs of one kind of file",
-                found=" and ".join(sorted(kinds)),
-                remedy="Keep one kind: their brightness cannot be compared.",
-            )
+        kinds: dict[str, Path] = {}
+        for path in self._shots:
+            name = "camera raw" if is_camera_raw(path) else LOSSY if is_lossy(path) else "PNG, TIFF or BMP"
+            kinds.setdefault(name, path)
+        self._require_one(kinds, "kind of file", "Keep one kind: their brightness cannot be compared.")
         (kind,) = kinds
         if kind == "camera raw":
             return "linear", _RAW
