@@ -74,7 +74,7 @@ def pack(values: np.ndarray, packing: str) -> bytes:
             for a, b in zip(flat[::2], flat[1::2], strict=True)
         )
     bits = int(packing[:2])
-    flat += [0] * (-len(flat) % (4 if bits == 10 else 2))
+    flat += [0] * (-len(flat) % {10: 4, 12: 2}.get(bits, 1))
     stream = [value >> bit & 1 for value in flat for bit in range(bits)]
     return bytes(sum(stream[i + bit] << bit for bit in range(8)) for i in range(0, len(stream), 8))
 

@@ -66,10 +66,12 @@ def picture_checks(
     capture: Capture, measurements: Sequence[ViewMeasurements], pairing: int | None
 ) -> list[Check]:
     """All checks of this file, in their order on the page."""
-    exposed = measured_exposures(capture)
+    encoding = _encoding(capture, pairing)
+    # A bent response looks like exposures that differ.
+    exposed = measured_exposures(capture) if encoding.verdict == "ok" else None
     return [
         _pairs(capture, measurements, pairing),
-        _encoding(capture, pairing),
+        encoding,
         _exposure(measurements, pairing, exposed),
         _saturation(capture, measurements),
         _noise(measurements),
@@ -179,7 +181,7 @@ def _exposure(
         return Check(key, title, "n/a", "The pair sums cannot be compared.")
     ratio = float(np.median([r.pair_ratio for r in known]))
     off = tuple(r.view for r in known if abs((r.pair_ratio or ratio) - ratio) > UNSTEADY)
-    figures = {"pair_ratio": ratio, "unsteady_views": len(off)}
+    figures: dict[str, Any] = {"pair_ratio": ratio, "unsteady_views": len(off)}
     said = f"(I0 + I90) / (I45 + I135) is {ratio:.3f} (median); ideal analyzers have 1."
     verdict: Verdict = "ok"
     remedy = ""

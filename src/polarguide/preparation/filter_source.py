@@ -72,6 +72,7 @@ class ShotsSource(Source):
     """Shots of an ordinary camera through a polarizing filter: what four a view and single ones have in common."""
 
     cameras = None
+    _root: Path
 
     def __init__(self, paths: list[Path], views: dict[str, list[Path]], settings: PrepareSettings) -> None:
         """Use the shots of each view, in their order; ``paths`` are all files that are read.

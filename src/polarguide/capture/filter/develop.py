@@ -135,8 +135,10 @@ def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
     if min(height, width) < 2:  # a window that fades out on both sides has no middle there
         return Shift(0.0, 0.0, False)
     window = cv2.createHanningWindow((width, height), cv2.CV_32F)
-    # It may write into its arguments: where their size needs no padding, it fades them out in place.
-    (x, y), _ = cv2.phaseCorrelate(reference.copy(), other.copy(), window)
+    # Borders count less: what enters the picture there has no match. Done here, as phaseCorrelate does it in place, and
+    # only to pictures of some sizes.
+    reference, other = reference * window, other * window
+    (x, y), _ = cv2.phaseCorrelate(reference, other)
     limit = LARGEST_SHARE * width
     if max(abs(x), abs(y)) > limit:
         x = y = 0.0
