@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from polarguide import optics
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
@@ -235,3 +237,55 @@ class TestWrong:
     def test_options_out_of_range(self) -> None:
         with pytest.raises(PolarguideError, match="--bits: expected 8 to 16, found 20"):
             ShotOptions(bits=20).checked()
+
+
+BITS = {"twelve": (4095, {}), "ten": (1023, {"bits": 10}), "clipped": (4095, {"saturation": 3500})}
+
+
+@pytest.mark.parametrize("case", sorted(BITS))
+@pytest.mark.parametrize("angles", [ANGLES, (0, 30, 60, 90, 120, 150)], ids=["four", "six"])
+def test_values_of_fewer_bits_in_16(tmp_path: Path, angles: tuple[int, ...], case: str) -> None:
+    """Full scale is that of the sensor, and what reaches it is saturated."""
+    full, given = BITS[case]
+    stored = [np.rint(malus(light(), math.radians(angle)) * full) for angle in angles]
+    for angle, values in zip(angles, stored, strict=True):
+        colors = np.repeat(values[..., None].astype(np.uint16), 3, axis=2)
+        assert cv2.imwrite(str(tmp_path / f"cup_a{angle}.png"), colors)
+    paths = [tmp_path / f"cup_a{angle}.png" for angle in angles]
+    maps = read_shot(paths, replace(PLAIN, **given, align=angles != ANGLES))
+    saturated = (np.stack(stored) >= given.get("saturation", full)).any(axis=0)
+    keeps = maps.usable & ~saturated
+    assert keeps.mean() > 0.5
+    np.testing.assert_allclose(maps.s0[keeps], light()[0][keeps], atol=2.5 / full)
+    if angles == ANGLES:
+        np.testing.assert_array_equal(maps.reason == Reason.SATURATED, saturated)
+
+
+@pytest.mark.parametrize("angles", [ANGLES, (0, 30, 60, 90, 120, 150)], ids=["four", "six"])
+def test_exposures_that_files_state_are_taken_back(tmp_path: Path, angles: tuple[int, ...]) -> None:
+    """One picture has a third of a stop less, and its EXIF data say so."""
+    for angle in angles:
+        time = 80 if angle == 90 else 100  # one over
+        values = np.rint(malus(light(), math.radians(angle)) * 0.8 * 100 / time * 255).astype(np.uint8)
+        exif = Image.Exif()
+        exif.get_ifd(0x8769).update({0x829A: 1 / time, 0x829D: 8.0, 0x8827: 100})
+        picture = Image.fromarray(np.repeat(values[..., None], 3, axis=2))
+        picture.save(tmp_path / f"cup_a{angle}.jpg", quality=100, subsampling=0, exif=exif)
+    maps = read_shot(
+        [tmp_path / f"cup_a{angle}.jpg" for angle in angles], replace(PLAIN, align=angles != ANGLES)
+    )
+    s0, s1, s2 = light()
+    assert float(np.abs(maps.dolp - np.hypot(s1, s2) / s0).mean()) < 0.01
+    assert any("exposures that differ by a factor of 1.25" in note for note in maps.notes)
+
+
+@pytest.mark.parametrize("flip", ["x", "y", "xy"])
+def test_a_mirrored_mosaic_with_a_gamma(tmp_path: Path, flip: str) -> None:
+    values = malus(light(), np.deg2rad(tiled(sensor_pattern("IMX250MZR").angles, SHAPE))) ** 0.8
+    stored = np.rint(values * 4095).astype(np.uint16)
+    stored = stored[:, ::-1] if "x" in flip else stored
+    cv2.imwrite(str(tmp_path / "part.png"), stored[::-1] if "y" in flip else stored)
+    maps = read_shot(tmp_path / "part.png", replace(MONO, flip=flip, gamma=0.8, demosaic="full"))
+    inner, (s0, s1, s2) = np.s_[4:-4, 4:-4], light()
+    np.testing.assert_allclose(maps.s0[inner], s0[inner], atol=3e-3)
+    np.testing.assert_allclose(maps.dolp[inner], (np.hypot(s1, s2) / s0)[inner], atol=6e-3)

@@ -135,7 +135,7 @@ def test_two_files_of_one_angle_are_ambiguous(tmp_path: Path) -> None:
     assert error.value.expected == "one picture of cup at 10 degrees"
 
 
-@pytest.mark.parametrize("option", [{"align": False}, {"gains": "auto"}, {"bits": 12}])
+@pytest.mark.parametrize("option", [{"align": False}, {"gains": "auto"}, {"flip": "x"}])
 def test_options_of_others_are_refused(tmp_path: Path, option: dict) -> None:
     write(tmp_path, [f"cup_a{angle}.png" for angle in SIX])
     with pytest.raises(PolarguideError) as error:

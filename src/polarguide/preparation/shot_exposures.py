@@ -21,12 +21,14 @@ from polarguide.geometry.polarizer import ANGLES
 _EQUAL = 1e-3
 
 
-def stated_exposures(views: Mapping[str, Sequence[Path]], advance: Advance) -> dict[str, list[float]]:
+def stated_exposures(
+    views: Mapping[str, Sequence[Path]], advance: Advance | None = None
+) -> dict[str, list[float]]:
     """Relative exposures that the files of views state (EXIF), their geometric mean over all of these views 1.
 
     Args:
         views: the files of each.
-        advance: told how many views are read.
+        advance: receives the number of views that were read.
 
     Returns:
         Those of the views whose files all state one; nothing where all state the same.
@@ -39,7 +41,8 @@ def stated_exposures(views: Mapping[str, Sequence[Path]], advance: Advance) -> d
         light = [read_taken(path).light for path in paths]
         if all(value is not None for value in light):
             logs[view] = [math.log(value) for value in light if value is not None]
-        advance(number)
+        if advance is not None:
+            advance(number)
     every = [value for of_view in logs.values() for value in of_view]
     if not every or max(every) - min(every) < _EQUAL:
         return {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -27,12 +27,22 @@ from polarguide.capture.memory import KEPT, READ, require_memory_of_each
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
 from polarguide.capture.sensor.demosaic import demosaic
-from polarguide.capture.sensor.pattern import SENSOR_SIZE, SIDE, estimate_levels, tiled, unusable_samples
+from polarguide.capture.sensor.pattern import (
+    FULL_16,
+    SENSOR_SIZE,
+    SIDE,
+    estimate_levels,
+    level_notes,
+    tiled,
+    unusable_samples,
+)
 from polarguide.capture.view import ANGLES, FULL_CODE, View
 from polarguide.capture.view_reader import ViewData, read_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_file
 from polarguide.preparation.mosaic_source import MosaicFiles, block_intensities, sample_blocks
+from polarguide.preparation.shot_exposures import exposures_of_view, stated_exposures
+from polarguide.preparation.shot_levels import levels_of_shots
 from polarguide.shots.exposures import ExposureSet
 from polarguide.shots.maps import Map, NoiseModel, estimated_noise, given_noise, interpolation_factors
 from polarguide.shots.options import ShotOptions
@@ -127,6 +137,7 @@ def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
     dark = files.dark(stored.shape)
     values = files.cut(stored)
     container = files.container(path, stored)
+    counts = np.bincount(stored.ravel(), minlength=FULL_16 + 1)
     levels = estimate_levels(
         int(stored.max()),
         int(np.bitwise_or.reduce(stored, None)),
@@ -134,11 +145,11 @@ def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
         bits=options.bits,
         black=options.black_level,
         saturation=options.saturation,
+        counts=counts,
     )
+    levels = replace(levels, gamma=options.gamma)
     files.require_kind(sample_blocks(values, SIDE), levels)
-    notes = []
-    if options.bits is None and container == 16:
-        notes.append(f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale.")
+    notes = level_notes(levels, counts, container, options.bits)
     side = 2 * pattern.period
     floor = None if dark is None else sample_blocks(dark, side)
     assert options.sensor is not None
@@ -253,15 +264,16 @@ def _gains(
 
 def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
     require_four_shots(shot.paths[0].parent, {shot.name: shot.files})
-    shots = read_shots(shot.files)
-    notes: list[str] = []
+    paths = [shot.files[angle] for angle in ANGLES]
+    levels, notes = levels_of_shots(paths, (1.0, 1.0, 1.0), options.preparation())
+    shots = read_shots(shot.files, levels=levels)
     transfer: str = options.transfer
     if transfer == "auto":
         decision = decide_transfer([shots], lossy=is_lossy(shot.files[0]))
         transfer = decision.transfer
         notes.append(f"Transfer {decision.reason}.")
     linear = linear_intensities(shots.pictures, transfer)
-    lsb = 1 / float(np.iinfo(shots.pictures.dtype).max)
+    lsb = 1 / float(np.iinfo(shots.pictures.dtype).max if levels is None else levels.white)
     clipped, dark = shots.clipped, shots.dark
     if options.align:
         shifts = estimate_shifts(linear)
@@ -273,6 +285,17 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
         ]
         notes += [f"Shots moved, in pixels: {', '.join(moved)}."] if moved else []
     saturated = np.asarray(clipped.any(axis=0))
+    stated = stated_exposures({shot.name: paths}).get(shot.name)
+    exposed = np.asarray(stated or UNIT_GAINS)
+    if stated:
+        spread = max(stated) / min(stated)
+        notes.append(f"The files state exposures that differ by a factor of {spread:.3g}; corrected.")
+    if options.gains == "auto" and options.calibration.gains is None:
+        measured = exposures_of_view(paths, linear.mean(axis=3), ~(saturated | dark), exposed.tolist())
+        exposed = np.asarray(measured.gains)
+        notes += [f"Shots {measured.warning}"] if measured.warning else []
+    if (exposed != 1.0).any():
+        linear = linear / exposed.astype(np.float32)[:, None, None, None]
     gray = linear.mean(axis=3)
     ratio = pair_ratio(gray, ~(saturated | dark))
     gains, said = _gains(ratio, options)

@@ -31,11 +31,13 @@ _ONE: dict[Kind, str] = {
 _OWNERS: dict[str, tuple[Kind, ...]] = {
     **dict.fromkeys(
         (
-            "sensor", "packing", "width", "height", "bits", "offset_x", "offset_y", "black_level", "dark_frame",
-            "saturation", "demosaic", "interpolation", "analyzers",
+            "sensor", "packing", "width", "height", "offset_x", "offset_y", "black_level", "dark_frame", "gamma",
+            "flip", "demosaic", "interpolation", "analyzers",
         ),
         ("mosaic",),
     ),
+    "bits": ("mosaic", "filter", "set"),
+    "saturation": ("mosaic", "filter", "set"),
     "transfer": ("filter", "set", "scene"),
     "align": ("filter",),
     "gains": ("mosaic", "filter"),
@@ -55,17 +57,21 @@ class ShotOptions:
         packing: Packing of .raw files (two different 12-bit packings exist; never guessed).
         width: Width of .raw files in pixels; others must have it, too.
         height: Height of .raw files in pixels.
-        bits: Bits of a sensor value in 16-bit files; without it 12 if no value exceeds 4095, else 16.
+        bits: Bits of a value in 16-bit files; without it those at which values pile up, else 12 if none exceeds
+            4095, else 16.
         offset_x: Column of the sensor at which the region of interest starts.
         offset_y: Row of the sensor at which it starts.
         black_level: Stored value without light.
         dark_frame: Picture with the lens covered, subtracted in place of the black level.
         saturation: Stored value from which the sensor saturates; without it full scale.
+        gamma: Gamma that the camera applied to mosaics: stored = light ^ gamma.
+        flip: Which way the camera mirrored the mosaics (Reverse X, Reverse Y): undone before anything else.
         demosaic: full, half or quarter resolution of the sensor.
         interpolation: How half and full fill in colors and angles.
         transfer: Encoding of filter shots; auto by the curvature of the response.
         align: Estimate and correct small shifts between the four shots of a filter; sets at other angles are not moved.
-        gains: none takes the angles as they are, auto corrects what the light of each shot tells of their gains.
+        gains: none corrects only exposures that the files state (EXIF), auto also what the light of each shot tells of
+            the gains of the angles.
         calibration: gains, order, sense and zero of the angles.
         analyzers: calibration of the sensor that polarguide calibrate wrote, for raw mosaics; takes the place of gains.
         full_well: Electrons of a sample at full scale, for its noise; without it the noise is estimated from each shot.
@@ -74,7 +80,7 @@ class ShotOptions:
     """
 
     sensor: Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"] | None = None
-    packing: Literal["10p", "12p", "12packed"] | None = None
+    packing: Literal["8", "16", "10p", "12p", "12packed"] | None = None
     width: _Positive | None = None
     height: _Positive | None = None
     bits: Annotated[int, Meta(ge=8, le=16)] | None = None
@@ -83,6 +89,8 @@ class ShotOptions:
     black_level: Annotated[float, Meta(ge=0)] = 0.0
     dark_frame: Path | None = None
     saturation: _Positive | None = None
+    gamma: Annotated[float, Meta(ge=0.1, le=4.0)] = 1.0
+    flip: Literal["none", "x", "y", "xy"] = "none"
     demosaic: Literal["half", "quarter", "full"] = "full"
     interpolation: Literal["bilinear", "guided"] = "bilinear"
     transfer: Literal["auto", "linear", "srgb"] = "auto"

@@ -17,17 +17,19 @@ from polarguide.capture.exposures import Angle, Exposure, analyzers, nominal, tu
 from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration, read_taken
 from polarguide.capture.filter.shots import Shots, read_stack
-from polarguide.capture.formats.pictures import linear_codes
+from polarguide.capture.formats.pictures import is_lossy, linear_codes, may_use_fewer_bits, rescaled
 from polarguide.capture.memory import require_memory
+from polarguide.capture.sensor.pattern import FULL_16, Levels
 from polarguide.capture.view import FULL_CODE, View
 from polarguide.capture.view_reader import ViewData, require_alike
 from polarguide.core.errors import PolarguideError
+from polarguide.preparation.filter_source import LOSSY
+from polarguide.preparation.shot_levels import levels_of_counts
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.sets import SetPicture, known_places
 from polarguide.shots.video import read_frames
 
 Mask = NDArray[np.bool_]
-_JPEG = (".jpg", ".jpeg")
 # Compression smears the edge of clipped areas over a few values.
 _COMPRESSED_FULL = 250
 _FITTED = 4 * (4 * 3 + 3 + 7)
@@ -100,12 +102,12 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
     unused = len(pictures)
     pictures = [picture for picture in pictures if not isinstance(picture.angle, str)]
     unused -= len(pictures)
-    transfer, note = _transfer([picture.path for picture in pictures], options.transfer)
+    transfer, note = _transfer(pictures, options.transfer)
     count = len(pictures)
     values: NDArray[Any] | None = None
     lost: NDArray[Any] | None = None
     dark: Mask | None = None
-    code, step, gray = 1, 0.0, True
+    code, step, gray, kind = 1, 0.0, True, np.dtype(np.uint16)
     for place, shot in enumerate(_read_each(pictures)):
         stored = shot.pictures[0]
         gray = gray and bool((stored[..., :1] == stored).all())
@@ -118,12 +120,22 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
             lost, dark = np.empty(values.shape[:3], bool), np.ones(values.shape[1:3], bool)
         elif not gray and values.shape[3] == 1:
             values = np.repeat(values, 3, axis=3)
-        values[place] = linear_codes(stored[..., : values.shape[3]], transfer)
+        values[place] = stored[..., : values.shape[3]]
         lost[place] = shot.clipped[0]
+        kind = stored.dtype
         dark &= shot.dark
     assert values is not None
     assert lost is not None
     assert dark is not None
+    levels, said = _levels(pictures, values, options)
+    every = np.arange(np.iinfo(kind).max + 1, dtype=kind)
+    if levels is not None:
+        every, step = rescaled(every, levels.white), 1 / levels.white
+    linear = linear_codes(every, transfer)
+    for picture, clipped in zip(values, lost, strict=True):  # one after the other, as memory is
+        if levels is not None:
+            clipped |= (picture >= levels.saturation).any(axis=2)
+        picture[...] = linear[picture]
     gains, words = _gains(pictures)
     turn = orientation_calibration(code)
     return SetSamples(
@@ -137,8 +149,24 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
         dark=apply_orientation(dark, code),
         masked=np.zeros(apply_orientation(dark, code).shape, bool),
         step=step,
-        notes=(note, *words, *_unused(unused)),
+        notes=(note, *said, *words, *_unused(unused)),
     )
+
+
+def _levels(
+    pictures: Sequence[SetPicture], values: NDArray[np.uint16], options: ShotOptions
+) -> tuple[Levels | None, list[str]]:
+    """Levels of the stored values where the files do not state them, as ``levels_of_shots`` has them, and notes."""
+    wide = any(
+        picture.frame is None and not is_camera_raw(picture.path) and may_use_fewer_bits(picture.path)
+        for picture in pictures
+    )
+    if not wide and options.bits is None and options.saturation is None:
+        return None, []
+    counts = sum(
+        (np.bincount(picture.ravel(), minlength=FULL_16 + 1) for picture in values), np.zeros(1, np.int64)
+    )
+    return levels_of_counts(counts, 16 if wide else 8, options.bits, options.saturation)
 
 
 def require_no_order(calibration: Calibration, name: str) -> None:
@@ -190,16 +218,30 @@ def _video(path: Path, frames: Sequence[int | None]) -> Iterator[Shots]:
         yield Shots(picture[None], 1, clipped[None], ~lit)
 
 
-def _transfer(paths: Sequence[Path], asked: str) -> tuple[str, str]:
-    """How the files are encoded, and why: as ``prepare`` takes photographs at any angles."""
-    if all(map(is_camera_raw, paths)):
+def _transfer(pictures: Sequence[SetPicture], asked: str) -> tuple[str, str]:
+    """How the files are encoded, and why: as ``prepare`` takes photographs at any angles.
+
+    Raises:
+        PolarguideError: they are of several kinds.
+    """
+    kinds: dict[str, Path] = {}
+    for picture in pictures:
+        raw = is_camera_raw(picture.path)
+        still = "camera raw" if raw else LOSSY if is_lossy(picture.path) else "PNG, TIFF or BMP"
+        kinds.setdefault("video" if picture.frame is not None else still, picture.path)
+    if len(kinds) > 1:
+        raise PolarguideError(
+            pictures[0].path.parent,
+            expected="a set of one kind of file",
+            found=" and ".join(f"{kind} ({path.name})" for kind, path in kinds.items()),
+            remedy="Keep one kind: their brightness cannot be compared.",
+        )
+    (kind,) = kinds
+    if kind == "camera raw":
         return "linear", "Transfer linear: camera raw, developed without tone curve."
     if asked != "auto":
         return asked, f"Transfer {asked}, as given."
-    pictures = {path.suffix.lower() for path in paths}
-    kind = "video" if pictures.isdisjoint((*_JPEG, ".png", ".tif", ".tiff")) else "JPEG"
-    kind = kind if kind == "video" or pictures <= set(_JPEG) else "PNG and TIFF"
-    usual = "linear" if kind == "PNG and TIFF" else "srgb"
+    usual = "srgb" if kind in ("video", LOSSY) else "linear"
     return usual, f"Transfer {usual}, as {kind} files usually are (--transfer sets it)."
 
 

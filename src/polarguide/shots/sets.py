@@ -20,7 +20,7 @@ from polarguide.capture.exposures import (
     normalized,
     read_table,
 )
-from polarguide.capture.filter.shots import SHOT_SUFFIXES, split_name
+from polarguide.capture.filter.shots import SHOT_SUFFIXES, group_files, split_name
 from polarguide.capture.layout import ambiguous, list_files
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
@@ -222,8 +222,10 @@ def _any_angles(folder: Path, views: dict[str, list[SetPicture]]) -> tuple[list[
     """The sets of a folder; and the files of views at 0, 45, 90 and 135 degrees, or some of them."""
     sets, four = [], []
     for view, mine in sorted(views.items()):
-        if all(picture.angle in ANGLES for picture in mine):
-            four += [picture.path for picture in mine]
+        paths = [picture.path for picture in mine]
+        # Of these angles, names with a mark such as cup_a45 are known here alone.
+        if all(picture.angle in ANGLES for picture in mine) and not (len(mine) == 4 and group_files(paths)[1]):
+            four += paths
         else:
             sets.append(_named_set(folder, view, mine))
     return sets, four

@@ -176,7 +176,7 @@ def require_four_shots(root: Path, shots: dict[str, dict[int, Path]]) -> None:
             )
 
 
-def read_shots(files: dict[int, Path], gains: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Shots:
+def read_shots(files: dict[int, Path], *, levels: Levels | None = None) -> Shots:
     """Read the four shots of a view, as ``read_stack`` does.
 
     Raises:
@@ -184,7 +184,7 @@ def read_shots(files: dict[int, Path], gains: tuple[float, float, float] = (1.0,
     """
     remedy = "Make the pictures smaller, all by the same factor."
     require_memory_of_each(list(files.values()), _READ, "four shots", remedy=remedy)
-    return read_stack([files[angle] for angle in ANGLES], gains)
+    return read_stack([files[angle] for angle in ANGLES], levels=levels)
 
 
 def read_stack(
