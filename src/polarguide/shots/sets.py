@@ -224,7 +224,9 @@ def _any_angles(folder: Path, views: dict[str, list[SetPicture]]) -> tuple[list[
     for view, mine in sorted(views.items()):
         paths = [picture.path for picture in mine]
         # Of these angles, names with a mark such as cup_a45 are known here alone.
-        if all(picture.angle in ANGLES for picture in mine) and not (len(mine) == 4 and group_files(paths)[1]):
+        if all(picture.angle in ANGLES for picture in mine) and not (
+            len(mine) == 4 and group_files(paths)[1]
+        ):
             four += paths
         else:
             sets.append(_named_set(folder, view, mine))

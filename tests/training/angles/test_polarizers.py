@@ -222,6 +222,21 @@ def test_only_what_is_an_exception_contradicts(tmp_path: Path) -> None:
     assert (found, "contradict" in said, "known angles were not checked" in said) == ([], False, True)
 
 
+@pytest.mark.parametrize(("places", "contradicting"), [((5,), []), ((5, 7), [5, 7]), ((4, 5), [])])
+def test_of_four_pictures_only_exchanged_ones_contradict(
+    places: tuple[int, ...], contradicting: list[int]
+) -> None:
+    """A single wrong angle would break the pair sums; those of 45 and 135 degrees are places 5 and 7."""
+    views = tuple(dataclasses.replace(view, mount="filter") for view in WHOLE.views)
+    polarizers = Polarizers(dataclasses.replace(WHOLE, views=views), STOKES, STEPS)
+    fits = polarizers.fit(predicted)[None]
+    fits[..., 3] = 2.0
+    for place in places:
+        fits[0, place, 0] = (fits[0, place, 0] + 90.0) % 180.0
+    polarizers.take(fits)
+    assert [k for k, judgment in enumerate(polarizers.judgments()) if judgment.contradicts] == contradicting
+
+
 def test_where_most_angles_are_doubtful_it_says_what_to_do(tmp_path: Path) -> None:
     scene, polarizers = unknown()
     fits = polarizers.fit(predicted)[None]

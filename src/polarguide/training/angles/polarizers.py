@@ -15,6 +15,7 @@ from torch import Tensor
 from polarguide.capture import Scene, View
 from polarguide.capture.exposures import Exposure
 from polarguide.capture.exposures import found as found_exposure
+from polarguide.capture.view import ANGLES
 from polarguide.training.angles.fit import fit_angle
 from polarguide.training.recipe import Recipe
 from polarguide.training.rules import AngleRules
@@ -45,6 +46,7 @@ class Judgment:
         usual: median of what the telling pictures of the same fit are ``off``: how well the model predicts any.
         unexplained: misfit of the last of all fits over the median of all pictures, times that over the misfit across:
             large where the picture is explained worse than others are, and hardly better than by a turned polarizer.
+        overruled: whether the other pictures of its view contradict a wrong angle; see ``Polarizers._overruled``.
         rules: by which it is judged.
     """
 
@@ -62,6 +64,7 @@ class Judgment:
     scatter: float = 0.0
     unexplained: float = 0.0
     usual: float = 0.0
+    overruled: bool = False
     rules: AngleRules = field(default_factory=AngleRules, repr=False)
 
     @property
@@ -111,7 +114,12 @@ class Judgment:
     @property
     def contradicts(self) -> bool:
         """Whether the picture contradicts its specified angle, by more than its ``limit``."""
-        return not self.unfiltered and abs(self.off) > self.limit
+        return not (self.unfiltered or self.overruled) and abs(self.off) > self.limit
+
+    def resembles(self, other: Judgment) -> bool:
+        """Whether it looks as if taken at the specified angle of another picture, as well as it tells."""
+        apart = (self.angle - (other.specified.angle or 0.0) + 90.0) % 180.0 - 90.0
+        return abs(apart) <= max(self.rules.contradicts, 3 * self.spread)
 
     @property
     def doubtful(self) -> bool:
@@ -249,7 +257,22 @@ class Polarizers:
             judgments.append(
                 judgment if specified.known else replace(judgment, believed=_belief(judgment, common))
             )
-        return judgments
+        return [replace(judgment, overruled=self._overruled(judgment, judgments)) for judgment in judgments]
+
+    def _overruled(self, judgment: Judgment, judgments: Sequence[Judgment]) -> bool:
+        """Whether a picture contradicts its angle, and the three or more others of its view do not.
+
+        Four pictures determine more than a Stokes vector: a single wrong angle breaks their pair sums, which
+        ``prepare`` and ``inspect`` check. Only two exchanged pictures keep the sums, and each looks like the other.
+        """
+        view = [other for other in judgments if other.view == judgment.view]
+        if not judgment.contradicts or len(view) < len(ANGLES) or any(not j.specified.known for j in view):
+            return False
+        return not any(
+            other.contradicts and judgment.resembles(other) and other.resembles(judgment)
+            for other in view
+            if other.number != judgment.number
+        )
 
     def _judged(self, fit: Tensor) -> list[Judgment]:
         """The judgment of each picture by one fit [P, 8]."""
