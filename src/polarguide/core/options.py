@@ -6,6 +6,7 @@ The command line reads names, types, defaults and texts from these classes.
 from __future__ import annotations
 
 import math
+import numbers
 import os
 import re
 from collections.abc import Iterable
@@ -44,8 +45,11 @@ def check_count(name: str, value: int, minimum: int = 1, most: int = MOST) -> No
     """Check an option's value.
 
     Raises:
-        PolarguideError: it is less than ``minimum`` or more than ``most``.
+        PolarguideError: it is not a whole number, or less than ``minimum`` or more than ``most``.
     """
+    if not isinstance(value, numbers.Integral) or isinstance(value, bool):
+        remedy = "Round it."
+        raise PolarguideError(name, expected="a whole number", found=repr(value), remedy=remedy)
     if not minimum <= value <= most:
         expected, change = (f"up to {most}", "smaller") if value > most else (f"{minimum} or more", "larger")
         raise PolarguideError(name, expected=expected, found=str(value), remedy=f"Give a {change} number.")

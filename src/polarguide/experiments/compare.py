@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
@@ -80,7 +81,7 @@ def compare(
         PolarguideError: wrong input, or another comparison at work in ``out``.
     """
     comparison = Comparison(
-        scenes=tuple(Path(scene) for scene in scenes),
+        scenes=tuple(_folder(scene) for scene in scenes),
         recipes=_checked_recipes(recipes),
         settings=settings,
         options=options,
@@ -143,6 +144,18 @@ def ablate(
     recipes = [*reference, *ablated(base, only)]
     options = replace(options, against=options.against or base)
     return compare(scenes, recipes, out, settings=settings, options=options, reporter=reporter)
+
+
+def _folder(scene: object) -> Path:
+    """The folder of a scene: runs are trained in other processes, which read it from there."""
+    if isinstance(scene, str | os.PathLike):
+        return Path(scene)
+    raise PolarguideError(
+        "scenes",
+        expected="folders of scenes, which other processes read",
+        found=f"a {type(scene).__name__}",
+        remedy="Pass scene.root in place of a loaded scene.",
+    )
 
 
 def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:

@@ -39,17 +39,17 @@ class TrainSettings:
             scene.json, and 1.5 where it has none.
         views_per_step: Views whose mean gradient makes a step. Learning rates grow with its square root; steps are
             steps, so more views are looked at. None: one for each process.
-        background: What is behind the subject: a scene to reconstruct, too; black, that is nothing; masked makes it
-            nothing (the subject in masks/ alone is read); auto, which is not specified, is black where the edges of the
-            pictures are, else scene.
+        background: What is behind the subject. scene: surroundings, which are reconstructed. black: nothing, the
+            pictures are black there. masked: nothing, pixels outside masks/ are set to black. auto: black where the
+            edges of the pictures are black, else scene.
         gaussians: Most Gaussians that there may be, each of which takes 4 kB. None: one for 20 pixels of all
             training views, 400,000 at most.
         exposures: Which pictures of a scene with four to train on, as if no others had been taken: captured, all that
             there are. See compare.
-        begin_again: Where angles are unknown, seek them in a short training on small pictures, and begin again with
-            them; otherwise they are fitted in the course of the training itself.
-        materials: What surfaces are made of: auto looks for metals, and heeds materials/ where the scene has it;
-            dielectric takes it that there is no metal.
+        begin_again: Where angles are unknown, find them in a short training on small pictures, and begin again
+            with them; otherwise they are fitted during the training itself.
+        materials: What surfaces are made of: auto detects metals, and reads the labels in materials/ if there are any;
+            dielectric assumes that there is no metal.
     """
 
     steps: int | None = None

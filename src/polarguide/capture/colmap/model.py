@@ -164,7 +164,7 @@ def find_model(root: Path, *, itself: bool = True, points: bool = True) -> tuple
         root if itself else root / "sparse" / "0",
         expected="a COLMAP model (cameras, images and points3D as .bin or .txt)",
         found="neither there nor in sparse/",
-        remedy="Run structure from motion on the pictures, or copy the model there.",
+        remedy="Copy the model there; or let polarguide prepare FOLDER --out SCENE run structure from motion.",
     )
 
 

@@ -253,6 +253,8 @@ def may_use_fewer_bits(path: Path) -> bool:
 
     Cameras of 10 to 14 bits write PNG and TIFF files of 16 bits, which do not say so.
     """
+    if not path.is_file():  # opening a pipe would wait for its writer; whoever reads the picture refuses it
+        return False
     with contextlib.suppress(struct.error, OverflowError, OSError), open(path, "rb") as file:
         start = file.read(32)
         if start.startswith(b"\x89PNG"):
