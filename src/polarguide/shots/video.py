@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.exposures import LARGEST, Angle, parse_angle
 from polarguide.core.errors import PolarguideError
-from polarguide.core.files import read_file
+from polarguide.core.files import read_file, require_file
 from polarguide.core.records import shortened
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
@@ -73,12 +73,15 @@ def read_frames(path: Path, frames: Sequence[int]) -> Iterator[NDArray[np.uint8]
     """The frames of a video [H, W, 3] uint8 RGB, one after the other.
 
     Args:
-        path: of the video. frames: numbers, counted from 0 and rising.
+        path: of the video, whose frames stay as they are stored: angles count from their horizontal. frames: numbers,
+            counted from 0 and rising.
 
     Raises:
         PolarguideError: OpenCV cannot read the video, or it ends before the last of them.
     """
+    require_file(path, expected="a video", remedy="Copy the file there.")
     video = cv2.VideoCapture(str(path))
+    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     try:
         place = -1
         for frame in frames:
