@@ -271,7 +271,7 @@ def test_masks_of_test_views_do_not_choose_points() -> None:
 
 
 def test_a_view_without_a_mask_is_named() -> None:
-    with pytest.raises(PolarguideError, match=r"none of view v1.*masks/v1\.png"):
+    with pytest.raises(PolarguideError, match=r"no mask for view v1.*masks/v1\.png"):
         mask_background(scene_of(view(mask=subject_mask()), view("v1")))
 
 

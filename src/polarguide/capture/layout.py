@@ -56,13 +56,13 @@ class Layout:
         return sorted(self.pictures.keys() | self.others.keys())
 
     def files(self, name: str) -> list[Path]:
-        """The pictures of a view that has all of them, in the order of its exposures."""
+        """Files of a view with all its pictures, in the order of its exposures."""
         if name in self.others:
             return [path for path, _ in self.others[name]]
         return [self.pictures[name][angle] for angle in ANGLES]
 
     def exposures(self, name: str) -> tuple[Exposure, ...]:
-        """What the pictures of a view are."""
+        """The exposures of a view's pictures."""
         return tuple(e for _, e in self.others[name]) if name in self.others else FOUR
 
 
@@ -109,7 +109,7 @@ def find_layout(root: Path) -> Layout:
 
 
 def refuse_scene(out: Path) -> None:
-    """Refuse to write into a scene, or into a folder that it is read from: what lies there means something.
+    """Refuse to write into a scene, or into a folder that it is read from.
 
     Raises:
         PolarguideError: there is one.

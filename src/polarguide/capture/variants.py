@@ -79,7 +79,7 @@ def mask_background(scene: Scene) -> Scene:
             raise PolarguideError(
                 scene.root / "masks",
                 expected="a mask of every view for --background masked",
-                found=f"none of view {view.name}",
+                found=f"no mask for view {view.name}",
                 remedy=f"Add masks/{view.name}.png, white where the subject is, or choose another background.",
             )
         views.append(view.masked())

@@ -112,10 +112,9 @@ class Exposures:
 def reconciled(points: Array, files: Array, unfiltered: NDArray[np.bool_]) -> Exposures:
     """Exposures from those of points and those of files.
 
-    Where both are known, the file's is corrected towards the points', as far as files usually err (``FILE_ERROR``) and
-    points agree with files in this capture; larger differences are laid to the points, whose errors have long tails. A
-    picture whose points contradict its file by far (``LARGEST_DOUBT``) is exposed as its points say. A filter takes the
-    same share of the light from all pictures behind it: the points say which.
+    Small differences correct the file's value, within its usual error (``FILE_ERROR``) and the agreement of points and
+    files in this capture. Large ones are taken as errors of the points, unless they exceed ``LARGEST_DOUBT``: then the
+    points count. A filter takes the same share of the light from all pictures behind it, which the points tell.
 
     Args:
         points, files: logarithms, [N]; NaN where one is not known.
@@ -345,7 +344,8 @@ def _warn(
     if contradicted:
         reporter.warn(
             f"{len(contradicted)} views are brighter or darker than the exposure in their files says "
-            f"({listed(contradicted)}); the points are believed. A filter that was taken off, or edited pictures?"
+            f"({listed(contradicted)}); the brightness of shared points is used instead. Was a filter taken off, "
+            "or a picture edited?"
         )
     if not np.isfinite(files).any():
         logs = np.array([picture.log for picture in pictures])

@@ -158,9 +158,9 @@ def reflect_native(
 
     Returns:
         ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features, texels and
-        levels, with ``detached`` the detached two, and with ``metal`` its share [K], not differentiable, what it
-        reflects [K, 3] and its degree of polarization over ``sin^2(zenith)`` [K, 3]; the same bits for any number of
-        threads.
+        levels. With ``detached`` also the two detached layers. With ``metal`` also the share of metal [K] (no gradient),
+        its reflected light [K, 3], and its degree of polarization over ``sin^2(zenith)`` [K, 3]. The bits are the same
+        for any number of threads.
 
     Raises:
         ValueError: if a shape is not as above.

@@ -306,7 +306,10 @@ def parse_scene(data: Any, where: str, *, folder: Path) -> SceneSpec:
         check_numbers(getattr(spec, key), where, key)
     if not sum(ring.get("share", 1.0) for ring in spec.camera.rings) > 0:
         raise PolarguideError(
-            f"{where} (camera.rings)", expected="a share of the views above 0", found="none", remedy=REMEDY
+            f"{where} (camera.rings)",
+            expected="a ring with a share of the views above 0",
+            found="none",
+            remedy=REMEDY,
         )
     return msgspec.structs.replace(spec, folder=folder)
 

@@ -74,7 +74,7 @@ def records(gaussians: Parameters, values: Mapping[str, Tensor]) -> NDArray[Any]
     """Quantize Gaussians; those too faint to be drawn at all are left out.
 
     Args:
-        gaussians: the Gaussians. values: of the shading model, [N, ...] by the names of ``SLOTS``.
+        gaussians: the Gaussians. values: the shading model's, [N, ...] by the names of ``SLOTS``.
 
     Returns:
         [K] records of whole texels, with named fields; in the order of a curve that fills space, so that neighbors
