@@ -158,7 +158,7 @@ def reflect_native(
 
     Returns:
         ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features, texels and
-        levels. With ``detached`` also the two detached layers. With ``metal`` also the share of metal [K] (no gradient),
+        levels. With ``detached`` also the two detached layers. With ``metal`` also its share [K] (no gradient),
         its reflected light [K, 3], and its degree of polarization over ``sin^2(zenith)`` [K, 3]. The bits are the same
         for any number of threads.
 
