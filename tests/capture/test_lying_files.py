@@ -136,7 +136,7 @@ def test_cameras_of_metashape(tmp_path: Path, text: str, found: str) -> None:
     path = tmp_path / "cameras.xml"
     path.write_bytes(text.encode("utf-16" if "UTF-16" in text else "utf-8"))
     with pytest.raises(PolarguideError, match=found):
-        read_pose_file(path, ["v0"], (32, 24))
+        read_pose_file(path, ["v0"], lambda _: ((32, 24),))
 
 
 def test_focal_lengths_of_nerfstudio_are_positive(tmp_path: Path) -> None:
@@ -144,7 +144,7 @@ def test_focal_lengths_of_nerfstudio_are_positive(tmp_path: Path) -> None:
     record = {"w": 32, "h": 24, "fl_x": 40.0, "fl_y": -40.0, "frames": [frame]}
     (tmp_path / "transforms.json").write_text(json.dumps(record))
     with pytest.raises(PolarguideError, match="a positive focal length fl_y"):
-        read_pose_file(tmp_path / "transforms.json", ["v0"], (32, 24))
+        read_pose_file(tmp_path / "transforms.json", ["v0"], lambda _: ((32, 24),))
 
 
 @pytest.mark.parametrize(

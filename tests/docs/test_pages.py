@@ -18,7 +18,7 @@ GENERATED = (DOCS / "generated", DOCS / "reference" / "api")
 PAGES = sorted(p for p in DOCS.rglob("*.md") if not any(made in p.parents for made in GENERATED))
 TEXTS = [*PAGES, *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"))]
 
-FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 # Folders of the repository whose files the pages name.
 NAMED_FILE = re.compile(r"\b(?:benchmarks|examples|native|src|tests)/[\w./-]+\.(?:py|json|cpp|h)\b")
 MODULE_FILE = re.compile(r"`([a-z_]+(?:/[a-z_]+)+\.py)`")

@@ -50,6 +50,7 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "exact_separation": (STOKES, NORMALS, RAYS),
     "filter_analyzer": (ANGLE[0, 0], RAYS),
     "fitted_stokes": (FOUR, CIRCLE),
+    "fitted_uncertainty": (GRAY, np.concatenate([FOUR[..., 0], FOUR[:2, ..., 0]]) * np.float32(1e-4)),
     "intensity": (GRAY, ANGLE),
     "intensity_noise": (FOUR[..., 0], 3),
     "lens_frame": (RAYS,),

@@ -128,7 +128,7 @@ SHOTS: dict[str, tuple[Callable[[Path], object], PrepareSettings, str]] = {
     "mixed depth": (
         lambda d: picture(d / "45" / "b.png", np.ones((48, 64, 3), np.uint8)), FILTER, "found 64x48 with 8 bits"
     ),
-    "flag of the other format": (lambda d: None, replace(FILTER, bits=12), "--bits: .*filter"),
+    "flag of the other format": (lambda d: None, replace(FILTER, demosaic="quarter"), "--demosaic: .*filter"),
 }  # fmt: skip
 
 

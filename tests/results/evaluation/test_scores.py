@@ -207,7 +207,7 @@ def test_errors_by_object_are_part_of_the_record(tmp_path, views):
     wrong = {"cup": {key: value for key, value in objects["cup"].items() if key != "stokes_error"}}
     path, materials = tmp_path / "metrics.json", {"metal": {**ERRORS, "psnr": "x"}}
     Fault(expected="the field stokes_error").raised_by(record.write_metrics, path, **given, objects=wrong)
-    Fault("psnr)", "a number or null", '"x"').raised_by(
+    Fault("psnr)", "a number or null", "text").raised_by(
         record.write_metrics, path, **given, materials=materials
     )
 
@@ -277,7 +277,7 @@ def test_shown_metrics_are_those_of_the_tables(views):
     ]
     shown = dict(lines)
     assert shown["PSNR"] == f"{means['psnr']:.3f} dB"
-    assert shown["normals within 11.25 deg"] == "0.250"
+    assert shown["normals within 11.25 deg"] == "25.000 %"
     assert (shown["Gaussians"], shown["training"]) == ("1,000", "n/a (the log is gone)")
     assert shown["LPIPS"] == (f"n/a ({means['lpips_reason']})" if means["lpips"] is None else shown["LPIPS"])
     assert shown["FLIP"] == f"{means['flip']:.3f}"
