@@ -31,8 +31,8 @@ Array = NDArray[np.float32]
 
 
 @dataclass(eq=False)
-class _Fit:
-    """What is fitted of some pixels.
+class PixelFit:
+    """The fit of some pixels.
 
     Attributes:
         stokes: [3, N] of the luminance. covariance: [6, N].
@@ -62,7 +62,7 @@ class SetModel:
         """Variances [K, N] of the samples of Stokes vectors [3, N]."""
         return np.asarray(self._floor + self._slope * np.maximum(self.rows @ stokes, 0), np.float32)
 
-    def fit(self, gray: Array, lost: NDArray[np.bool_]) -> _Fit:
+    def fit(self, gray: Array, lost: NDArray[np.bool_]) -> PixelFit:
         """Fit pixels [K, N]: least squares, then with the variances that these predict, then without outliers."""
         usable = (~lost & self._used[:, None]).astype(np.float32)
         determined = self._determined(usable)
@@ -70,11 +70,11 @@ class SetModel:
         stokes, _ = self._solve(usable, gray)
         weights = usable / self.variances(stokes)
         stokes, covariance = self._solve(weights, gray)
-        fit = _Fit(stokes, covariance, weights, determined)
+        fit = PixelFit(stokes, covariance, weights, determined)
         self._drop_outliers(gray, fit)
         return fit
 
-    def _drop_outliers(self, gray: Array, fit: _Fit) -> None:
+    def _drop_outliers(self, gray: Array, fit: PixelFit) -> None:
         """Leave out the sample that is off most, pixel by pixel, while one is off by more than noise is."""
         at = np.flatnonzero(fit.determined)
         while at.size:
@@ -218,7 +218,7 @@ class _Arrays:
         if count > 3:
             self.residual[part] = model.residual(gray, fit.stokes).reshape(size)
 
-    def _state(self, part: slice, fit: _Fit, size: tuple[int, int], snr: float) -> None:
+    def _state(self, part: slice, fit: PixelFit, size: tuple[int, int], snr: float) -> None:
         """DoLP, AoLP and their uncertainty, and which pixels say nothing."""
         stokes = torch.from_numpy(fit.stokes)
         spread = optics.fitted_uncertainty(stokes, torch.from_numpy(fit.covariance))
