@@ -210,3 +210,13 @@ def test_pictures_of_other_sizes_are_refused(tmp_path: Path) -> None:
         read_shot(tmp_path)
     assert error.value.where.endswith("ball_a70.png")
     assert "25x24" in error.value.found
+
+
+def test_a_picture_that_clips_everywhere_is_left_out(tmp_path: Path) -> None:
+    stokes = sphere()
+    pictures = photographed(stokes, SIX)
+    pictures[1] = np.iinfo(pictures.dtype).max
+    maps = read(tmp_path, pictures, SIX)
+    assert maps.left_out is not None
+    assert (maps.left_out >= 1).all()
+    assert np.abs(maps.dolp - np.hypot(stokes[1], stokes[2]) / stokes[0])[maps.usable].mean() < 0.02

@@ -251,11 +251,10 @@ def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> C
     if not off:
         return Check(key, title, "ok", said, figures=figures)
     verdict: Verdict = "wrong" if float(np.mean(lost)) > BLOWN else "warning"
-    clipped = sum(r.saturated > r.invalid for r in measurements if r.view in off) * 2 > len(off)
-    way = "expose shorter, keep lamps out of the picture" if clipped else "see what marks them invalid"
     return Check(
         key, title, verdict, f"{said} Over {SATURATED:.0%} are lost in {len(off)} views ({listed(list(off))}).",
-        f"These pixels carry no polarization and are excluded: {way}.", off, figures,
+        "These pixels carry no polarization and are excluded. Invalid ones may have clipped in the camera: expose "
+        "shorter, keep lamps out of the picture.", off, figures,
     )  # fmt: skip
 
 

@@ -27,12 +27,15 @@ from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.exposures import Angle, angle_text, turned
 from polarguide.capture.filter.camera_raw import is_camera_raw, stored_frame
 from polarguide.capture.filter.develop import (
+    CAMERA_RAW,
     Shift,
     align_shots,
     decide_transfer,
     estimate_shifts,
+    kind_of_file,
     linear_intensities,
     rounding_of_bytes,
+    transfer_of_kind,
 )
 from polarguide.capture.filter.exif import apply_orientation, orientation, orientation_calibration, read_taken
 from polarguide.capture.filter.shots import (
@@ -64,8 +67,6 @@ from polarguide.preparation.source import DevelopedView, Source, Stored
 _JUDGED_VIEWS = 8
 # Bytes for each pixel of a shot: as stored and stacked, linear, aligned or turned, written.
 _WORKED = 3 * (2 + 2 + 4 + 4 + 4)
-LOSSY = "JPEG or WebP"
-_RAW = "Transfer linear: camera raw, developed without tone curve, alike for all shots."
 
 
 class ShotsSource(Source):
@@ -203,8 +204,8 @@ class FilterSource(ShotsSource):
         gains, notes = asked.calibration.gains, []
         transfer: str = asked.transfer
         if transfer == "auto" and all(map(is_camera_raw, self.paths)):
-            transfer = "linear"
-            notes.append(_RAW)
+            transfer, note = transfer_of_kind(CAMERA_RAW, transfer)
+            notes.append(note)
         levels, counted = levels_of_shots(self._shots, self._white, self._settings)
         notes += counted
         if transfer == "auto":
@@ -416,19 +417,11 @@ class SinglesSource(ShotsSource):
         Raises:
             PolarguideError: they are of several kinds.
         """
-        asked = self._settings.transfer
         kinds: dict[str, Path] = {}
         for path in self._shots:
-            name = "camera raw" if is_camera_raw(path) else LOSSY if is_lossy(path) else "PNG, TIFF or BMP"
-            kinds.setdefault(name, path)
+            kinds.setdefault(kind_of_file(path), path)
         self._require_one(kinds, "kind of file", "Keep one kind: their brightness cannot be compared.")
-        (kind,) = kinds
-        if kind == "camera raw":
-            return "linear", _RAW
-        if asked != "auto":
-            return asked, f"Transfer {asked}, as given."
-        usual = "srgb" if kind == LOSSY else "linear"
-        return usual, f"Transfer {usual}, as {kind} files usually are (--transfer sets it)."
+        return transfer_of_kind(next(iter(kinds)), self._settings.transfer)
 
     def _summary(self) -> str:
         """How many photographs there are, and at which angles."""

@@ -50,6 +50,11 @@ def stated_exposures(
     return {view: [math.exp(value - mean) for value in of_view] for view, of_view in logs.items()}
 
 
+def corrected_note(stated: Sequence[float]) -> str:
+    """The exposures of a single shot that its files state, for the user."""
+    return f"The files state exposures that differ by a factor of {max(stated) / min(stated):.3g}; corrected."
+
+
 def exposure_notes(stated: Mapping[str, Sequence[float]], views: int) -> list[str]:
     """What the files state, for the user."""
     if not stated:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.filter.shots import read_stack
@@ -38,24 +37,10 @@ def levels_of_shots(
         values = read_stack([path], white).pictures
         container = 8 * values.dtype.itemsize
         counts += np.bincount(values.ravel(), minlength=len(counts))
-    return levels_of_counts(counts, container, settings.bits, settings.saturation)
-
-
-def levels_of_counts(
-    counts: NDArray[np.int64], container: int, bits: int | None, saturation: int | None
-) -> tuple[Levels | None, list[str]]:
-    """Levels of stored values by how often each occurs, from 0 on, and notes for the user.
-
-    Args:
-        counts: of the values. container: bits of a value in the files. bits, saturation: as given, or None.
-
-    Raises:
-        PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.
-    """
     occurring = np.flatnonzero(counts)
     levels = estimate_levels(
         int(occurring[-1]), int(np.bitwise_or.reduce(occurring)), container,
-        bits=bits, black=0.0, saturation=saturation, counts=counts,
+        bits=settings.bits, black=0.0, saturation=settings.saturation, counts=counts,
     )  # fmt: skip
     usual = levels.bits == container and levels.saturation == levels.white
-    return levels, [] if usual else level_notes(levels, counts, container, bits)
+    return levels, [] if usual else level_notes(levels, counts, container, settings.bits)

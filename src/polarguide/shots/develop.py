@@ -32,7 +32,6 @@ from polarguide.capture.sensor.pattern import (
     SENSOR_SIZE,
     SIDE,
     estimate_levels,
-    level_notes,
     tiled,
     unusable_samples,
 )
@@ -41,12 +40,18 @@ from polarguide.capture.view_reader import ViewData, read_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_file
 from polarguide.preparation.mosaic_source import MosaicFiles, block_intensities, sample_blocks
-from polarguide.preparation.shot_exposures import exposures_of_view, stated_exposures
-from polarguide.preparation.shot_levels import levels_of_shots
+from polarguide.preparation.shot_exposures import corrected_note, exposures_of_view, stated_exposures
 from polarguide.shots.exposures import ExposureSet
 from polarguide.shots.maps import Map, NoiseModel, estimated_noise, given_noise, interpolation_factors
 from polarguide.shots.options import ShotOptions
-from polarguide.shots.samples import SetSamples, read_set, samples_of_loaded, samples_of_view
+from polarguide.shots.samples import (
+    SetSamples,
+    levels_of_shot,
+    piled_up,
+    read_set,
+    samples_of_loaded,
+    samples_of_view,
+)
 from polarguide.shots.sets import known_places
 
 Mask = NDArray[np.bool_]
@@ -137,7 +142,6 @@ def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
     dark = files.dark(stored.shape)
     values = files.cut(stored)
     container = files.container(path, stored)
-    counts = np.bincount(stored.ravel(), minlength=FULL_16 + 1)
     levels = estimate_levels(
         int(stored.max()),
         int(np.bitwise_or.reduce(stored, None)),
@@ -145,11 +149,15 @@ def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
         bits=options.bits,
         black=options.black_level,
         saturation=options.saturation,
-        counts=counts,
     )
+    notes = []
+    if options.bits is None and container == 16:
+        notes.append(f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale.")
+    pile, piled = piled_up(np.bincount(stored.ravel(), minlength=FULL_16 + 1), container, options)
+    if pile is not None and pile < levels.saturation:
+        levels, notes = replace(levels, saturation=pile), [*notes, *piled]
     levels = replace(levels, gamma=options.gamma)
     files.require_kind(sample_blocks(values, SIDE), levels)
-    notes = level_notes(levels, counts, container, options.bits)
     side = 2 * pattern.period
     floor = None if dark is None else sample_blocks(dark, side)
     assert options.sensor is not None
@@ -265,8 +273,11 @@ def _gains(
 def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
     require_four_shots(shot.paths[0].parent, {shot.name: shot.files})
     paths = [shot.files[angle] for angle in ANGLES]
-    levels, notes = levels_of_shots(paths, (1.0, 1.0, 1.0), options.preparation())
-    shots = read_shots(shot.files, levels=levels)
+    shots = read_shots(shot.files)
+    counts = np.bincount(shots.pictures.ravel(), minlength=FULL_16 + 1)
+    levels, notes = levels_of_shot(counts, 8 * shots.pictures.dtype.itemsize, options)
+    if levels is not None:
+        shots = read_shots(shot.files, levels=levels)
     transfer: str = options.transfer
     if transfer == "auto":
         decision = decide_transfer([shots], lossy=is_lossy(shot.files[0]))
@@ -287,9 +298,7 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
     saturated = np.asarray(clipped.any(axis=0))
     stated = stated_exposures({shot.name: paths}).get(shot.name)
     exposed = np.asarray(stated or UNIT_GAINS)
-    if stated:
-        spread = max(stated) / min(stated)
-        notes.append(f"The files state exposures that differ by a factor of {spread:.3g}; corrected.")
+    notes += [corrected_note(stated)] if stated else []
     if options.gains == "auto" and options.calibration.gains is None:
         measured = exposures_of_view(paths, linear.mean(axis=3), ~(saturated | dark), exposed.tolist())
         exposed = np.asarray(measured.gains)

@@ -148,6 +148,8 @@ def _predicted(rows: Floats, gray: Floats, used: NDArray[np.bool_], k: int) -> _
     With m = (1, cos 2t, sin 2t) / 2 times the Stokes vector, the angle t has the least sum of (I - g m)^2. Moments of
     the Stokes vectors are taken without what noise adds to them, or unpolarized light would tell an angle.
     """
+    if not gray.shape[1]:  # some picture clips everywhere
+        return _Angle(None, math.inf, 1.0, 0.0)
     others = used.copy()
     others[k] = False
     inverse = np.linalg.pinv(rows[others])

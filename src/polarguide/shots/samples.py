@@ -14,17 +14,16 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import ANGLES, Calibration
 from polarguide.capture.exposures import Angle, Exposure, analyzers, nominal, turned
-from polarguide.capture.filter.camera_raw import is_camera_raw
-from polarguide.capture.filter.exif import apply_orientation, orientation_calibration, read_taken
+from polarguide.capture.filter.develop import kind_of_file, transfer_of_kind
+from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import Shots, read_stack
-from polarguide.capture.formats.pictures import is_lossy, linear_codes, may_use_fewer_bits, rescaled
+from polarguide.capture.formats.pictures import linear_codes, rescaled
 from polarguide.capture.memory import require_memory
-from polarguide.capture.sensor.pattern import FULL_16, Levels
+from polarguide.capture.sensor.pattern import FULL_16, Levels, clipping_bits, estimate_levels
 from polarguide.capture.view import FULL_CODE, View
 from polarguide.capture.view_reader import ViewData, require_alike
 from polarguide.core.errors import PolarguideError
-from polarguide.preparation.filter_source import LOSSY
-from polarguide.preparation.shot_levels import levels_of_counts
+from polarguide.preparation.shot_exposures import corrected_note, stated_exposures
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.sets import SetPicture, known_places
 from polarguide.shots.video import read_frames
@@ -34,8 +33,6 @@ Mask = NDArray[np.bool_]
 _COMPRESSED_FULL = 250
 _FITTED = 4 * (4 * 3 + 3 + 7)
 """Bytes for each pixel of what is fitted: intensities, Stokes vectors and maps."""
-_UNEQUAL = 1.03
-"""Ratio of exposures in the files from which on they count: shutters and apertures have nominal values."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +124,10 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
     assert values is not None
     assert lost is not None
     assert dark is not None
-    levels, said = _levels(pictures, values, options)
+    counts = sum(
+        (np.bincount(picture.ravel(), minlength=FULL_16 + 1) for picture in values), np.zeros(1, np.int64)
+    )
+    levels, said = levels_of_shot(counts, 8 * kind.itemsize, options)
     every = np.arange(np.iinfo(kind).max + 1, dtype=kind)
     if levels is not None:
         every, step = rescaled(every, levels.white), 1 / levels.white
@@ -153,20 +153,39 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
     )
 
 
-def _levels(
-    pictures: Sequence[SetPicture], values: NDArray[np.uint16], options: ShotOptions
+def levels_of_shot(
+    counts: NDArray[np.int64], container: int, options: ShotOptions
 ) -> tuple[Levels | None, list[str]]:
-    """Levels of the stored values where the files do not state them, as ``levels_of_shots`` has them, and notes."""
-    wide = any(
-        picture.frame is None and not is_camera_raw(picture.path) and may_use_fewer_bits(picture.path)
-        for picture in pictures
-    )
-    if not wide and options.bits is None and options.saturation is None:
+    """Full scale and saturation of the pictures of one shot, and notes; None where they are those of the files.
+
+    Full scale is never guessed from the values of one shot, or shots of a series would be on several scales.
+
+    Args:
+        counts: how often each stored value occurs, from 0 on. container: bits of a value in the files.
+
+    Raises:
+        PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.
+    """
+    pile, notes = piled_up(counts, container, options)
+    if pile is None and options.bits is None and options.saturation is None:
         return None, []
-    counts = sum(
-        (np.bincount(picture.ravel(), minlength=FULL_16 + 1) for picture in values), np.zeros(1, np.int64)
-    )
-    return levels_of_counts(counts, 16 if wide else 8, options.bits, options.saturation)
+    largest, bits = int(np.flatnonzero(counts)[-1]), options.bits or container
+    return estimate_levels(
+        largest, 1, container, bits=bits, black=0.0, saturation=options.saturation or pile
+    ), notes
+
+
+def piled_up(counts: NDArray[np.int64], container: int, options: ShotOptions) -> tuple[int | None, list[str]]:
+    """The value below full scale at which samples of 16-bit files clip, unless options state it; and a note of it."""
+    if container != 16 or options.bits is not None or options.saturation is not None:
+        return None, []
+    bits = clipping_bits(counts)
+    if bits in (None, 16):
+        return None, []
+    top, share = (1 << bits) - 1, float(counts[(1 << bits) - 1] / counts.sum())
+    return top, [
+        f"Values pile up at {top} ({share:.1%} of the samples): taken as saturated. --bits {bits} makes it full scale."
+    ]
 
 
 def require_no_order(calibration: Calibration, name: str) -> None:
@@ -226,9 +245,8 @@ def _transfer(pictures: Sequence[SetPicture], asked: str) -> tuple[str, str]:
     """
     kinds: dict[str, Path] = {}
     for picture in pictures:
-        raw = is_camera_raw(picture.path)
-        still = "camera raw" if raw else LOSSY if is_lossy(picture.path) else "PNG, TIFF or BMP"
-        kinds.setdefault("video" if picture.frame is not None else still, picture.path)
+        kind = "video" if picture.frame is not None else kind_of_file(picture.path)
+        kinds.setdefault(kind, picture.path)
     if len(kinds) > 1:
         raise PolarguideError(
             pictures[0].path.parent,
@@ -236,27 +254,17 @@ def _transfer(pictures: Sequence[SetPicture], asked: str) -> tuple[str, str]:
             found=" and ".join(f"{kind} ({path.name})" for kind, path in kinds.items()),
             remedy="Keep one kind: their brightness cannot be compared.",
         )
-    (kind,) = kinds
-    if kind == "camera raw":
-        return "linear", "Transfer linear: camera raw, developed without tone curve."
-    if asked != "auto":
-        return asked, f"Transfer {asked}, as given."
-    usual = "srgb" if kind in ("video", LOSSY) else "linear"
-    return usual, f"Transfer {usual}, as {kind} files usually are (--transfer sets it)."
+    return transfer_of_kind(next(iter(kinds)), asked)
 
 
 def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:
     """The gain of each picture: as the table states, else as the files state their exposure; and notes."""
     given = [picture.gain for picture in pictures]
-    light = [None if picture.frame is not None else read_taken(picture.path).light for picture in pictures]
-    known = [value for value in light if value is not None]
-    if any(gain is not None for gain in given) or len(known) < len(light):
-        return [1.0 if gain is None else gain for gain in given], []
-    usual = float(np.median(known))
-    if max(known) < _UNEQUAL * min(known):
-        return [1.0] * len(pictures), []
-    ratio = f"The files state exposures that differ by a factor of {max(known) / min(known):.3g}; corrected."
-    return [value / usual for value in known], [ratio]
+    if all(gain is None and picture.frame is None for gain, picture in zip(given, pictures, strict=True)):
+        stated = stated_exposures({"": [picture.path for picture in pictures]}).get("")
+        if stated is not None:
+            return stated, [corrected_note(stated)]
+    return [1.0 if gain is None else gain for gain in given], []
 
 
 def samples_of_view(data: ViewData, full: int | None, options: ShotOptions) -> SetSamples:

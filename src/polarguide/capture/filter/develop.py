@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -11,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture import checks
+from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.filter.shots import Shots
-from polarguide.capture.formats.pictures import linear_codes
+from polarguide.capture.formats.pictures import is_lossy, linear_codes
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.write import Rounding, rounding_of
 from polarguide.optics.color import srgb_decode_array
@@ -217,6 +219,25 @@ def rounding_of_bytes(transfer: str, smallest: float) -> Rounding:
     """
     shown = np.arange(256) / 255
     return rounding_of(FULL_CODE * smallest * (srgb_decode_array(shown) if transfer == "srgb" else shown))
+
+
+LOSSY, PLAIN, CAMERA_RAW = "JPEG or WebP", "PNG, TIFF or BMP", "camera raw"
+"""Kinds of picture files by their usual encoding."""
+
+
+def kind_of_file(path: Path) -> str:
+    """The kind of a photograph by its suffix."""
+    return CAMERA_RAW if is_camera_raw(path) else LOSSY if is_lossy(path) else PLAIN
+
+
+def transfer_of_kind(kind: str, asked: str) -> tuple[str, str]:
+    """How files of a kind are usually encoded, and why; ``asked``: as specified, or auto."""
+    if kind == CAMERA_RAW:
+        return "linear", "Transfer linear: camera raw, developed without tone curve, alike for all shots."
+    if asked != "auto":
+        return asked, f"Transfer {asked}, as given."
+    usual = "linear" if kind == PLAIN else "srgb"
+    return usual, f"Transfer {usual}, as {kind} files usually are (--transfer sets it)."
 
 
 def decide_transfer(shots: Sequence[Shots], *, lossy: bool) -> TransferDecision:

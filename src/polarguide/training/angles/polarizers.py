@@ -265,8 +265,10 @@ class Polarizers:
         Four pictures determine more than a Stokes vector: a single wrong angle breaks their pair sums, which
         ``prepare`` and ``inspect`` check. Only two exchanged pictures keep the sums, and each looks like the other.
         """
+        if not judgment.contradicts:
+            return False
         view = [other for other in judgments if other.view == judgment.view]
-        if not judgment.contradicts or len(view) < len(ANGLES) or any(not j.specified.known for j in view):
+        if len(view) < len(ANGLES) or any(not j.specified.known for j in view):
             return False
         return not any(
             other.contradicts and judgment.resembles(other) and other.resembles(judgment)
