@@ -28,7 +28,6 @@ from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
 from polarguide.capture.sensor.demosaic import demosaic
 from polarguide.capture.sensor.pattern import (
-    FULL_16,
     SENSOR_SIZE,
     SIDE,
     estimate_levels,
@@ -153,7 +152,7 @@ def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
     notes = []
     if options.bits is None and container == 16:
         notes.append(f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale.")
-    pile, piled = piled_up(np.bincount(stored.ravel(), minlength=FULL_16 + 1), container, options)
+    pile, piled = piled_up(stored, container, options)
     if pile is not None and pile < levels.saturation:
         levels, notes = replace(levels, saturation=pile), [*notes, *piled]
     levels = replace(levels, gamma=options.gamma)
@@ -274,8 +273,7 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
     require_four_shots(shot.paths[0].parent, {shot.name: shot.files})
     paths = [shot.files[angle] for angle in ANGLES]
     shots = read_shots(shot.files)
-    counts = np.bincount(shots.pictures.ravel(), minlength=FULL_16 + 1)
-    levels, notes = levels_of_shot(counts, 8 * shots.pictures.dtype.itemsize, options)
+    levels, notes = levels_of_shot(shots.pictures, 8 * shots.pictures.dtype.itemsize, options)
     if levels is not None:
         shots = read_shots(shot.files, levels=levels)
     transfer: str = options.transfer

@@ -124,18 +124,17 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
     assert values is not None
     assert lost is not None
     assert dark is not None
-    counts = sum(
-        (np.bincount(picture.ravel(), minlength=FULL_16 + 1) for picture in values), np.zeros(1, np.int64)
-    )
-    levels, said = levels_of_shot(counts, 8 * kind.itemsize, options)
+    levels, said = levels_of_shot(values, 8 * kind.itemsize, options)
     every = np.arange(np.iinfo(kind).max + 1, dtype=kind)
     if levels is not None:
         every, step = rescaled(every, levels.white), 1 / levels.white
     linear = linear_codes(every, transfer)
+    as_stored = levels is None and kind == np.uint16 and transfer == "linear"
     for picture, clipped in zip(values, lost, strict=True):  # one after the other, as memory is
         if levels is not None:
             clipped |= (picture >= levels.saturation).any(axis=2)
-        picture[...] = linear[picture]
+        if not as_stored:
+            picture[...] = linear[picture]
     gains, words = _gains(pictures)
     turn = orientation_calibration(code)
     return SetSamples(
@@ -154,37 +153,39 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
 
 
 def levels_of_shot(
-    counts: NDArray[np.int64], container: int, options: ShotOptions
+    values: NDArray[Any], container: int, options: ShotOptions
 ) -> tuple[Levels | None, list[str]]:
     """Full scale and saturation of the pictures of one shot, and notes; None where they are those of the files.
 
     Full scale is never guessed from the values of one shot, or shots of a series would be on several scales.
 
     Args:
-        counts: how often each stored value occurs, from 0 on. container: bits of a value in the files.
+        values: [K, ...] stored values. container: bits of a value in the files.
 
     Raises:
         PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.
     """
-    pile, notes = piled_up(counts, container, options)
+    pile, notes = piled_up(values, container, options)
     if pile is None and options.bits is None and options.saturation is None:
         return None, []
-    largest, bits = int(np.flatnonzero(counts)[-1]), options.bits or container
-    return estimate_levels(
-        largest, 1, container, bits=bits, black=0.0, saturation=options.saturation or pile
-    ), notes
+    bits, top = options.bits or container, options.saturation or pile
+    return estimate_levels(int(values.max()), 1, container, bits=bits, black=0.0, saturation=top), notes
 
 
-def piled_up(counts: NDArray[np.int64], container: int, options: ShotOptions) -> tuple[int | None, list[str]]:
+def piled_up(values: NDArray[Any], container: int, options: ShotOptions) -> tuple[int | None, list[str]]:
     """The value below full scale at which samples of 16-bit files clip, unless options state it; and a note of it."""
-    if container != 16 or options.bits is not None or options.saturation is not None:
+    top = int(values.max())
+    if container != 16 or top == FULL_16 or options.bits is not None or options.saturation is not None:
         return None, []
-    bits = clipping_bits(counts)
-    if bits in (None, 16):
+    bits = top.bit_length()
+    if top != (1 << bits) - 1:  # cheaper than to count values, and the rule of what follows
         return None, []
-    top, share = (1 << bits) - 1, float(counts[(1 << bits) - 1] / counts.sum())
+    counts = sum((np.bincount(part.ravel(), minlength=FULL_16 + 1) for part in values), np.zeros(1, np.int64))
+    if clipping_bits(counts) is None:
+        return None, []
     return top, [
-        f"Values pile up at {top} ({share:.1%} of the samples): taken as saturated. --bits {bits} makes it full scale."
+        f"Values pile up at {top} ({counts[top] / counts.sum():.1%} of the samples): taken as saturated. "
+        f"--bits {bits} makes it full scale."
     ]
 
 
