@@ -114,7 +114,7 @@ def test_a_picture_at_a_wrong_angle_is_named_and_left_out(tmp_path: Path, angles
     ("stokes", "change", "words"),
     [
         (plate(), lambda p: p, "contradicts the others"),
-        (sphere(), lambda p: (0.8 * p).astype(np.uint16), "-20% as bright"),
+        (sphere(), lambda p: (0.8 * p).astype(np.uint16), "20% darker than the others predict"),
         (sphere(), lambda p: np.roll(p, 25, axis=1), "contradicts|looks like"),
     ],
     ids=["an angle without a sign in the light", "exposure", "motion"],

@@ -138,7 +138,8 @@ def _reason(samples: SetSamples, k: int, found: _Angle) -> str:
         looks = f"{math.degrees(found.angle or 0.0) % 180:.0f} degrees"
         return f"{head} looks like {looks}: its angle is probably wrong. It is left out."
     if abs(found.gain - 1) > BRIGHTER:
-        return f"{head} is {found.gain - 1:+.0%} as bright as the others predict (exposure or light). It is left out."
+        way = "brighter" if found.gain > 1 else "darker"
+        return f"{head} is {abs(found.gain - 1):.0%} {way} than the others predict (exposure or light). It is left out."
     return f"{head} contradicts the others (motion, light or a wrong angle). It is left out."
 
 

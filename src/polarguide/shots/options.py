@@ -57,13 +57,14 @@ class ShotOptions:
         packing: Packing of .raw files (two different 12-bit packings exist; never guessed).
         width: Width of .raw files in pixels; others must have it, too.
         height: Height of .raw files in pixels.
-        bits: Bits of a value in 16-bit files; without it those at which values pile up, else 12 if none exceeds
-            4095, else 16.
+        bits: Bits of a value in 16-bit files; without it 16 for shots through a filter, for mosaics 12 if no value
+            exceeds 4095, else 16.
         offset_x: Column of the sensor at which the region of interest starts.
         offset_y: Row of the sensor at which it starts.
         black_level: Stored value without light.
         dark_frame: Picture with the lens covered, subtracted in place of the black level.
-        saturation: Stored value from which the sensor saturates; without it full scale.
+        saturation: Stored value from which the sensor saturates; without it that at which samples pile up, or full
+            scale.
         gamma: Gamma that the camera applied to mosaics: stored = light ^ gamma.
         flip: Which way the camera mirrored the mosaics (Reverse X, Reverse Y): undone before anything else.
         demosaic: full, half or quarter resolution of the sensor.
