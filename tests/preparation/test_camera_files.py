@@ -157,6 +157,24 @@ def test_wrong_packing_is_refused(tmp_path):
     assert "12p" in caught.value.remedy
 
 
+def test_four_pictures_side_by_side_are_no_mosaic(tmp_path):
+    """What viewers of polarization cameras show, of one view, behind 0 and 45, 90 and 135 degrees, with noise."""
+    rng = np.random.default_rng(4)
+    texture = 0.5 + 8 * (cv2.GaussianBlur(rng.random((192, 256)), (0, 0), 3) - 0.5)
+    light = four(192, 256) * np.clip(texture, 0.05, 1)
+    small = light[:, ::2, ::2]
+    for name, picture in (
+        ("quarters", np.block([[small[0], small[1]], [small[2], small[3]]])),
+        ("mosaic", mosaic(light)),
+    ):
+        noisy = rng.poisson(np.clip(picture, 0, 1) * 4095)
+        np.save(tmp_path / f"{name}.npy", np.minimum(noisy, 4095).astype(np.uint16))
+    assert read_mosaic(tmp_path / "mosaic.npy", RawFormat()).shape == (192, 256)
+    with pytest.raises(PolarguideError) as caught:
+        read_mosaic(tmp_path / "quarters.npy", RawFormat())
+    assert "four times" in caught.value.found
+
+
 def test_hot_pixels_are_found_and_noise_is_not():
     rng = np.random.default_rng(2)
     hot = rng.random((96, 128)) < 0.003

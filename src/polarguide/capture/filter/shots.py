@@ -31,8 +31,8 @@ _SUFFIX = re.compile(
     r"(?P<view>.+?)[-_ .]+(?:i|pol|angle)?[-_ ]?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE
 )
 _BARE = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE)
-# Compression smears the edge of clipped areas over a few values.
-_LOSSY_FULL = 250
+# Compression smears the edge of clipped areas over a few values of 8 bits.
+_LOSSY_FULL = 250 / 255
 # Bytes that a pixel of four shots takes at least: as decoded, and stacked.
 _READ = 4 * 3 * (2 + 2)
 
@@ -217,7 +217,8 @@ def read_stack(
                 remedy="Keep the camera still between the shots of a view, or export them all alike.",
             )
     stack = np.stack(pictures)
-    full = _LOSSY_FULL if is_lossy(paths[0]) else int(np.iinfo(stack.dtype).max)
+    full = int(np.iinfo(stack.dtype).max)
+    full = round(_LOSSY_FULL * full) if is_lossy(paths[0]) else full
     if levels is not None:
         full = min(full, levels.saturation)
     # By the largest of the three colors, written out: NumPy reduces a last axis of three slowly.

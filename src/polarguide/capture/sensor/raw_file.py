@@ -89,7 +89,8 @@ def read_mosaic(path: Path, raw: RawFormat, *, least: int = 1) -> NDArray[Any]:
         [H, W] uint8 or uint16, the values as stored.
 
     Raises:
-        PolarguideError: the file cannot be read, is damaged, has color channels or another size, or is too small.
+        PolarguideError: the file cannot be read, is damaged, has color channels or another size, is too small, or holds
+            four pictures.
     """
     packed = path.suffix.lower() == ".raw"
     values = _read_packed(path, read_file(path), raw) if packed else _read_plain(path, raw)
@@ -100,6 +101,7 @@ def read_mosaic(path: Path, raw: RawFormat, *, least: int = 1) -> NDArray[Any]:
             found=f"{values.shape[1]}x{values.shape[0]}",
             remedy="Give the whole picture of the sensor.",
         )
+    _require_one_picture(path, values)
     return values
 
 
@@ -148,6 +150,51 @@ def _read_packed(path: Path, data: bytes, raw: RawFormat) -> NDArray[Any]:
     values = unpack(data, raw.width, raw.height, raw.packing)
     _require_alike_neighbors(path, data, values, raw.packing)
     return values
+
+
+_CELLS = 4
+"""Pixels along a block whose mean is free of analyzers and colors on every sensor."""
+_LEAST_BLOCKS, _MOST_BLOCKS = 8, 128
+"""Along a quarter: with fewer, chance correlates them; more need not be compared."""
+_TILED = 0.4
+"""Correlation of the detail in every quarter with that in the first: over 0.55 of one view, 0.2 at most of others."""
+
+
+def is_tiled(values: NDArray[Any]) -> bool:
+    """Whether a picture holds the same view four times, in two rows of two, as cameras show the four angles apart.
+
+    The detail (means of blocks less those of the blocks around) of each quarter is compared with that of the first.
+    """
+    down, across = (min(side // 2 // _CELLS, _MOST_BLOCKS) for side in values.shape)
+    if min(down, across) < _LEAST_BLOCKS:
+        return False
+    half = [side // 2 for side in values.shape]
+    detail = []
+    for row, column in ((0, 0), (0, half[1]), (half[0], 0), (half[0], half[1])):
+        part = values[row : row + down * _CELLS, column : column + across * _CELLS]
+        means = part.reshape(down, _CELLS, across, _CELLS).mean(axis=(1, 3))
+        around = sum(np.roll(means, (y, x), (0, 1)) for y in (-1, 0, 1) for x in (-1, 0, 1))
+        # Logarithms of ratios: a quarter that is brighter everywhere has the same detail.
+        fine = np.log((means + 1) / (around / 9 + 1))[1:-1, 1:-1].ravel()
+        detail.append(fine - fine.mean())
+    first, *others = (fine / max(float(np.linalg.norm(fine)), 1e-12) for fine in detail)
+    return min(float(first @ other) for other in others) > _TILED
+
+
+def _require_one_picture(path: Path, values: NDArray[Any]) -> None:
+    """Refuse four pictures side by side in place of a mosaic: nothing later would tell.
+
+    Raises:
+        PolarguideError: the file holds them.
+    """
+    if is_tiled(values):
+        raise PolarguideError(
+            path,
+            expected="a raw mosaic, in which the four angles take turns from pixel to pixel",
+            found="the same view four times, side by side",
+            remedy="Save what the sensor delivers (a pixel format such as Mono12 or BayerRG12), not one that shows the "
+            "four angles apart; or cut the file into four shots, NAME_0, NAME_45, NAME_90 and NAME_135.",
+        )
 
 
 _APART = 4
