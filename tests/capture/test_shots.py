@@ -23,8 +23,8 @@ from polarguide.capture.calibration import Calibration
 from polarguide.capture.exposures import Angle, angle_labels, turned
 from polarguide.capture.filter.camera_raw import read_camera_raw
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration, read_taken, taken
+from polarguide.capture.filter.names import split_name
 from polarguide.capture.filter.ring_scale import BAND, place, ring_scale
-from polarguide.capture.filter.shots import split_name
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.polarizer import malus
 from polarguide.preparation.prepare import prepare_scene

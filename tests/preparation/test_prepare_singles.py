@@ -283,6 +283,31 @@ def test_developed_first_and_posed_later(tmp_path: Path) -> None:
     assert np.abs(gain_errors(capture, scene)).max() < 0.05
 
 
+@pytest.mark.parametrize(
+    ("names", "angles"),
+    [
+        ("cup_{}.png", range(10, 180, 30)),
+        ("{}.png", range(0, 180, 20)),
+        ("{}/cup.png", range(10, 180, 30)),
+        ("cup_{}.png", range(0, 360, 40)),
+        ("cup_a{}.png", (0, 60, 120, 180, 240)),
+    ],
+)
+def test_sweeps_are_named_as_for_priors(tmp_path: Path, names: str, angles: range | tuple[int, ...]) -> None:
+    """Plain numbers that go evenly around, and pictures half a turn apart."""
+    light, source = smooth_light(), tmp_path / "cup"
+    for angle, values in zip(angles, behind(light, angles), strict=True):
+        write_picture(source / names.format(angle), values)
+    prepare_scene(source, tmp_path / "out", PLAIN)
+    rows = table(tmp_path / "out")
+    assert sorted(float(row["angle"]) for row in rows) == sorted(a % 180 for a in angles)
+    assert {row["view"] for row in rows} == {"cup"}
+    assert summary(tmp_path / "out")["format"] == "singles"
+    for row in rows:
+        expected = malus(light, np.radians(float(row["angle"])))
+        assert np.abs(read_one(tmp_path / "out" / "polar" / row["file"]) - expected).max() < 2e-3
+
+
 def test_four_shots_of_a_tripod_stay_what_they_were(tmp_path: Path) -> None:
     write_shots(tmp_path / "in", "v", behind(smooth_light()))
     prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
@@ -314,7 +339,7 @@ TABLES = {
     "too many cells": ("file,angle\na.png,0,1\nb.png,0\n", "line 2.: expected 2 cells, found 3"),
     "empty": ("", "found an empty file"),
     "no text": (b"\xff\xfe\x00", "expected CSV text in UTF-8"),
-    "twice one angle": ("file,angle,view\na.png,0,v\nb.png,180,v\n", "one photograph of v at 180 degrees"),
+    "twice one angle": ("file,angle,view\na.png,0,v\nb.png,0,v\n", "one photograph of v at 0 degrees"),
     "twice no filter": (
         "file,angle,view\na.png,none,v\nb.png,none,v\n",
         "one photograph of v without a filter",
