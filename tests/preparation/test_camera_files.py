@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from camera_files import pack
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
@@ -12,7 +13,7 @@ from polarguide.capture.formats.pictures import decode_picture
 from polarguide.capture.pair_sums import measured_gains, pair_moments
 from polarguide.capture.sensor.defects import defects
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
-from polarguide.capture.sensor.raw_file import RawFormat, read_mosaic
+from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
 from polarguide.core.errors import PolarguideError
 from polarguide.preparation.mosaic_source import MosaicFiles
 from polarguide.preparation.settings import PrepareSettings
@@ -144,17 +145,18 @@ def test_mirrored_mosaics_are_turned_back(tmp_path, flip):
     assert (files.read(tmp_path / "v.npy") == values).all()
 
 
-def test_wrong_packing_is_refused(tmp_path):
-    values = np.rint(mosaic(four()) * 4095).astype(np.uint16).reshape(-1, 2)
-    packed = np.stack(
-        [values[:, 0] & 255, values[:, 0] >> 8 | (values[:, 1] & 15) << 4, values[:, 1] >> 4], 1
-    )
+@pytest.mark.parametrize(
+    ("stored", "asked"),
+    [("12p", "12packed"), ("12packed", "12p"), ("12mipi", "12packed"), ("10mipi", "10p"), ("16be", "16")],
+)
+def test_wrong_packing_is_refused(tmp_path, stored, asked):
+    values = np.rint(mosaic(four()) * ((1 << PACKINGS[stored][2]) - 1)).astype(np.uint16)
     path = tmp_path / "v.raw"
-    path.write_bytes(packed.astype(np.uint8).tobytes())
-    assert (read_mosaic(path, RawFormat(128, 96, "12p")).reshape(-1, 2) == values).all()
+    path.write_bytes(pack(values, stored))
+    assert (read_mosaic(path, RawFormat(128, 96, stored)) == values).all()
     with pytest.raises(PolarguideError) as caught:
-        read_mosaic(path, RawFormat(128, 96, "12packed"))
-    assert "12p" in caught.value.remedy
+        read_mosaic(path, RawFormat(128, 96, asked))
+    assert caught.value.remedy.rstrip(".").endswith(f"--packing {stored}")
 
 
 def test_four_pictures_side_by_side_are_no_mosaic(tmp_path):
