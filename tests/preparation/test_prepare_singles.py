@@ -291,6 +291,9 @@ def test_developed_first_and_posed_later(tmp_path: Path) -> None:
         ("{}/cup.png", range(10, 180, 30)),
         ("cup_{}.png", range(0, 360, 40)),
         ("cup_a{}.png", (0, 60, 120, 180, 240)),
+        ("cup_{}.png", (0, 45, 90, -45)),
+        ("{}/cup.png", (0, 45, 90, -45)),
+        ("{}.png", range(-80, 100, 20)),
     ],
 )
 def test_sweeps_are_named_as_for_priors(tmp_path: Path, names: str, angles: range | tuple[int, ...]) -> None:

@@ -17,10 +17,12 @@ NAMING = (
 )
 _WORDS = "unknown|none"
 _NUMBER = r"(?P<mark>angle|pol|a|i)?[-_ ]?(?P<angle>\d{1,3}(?:\.\d+)?)(?P<unit>deg)?"
-_SINGLE = re.compile(rf"(?P<view>.+?)[-_ .]+(?:{_NUMBER}|(?P<word>{_WORDS}))", re.IGNORECASE)
+# A minus right before a number is its sign if another sign separates it from the view: cup_-45, but not cup-45.
+_APART = r"(?:[-_ .]*[_ .](?P<minus>-)(?=\d)|[-_ .]+)"
+_SINGLE = re.compile(rf"(?P<view>.+?){_APART}(?:{_NUMBER}|(?P<word>{_WORDS}))", re.IGNORECASE)
 # Degrees between the marks of a filter's ring: other numbers need a letter, as they may count pictures.
 _MARKS = 15
-_NUMBERED = re.compile(r"(?:(?P<view>.+?)[-_ .]+)?(?P<number>\d{1,3}(?:\.\d+)?)")
+_NUMBERED = re.compile(rf"(?:(?P<view>.+?){_APART}|(?P<alone>-))?(?P<number>\d{{1,3}}(?:\.\d+)?)")
 _SMALLEST_STEP = 2.0
 """Degrees: numbers that rise by one may count pictures."""
 _ALIKE = 1e-6
@@ -47,7 +49,8 @@ def angles_of_names(names: Sequence[str], *, folders: bool = False) -> list[tupl
     for place, name in enumerate(names):
         match = _NUMBERED.fullmatch(name)
         if match is not None:
-            numbered.setdefault(match["view"] or "", []).append((place, float(match["number"])))
+            sign = -1 if match["minus"] or match["alone"] else 1
+            numbered.setdefault(match["view"] or "", []).append((place, sign * float(match["number"])))
     for view, places in numbered.items():
         if covers_turn([number for _, number in places]):
             for place, number in places:
@@ -87,6 +90,6 @@ def _angle_of(match: re.Match[str]) -> Angle | None:
     """The angle that a name states; None for numbers that may count pictures."""
     if match["word"]:
         return parse_angle(match["word"])
-    number = float(match["angle"])
+    number = -float(match["angle"]) if match["minus"] else float(match["angle"])
     certain = match["mark"] or match["unit"] or (number % _MARKS == 0 and number < 180)
-    return number if certain and number <= 360 else None
+    return number if certain and abs(number) <= 360 else None

@@ -29,9 +29,10 @@ SHOT_SUFFIXES = (*SUFFIXES, *CAMERA_RAW)
 Candidates = dict[str, dict[int, list[Path]]]
 """View -> angle -> the files that may be its shot: one, unless names are ambiguous."""
 _SUFFIX = re.compile(
-    r"(?P<view>.+?)[-_ .]+(?:i|pol|angle)?[-_ ]?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE
+    r"(?P<view>.+?)[-_ .]+(?:i|pol|angle)?[-_ ]?(?<![_ .]-)(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?",
+    re.IGNORECASE,
 )
-_BARE = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE)
+_BARE = re.compile(r"(?:(?:i|pol|angle)[-_ ]?|[_ ])?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE)
 # Compression smears the edge of clipped areas over a few values of 8 bits.
 _LOSSY_FULL = 250 / 255
 # Bytes that a pixel of four shots takes at least: as decoded, and stacked.
