@@ -1,5 +1,8 @@
 """What cameras write beside the usual: exposures that differ, bits, mirrored mosaics, defects, and kinds of files."""
 
+import io
+import struct
+
 import cv2
 import numpy as np
 import pytest
@@ -8,7 +11,8 @@ from camera_files import pack
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from polarguide.capture.filter.develop import align_shots, estimate_shifts
+from polarguide.capture.filter.develop import align_shots, estimate_shifts, require_known_encoding
+from polarguide.capture.formats.icc import stated_exponent
 from polarguide.capture.formats.pictures import decode_picture
 from polarguide.capture.pair_sums import measured_gains, pair_moments
 from polarguide.capture.sensor.defects import defects
@@ -205,3 +209,53 @@ def test_a_turned_camera_is_turned_back():
     moved, bad = align_shots(stack, np.zeros(stack.shape[:3], bool), motions)
     off = np.abs(moved[..., 0] - light)[:, ~bad.any(axis=0)]
     assert np.median(off) < 0.3 * np.median(np.abs(shots - light))
+
+
+def profile(kind, *numbers):
+    """An ICC profile with one curve: curveType of one exponent or of none, or parametricCurveType."""
+    curve = kind + bytes(4)
+    if kind == b"curv":
+        curve += struct.pack(">I", len(numbers)) + b"".join(
+            struct.pack(">H", round(n * 256)) for n in numbers
+        )
+    else:
+        form = {1: 0, 3: 1, 4: 2, 5: 3, 7: 4}[len(numbers)]
+        curve += struct.pack(">Hxx", form) + b"".join(struct.pack(">i", round(n * 65536)) for n in numbers)
+    return bytes(128) + struct.pack(">I4sII", 1, b"rTRC", 144, len(curve)) + curve
+
+
+SRGB = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg", ".webp"])
+@pytest.mark.parametrize(
+    ("curve", "exponent"),
+    [
+        (profile(b"curv", 1.8), 1.8),
+        (profile(b"curv"), 1.0),
+        (profile(b"para", 2.2), 2.2),
+        (profile(b"para", *SRGB), 2.224),
+        (profile(b"para", *SRGB, 0.0, 0.0), 2.224),
+        (None, None),
+    ],
+)
+def test_profiles_state_how_a_picture_is_encoded(tmp_path, suffix, curve, exponent):
+    path = tmp_path / f"v{suffix}"
+    Image.new("RGB", (16, 16), (90, 120, 60)).save(path, **({} if curve is None else {"icc_profile": curve}))
+    found = stated_exponent(path.read_bytes())
+    assert found == (None if exponent is None else pytest.approx(exponent, abs=0.01))
+    if exponent != 1.8:
+        return require_known_encoding(path)
+    with pytest.raises(PolarguideError) as caught:
+        require_known_encoding(path)
+    assert "1.80" in caught.value.found
+
+
+def test_damaged_profiles_state_nothing():
+    whole = profile(b"para", *SRGB)
+    image = io.BytesIO()
+    Image.new("RGB", (16, 16)).save(image, "JPEG", icc_profile=whole)
+    data, at = image.getvalue(), image.getvalue().index(whole)
+    for place in range(at + 128, at + len(whole)):
+        found = stated_exponent(data[:place] + b"\xff" + data[place + 1 :])
+        assert found is None or found > 0

@@ -384,7 +384,7 @@ def refused(root: Path, settings: PrepareSettings, message: str) -> None:
         (("img_001.jpg", "img_002.jpg"), {}, "--angles unknown, or angles.csv"),
         (("img_001.jpg", "img_002.jpg"), {}, "prepare .*in --out in-scene --angles none"),
         (("a_a30.jpg", "a-30.png"), {}, "one photograph of a at 30 degrees"),
-        (("a_a30.jpg", "b_a30.png"), {}, r"one kind of file.*JPEG or WebP \(.*\) and PNG, TIFF or BMP"),
+        (("a_a30.jpg", "b_a30.png"), {}, r"one kind of file.*JPEG, WebP or HEIC \(.*\) and PNG, TIFF or BMP"),
         (("IMG_1.jpg", "IMG_1.png"), {"angles": "unknown"}, "one file called IMG_1"),
         (("IMG_1.jpg", "IMG_2.jpg"), {"angles": "0,60,120"}, "a multiple of 3 photographs.*found 2"),
         (("IMG_1.jpg", "IMG_2.jpg"), {"angles": "0,left"}, "--angles: expected unknown, none"),

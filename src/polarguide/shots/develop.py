@@ -18,6 +18,7 @@ from polarguide.capture.filter.develop import (
     decide_transfer,
     estimate_shifts,
     linear_intensities,
+    require_known_encoding,
 )
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import read_shots, require_four_shots
@@ -284,6 +285,7 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
         shots = read_shots(shot.files, levels=levels)
     transfer: str = options.transfer
     if transfer == "auto":
+        require_known_encoding(paths[0])
         decision = decide_transfer([shots], lossy=is_lossy(shot.files[0]))
         transfer = decision.transfer
         notes.append(f"Transfer {decision.reason}.")
