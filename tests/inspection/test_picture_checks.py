@@ -62,7 +62,8 @@ def test_a_fault_is_flagged_by_its_check(tmp_path, change, expected) -> None:
 
 
 @pytest.mark.parametrize(
-    ("gamma", "verdict"), [(0.95, "ok"), (0.9, "warning"), (0.8, "wrong"), (1.05, "ok"), (1.12, "warning")]
+    ("gamma", "verdict"),
+    [(0.95, "ok"), (0.9, "warning"), (0.8, "warning"), (0.7, "wrong"), (1.05, "ok"), (1.12, "warning")],
 )
 def test_the_curvature_tells_the_gamma(tmp_path, gamma: float, verdict: str) -> None:
     check = checked(write_scene(tmp_path / "s", lambda v: v**gamma))["encoding"]

@@ -11,7 +11,13 @@ from camera_files import pack
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from polarguide.capture.filter.develop import align_shots, estimate_shifts, require_known_encoding
+from polarguide.capture.filter.develop import (
+    align_shots,
+    decide_transfer,
+    estimate_shifts,
+    require_known_encoding,
+)
+from polarguide.capture.filter.shots import Shots
 from polarguide.capture.formats.icc import stated_exponent
 from polarguide.capture.formats.pictures import decode_picture
 from polarguide.capture.pair_sums import measured_gains, pair_moments
@@ -19,6 +25,7 @@ from polarguide.capture.sensor.defects import defects
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
 from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
 from polarguide.core.errors import PolarguideError
+from polarguide.optics.color import srgb_encode_array as srgb_encode
 from polarguide.preparation.mosaic_source import MosaicFiles
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.shot_exposures import exposures_of_view, stated_exposures
@@ -259,3 +266,19 @@ def test_damaged_profiles_state_nothing():
     for place in range(at + 128, at + len(whole)):
         found = stated_exponent(data[:place] + b"\xff" + data[place + 1 :])
         assert found is None or found > 0
+
+
+@pytest.mark.parametrize(
+    ("encode", "transfer", "doubtful"),
+    [
+        (lambda light: light, "linear", False),
+        (srgb_encode, "srgb", False),
+        (lambda light: srgb_encode(light) ** 1.6, "srgb", True),
+        (lambda light: light ** (1 / 1.5), "srgb", True),
+    ],
+)
+def test_a_tone_curve_that_is_neither_is_doubted(encode, transfer, doubtful):
+    codes = np.rint(np.clip(encode(four()), 0, 1) * 65535).astype(np.uint16)
+    pictures, none = np.repeat(codes[..., None], 3, axis=3), np.zeros(codes.shape, bool)
+    found = decide_transfer([Shots(pictures, 1, none, none[0])], lossy=True)
+    assert (found.transfer, bool(found.doubt)) == (transfer, doubtful)

@@ -216,6 +216,8 @@ class FilterSource(ShotsSource):
             decision = decide_transfer(judged, lossy=is_lossy(self.paths[0]))
             transfer = decision.transfer
             notes.append(f"Transfer {decision.reason}.")
+            if decision.doubt:
+                warnings.warn(decision.doubt, PolarguideWarning, stacklevel=2)
         stated = stated_exposures(self._of_view, advance) if asked.gains == "auto" else {}
         notes += exposure_notes(stated, len(self.views))
         # One scale for all shots, with room for the largest gain that is corrected.

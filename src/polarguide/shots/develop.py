@@ -288,7 +288,7 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
         require_known_encoding(paths[0])
         decision = decide_transfer([shots], lossy=is_lossy(shot.files[0]))
         transfer = decision.transfer
-        notes.append(f"Transfer {decision.reason}.")
+        notes += [f"Transfer {decision.reason}.", *filter(None, [decision.doubt])]
     linear = linear_intensities(shots.pictures, transfer)
     lsb = 1 / float(np.iinfo(shots.pictures.dtype).max if levels is None else levels.white)
     clipped, dark = shots.clipped, shots.dark

@@ -202,10 +202,11 @@ def _turn(reference: NDArray[np.float32], other: NDArray[np.float32], shift: Shi
 
 @dataclass(frozen=True)
 class TransferDecision:
-    """The chosen transfer function, and the reason."""
+    """The chosen transfer function, the reason, and what to warn of: "" or a sentence."""
 
     transfer: str
     reason: str
+    doubt: str = ""
 
 
 def linear_intensities(pictures: NDArray[Any], transfer: str) -> NDArray[np.float32]:
@@ -271,17 +272,35 @@ def decide_transfer(shots: Sequence[Shots], *, lossy: bool) -> TransferDecision:
         shots: some views, aligned well enough (as from a tripod).
         lossy: whether the files are JPEG, WebP or HEIC, for the default where the curvature does not decide.
     """
-    measures = [
-        checks.measure(linear_codes(view.pictures, "linear"), ~(view.clipped.any(axis=0) | view.dark))
-        for view in shots
-    ]
-    slope = checks.curvature(measures)
+    slope = _slope(shots, "linear")
     found = checks.encoding(slope)
     said = "too few pixels are polarized to tell"
     if slope is not None:
         said = f"the curvature of the response is {slope:+.2f}; linear files have 0, sRGB about -0.6"
     if found is not None:
-        return TransferDecision(found, f"{found}: {said}")
+        return TransferDecision(found, f"{found}: {said}", _doubt(shots, found))
     fallback = "srgb" if lossy else "linear"
     kind = "JPEG, WebP and HEIC files" if lossy else "PNG, TIFF and BMP files"
-    return TransferDecision(fallback, f"{fallback}, as {kind} usually are: {said} (--transfer sets it)")
+    reason = f"{fallback}, as {kind} usually are: {said} (--transfer sets it)"
+    return TransferDecision(fallback, reason, _doubt(shots, fallback))
+
+
+def _slope(shots: Sequence[Shots], transfer: str) -> float | None:
+    """The curvature of the response that a transfer leaves, over all views."""
+    return checks.curvature(
+        [
+            checks.measure(linear_codes(view.pictures, transfer), ~(view.clipped.any(axis=0) | view.dark))
+            for view in shots
+        ]
+    )
+
+
+def _doubt(shots: Sequence[Shots], transfer: str) -> str:
+    """What to say where the chosen transfer leaves the response bent, as a camera's own tone curve does."""
+    left = _slope(shots, transfer)
+    if left is None or checks.ENCODED[0] <= left <= checks.DECODED[0]:
+        return ""
+    return (
+        f"Read as {transfer}, the response still has a curvature of {left:+.2f} (0 if it is linear): the files have "
+        "another tone curve, and DoLP is wrong. Export 16-bit TIFF without a tone curve, or take camera raw."
+    )
