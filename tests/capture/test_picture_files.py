@@ -401,7 +401,9 @@ def test_heic_that_is_not_read_is_named(tmp_path: Path, monkeypatch: pytest.Monk
         with pytest.raises(PolarguideError) as error:
             decode_picture(tmp_path / "a.heic", data)
         assert part in error.value.found
-    monkeypatch.undo()
+
+
+def test_heic_of_high_dynamic_range_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PolarguideError) as error:
         decode_picture(tmp_path / "a.heic", heic(np.full((48, 64, 3), 0.5), 10, 1, profile=18))
     assert "HLG" in error.value.found
