@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import struct
+import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -17,9 +19,9 @@ from PIL import Image
 from tiny_capture import TinyCapture, encode_srgb, fails, ideal_intensities, write_picture
 
 from polarguide.capture import load_scene
-from polarguide.capture.filter.exif import orientation
+from polarguide.capture.filter.exif import orientation, taken
 from polarguide.capture.formats import pictures
-from polarguide.capture.formats.integrity import find_damage
+from polarguide.capture.formats.integrity import declared_size, find_damage
 from polarguide.capture.formats.pictures import decode_picture, linear_codes
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.write import intensity_codes, rounding_of, write_png
@@ -335,3 +337,73 @@ def test_pixels_are_as_stored_whatever_the_orientation_and_never_from_pillow(
     np.testing.assert_array_equal(decode_picture(path, path.read_bytes()), COLORS)
     assert orientation(path.read_bytes()) == (1 if big else code)
     np.testing.assert_array_equal(decode_picture(path, PNG), COLORS[..., ::-1])
+
+
+def heic(light: np.ndarray, bits: int, turn: int, profile: int = 13) -> bytes:
+    """A HEIC file of light in [0, 1], without loss of color resolution, turned for display as a telephone does."""
+    pillow_heif = pytest.importorskip("pillow_heif", reason="the extra heic")
+    kind, mode = (np.uint8, "RGB") if bits == 8 else (np.uint16, "RGB;16")
+    values = np.rint(light * np.iinfo(kind).max).astype(kind)
+    tags = Image.Exif()
+    tags[274], tags.get_ifd(34665)[33434] = turn, 0.02
+    file = pillow_heif.from_bytes(mode, values.shape[1::-1], values.tobytes())
+    out = io.BytesIO()
+    file.save(
+        out,
+        quality=-1,
+        chroma=444,
+        exif=tags.tobytes(),
+        matrix_coefficients=0,
+        transfer_characteristics=profile,
+    )
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("bits", [8, 10])
+@pytest.mark.parametrize("turn", [1, 3, 6, 8])
+def test_heic_is_read_as_stored_with_its_turn_and_its_exposure(tmp_path: Path, bits: int, turn: int) -> None:
+    down, across = np.mgrid[:48, :64]
+    light = np.stack([across / 63, down / 47, np.full(down.shape, 0.9)], -1)
+    light[:4, :4] = 1.0
+    data = heic(light, bits, turn)
+    found = decode_picture(tmp_path / "a.heic", data)
+    assert found.dtype == (np.uint8 if bits == 8 else np.uint16)
+    full = np.iinfo(found.dtype).max
+    assert found.max() == full  # of 10 bits, too
+    np.testing.assert_allclose(found / full, light, atol=1.01 / ((1 << bits) - 1))
+    assert (orientation(data), declared_size(data), taken(data).light) == (turn, (64, 48), pytest.approx(2.0))
+
+
+def test_heic_that_is_not_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A header alone, so that this needs no package: one picture of 64x48 that is turned, and an empty codec.
+    def box(kind: bytes, *parts: bytes) -> bytes:
+        body = b"".join(parts)
+        return struct.pack(">I", 8 + len(body)) + kind + body
+
+    whole, size = b"\0" * 4, struct.pack(">4xII", 64, 48)
+
+    def file(*properties: bytes, brand: bytes = b"heic") -> bytes:
+        numbers = bytes(range(1, len(properties) + 1))
+        own = whole + struct.pack(">IHB", 1, 1, len(numbers)) + numbers
+        iprp = box(b"iprp", box(b"ipco", *properties), box(b"ipma", own))
+        return box(b"ftyp", brand, whole) + box(b"meta", whole, box(b"pitm", whole, b"\0\1"), iprp)
+
+    ispe, turned = box(b"ispe", size), box(b"irot", b"\3")
+    assert (declared_size(file(ispe, turned)), orientation(file(ispe, turned))) == ((64, 48), 6)
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    for data, part in (
+        (file(ispe, turned), "not installed"),
+        (file(ispe, box(b"imir", b"\0")), "mirrored for display"),
+        (file(turned), "without a size"),
+        (file(ispe)[:-1], "cut short"),
+        (file(ispe, brand=b"avif"), "AVIF"),
+    ):
+        with pytest.raises(PolarguideError) as error:
+            decode_picture(tmp_path / "a.heic", data)
+        assert part in error.value.found
+
+
+def test_heic_of_high_dynamic_range_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(PolarguideError) as error:
+        decode_picture(tmp_path / "a.heic", heic(np.full((48, 64, 3), 0.5), 10, 1, profile=18))
+    assert "HLG" in error.value.found

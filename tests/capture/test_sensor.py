@@ -33,11 +33,14 @@ def test_packings_round_trip(packing: str, width: int, height: int) -> None:
     np.testing.assert_array_equal(unpack(data, width, height, packing), values)
 
 
-def test_the_two_12_bit_packings_differ_in_their_bytes() -> None:
+def test_packings_of_equal_size_differ_in_their_bytes() -> None:
     # 0xABC and 0x123, by the words of the two standards.
     np.testing.assert_array_equal(unpack(b"\xbc\x3a\x12", 2, 1, "12p"), [[0xABC, 0x123]])
     np.testing.assert_array_equal(unpack(b"\xab\x3c\x12", 2, 1, "12packed"), [[0xABC, 0x123]])
+    np.testing.assert_array_equal(unpack(b"\xab\x12\x3c", 2, 1, "12mipi"), [[0xABC, 0x123]])
     np.testing.assert_array_equal(unpack(b"\xff\x03\x00\x00\xc0", 4, 1, "10p"), [[1023, 0, 0, 768]])
+    np.testing.assert_array_equal(unpack(b"\xff\x00\x00\xc0\x43", 4, 1, "10mipi"), [[1023, 0, 0, 769]])
+    np.testing.assert_array_equal(unpack(b"\xff\x23\xc0", 2, 1, "10packed"), [[1023, 770]])
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,8 @@ from polarguide.capture.calibration import Calibration
 from polarguide.capture.exposures import Angle, angle_labels, turned
 from polarguide.capture.filter.camera_raw import read_camera_raw
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration, read_taken, taken
+from polarguide.capture.filter.names import split_name
 from polarguide.capture.filter.ring_scale import BAND, place, ring_scale
-from polarguide.capture.filter.shots import split_name
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.polarizer import malus
 from polarguide.preparation.prepare import prepare_scene
@@ -80,6 +80,28 @@ def test_white_balance_and_saturation(tmp_path: Path) -> None:
     np.testing.assert_allclose(polar[:, inside], expected[:, inside], atol=4e-3)
 
 
+def test_a_sensor_that_clips_is_at_full_scale(tmp_path: Path) -> None:
+    """LibRaw's own rounding would leave the white level of 12 bits without black at 65534."""
+    pytest.importorskip("rawpy")
+    from raw_photographs import write_dng
+
+    write_dng(tmp_path / "a.dng", np.full((32, 48, 3), 1.5), black=0)
+    assert (read_camera_raw(tmp_path / "a.dng", UNIT)[0] == 65535).all()
+
+
+@pytest.mark.parametrize("black", [0, 528])
+def test_linear_dng_clips_at_full_scale(tmp_path: Path, black: int) -> None:
+    """Three colors at every pixel, as telephones write them, with a black level."""
+    pytest.importorskip("rawpy")
+    from raw_photographs import write_linear_dng
+
+    light = np.linspace(0, 1.2, 48 * 64 * 3).reshape(48, 64, 3)
+    write_linear_dng(tmp_path / "a.dng", light, black=black)
+    pixels, _ = read_camera_raw(tmp_path / "a.dng", UNIT)
+    np.testing.assert_allclose(pixels / 65535, np.minimum(light, 1), atol=2e-4)
+    assert (pixels[light > 1.001] == 65535).all()
+
+
 def test_orientation_turns_pixels_and_angles(tmp_path: Path) -> None:
     stored = smooth_light(64, 96)
     write_shots(tmp_path / "in", stored, orientation=6)
@@ -130,6 +152,7 @@ class Recorder:
 
     def __init__(self, flip: int) -> None:
         self.sizes = SimpleNamespace(raw_width=6, raw_height=4, flip=flip)
+        self.raw_type = SimpleNamespace(name="Flat")
         self.asked: dict = {}
 
     def __enter__(self) -> Recorder:
@@ -182,6 +205,10 @@ def test_white_balance_is_for_camera_raw(tmp_path: Path) -> None:
         ("v3_Angle-20", ("v3", 20.0)),
         ("v3_22deg", ("v3", 22.0)),
         ("v3_i135", ("v3", 135.0)),
+        ("cup_-45", ("cup", -45.0)),
+        ("cup -30deg", ("cup", -30.0)),
+        ("cup - 45", ("cup", 45.0)),
+        ("cup-45", ("cup", 45.0)),
         ("v3.unknown", ("v3", "unknown")),
         ("v3_NONE", ("v3", "none")),
         ("IMG_0012", None),

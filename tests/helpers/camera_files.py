@@ -67,13 +67,21 @@ def mosaic(intensities: np.ndarray, pattern: tuple[str, ...], offset: tuple[int,
 def pack(values: np.ndarray, packing: str) -> bytes:
     """Pack by way of single bits, as the standards put it in words."""
     flat = [int(value) for value in values.ravel()]
-    if packing == "12packed":
-        flat += [0] * (len(flat) % 2)
-        return b"".join(
-            bytes([a >> 4, (a & 15) | (b & 15) << 4, b >> 4])
-            for a, b in zip(flat[::2], flat[1::2], strict=True)
-        )
+    if packing == "16be":
+        return b"".join(value.to_bytes(2, "big") for value in flat)
     bits = int(packing[:2])
+    if packing.endswith(("packed", "mipi")):
+        count, low = (4 if packing == "10mipi" else 2), bits - 8
+        flat += [0] * (-len(flat) % count)
+        out = b""
+        for at in range(0, len(flat), count):
+            group = flat[at : at + count]
+            high = [value >> low for value in group]
+            apart = 4 if packing.endswith("packed") else low
+            rest = sum(value % (1 << low) << apart * place for place, value in enumerate(group))
+            high.insert(1 if packing.endswith("packed") else count, rest)
+            out += bytes(high)
+        return out
     flat += [0] * (-len(flat) % {10: 4, 12: 2}.get(bits, 1))
     stream = [value >> bit & 1 for value in flat for bit in range(bits)]
     return bytes(sum(stream[i + bit] << bit for bit in range(8)) for i in range(0, len(stream), 8))

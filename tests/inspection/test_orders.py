@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,18 @@ import torch
 
 from polarguide import optics
 from polarguide.capture.calibration import Calibration, oriented
-from polarguide.inspection.angles import IDENTITY, ORDERS, PAIRINGS, swaps
+from polarguide.capture.sensor.pattern import sensor_pattern
+from polarguide.geometry.polarizer import ANGLES
+from polarguide.inspection.angles import (
+    IDENTITY,
+    MOSAICS,
+    ORDERS,
+    PAIRINGS,
+    AngleFindings,
+    Order,
+    OrderPosterior,
+    swaps,
+)
 
 
 def test_three_pairings_of_eight_orders_are_all_permutations() -> None:
@@ -37,6 +49,27 @@ def test_an_order_turns_the_aolp_as_its_sense_and_zero_say(order) -> None:
     expected = order.sense * before + math.radians(order.zero)
     torch.testing.assert_close(torch.cos(2 * after), torch.cos(2 * expected), atol=1e-5, rtol=0)
     torch.testing.assert_close(torch.sin(2 * after), torch.sin(2 * expected), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("key", MOSAICS)
+def test_mirrored_and_shifted_mosaics_are_named_by_the_options_that_read_them(key) -> None:
+    """By the angles of a sensor whose mosaic is mirrored or begins elsewhere, in the frame of that picture."""
+    pattern = sensor_pattern("IMX250MZR").angles
+    stored = np.tile(pattern, (2, 2))
+    option, value = MOSAICS[key].split(",")[0].split()[:2]
+    if option == "--flip":
+        stored = stored[:, ::-1] if "x" in value else stored
+        stored = stored[::-1] if "y" in value else stored
+        stored = -stored % 180 if len(value) == 1 else stored  # a mirror turns angles round
+    else:
+        stored = np.roll(stored, -int(value), axis=1 if option == "--offset-x" else 0)
+    true = {int(pattern[place]): int(stored[place]) for place in np.ndindex(2, 2)}
+    order = Order(*key)
+    assert order.files() == tuple(true[angle] for angle in ANGLES)
+    sure = OrderPosterior((0.0,) * 8, tuple(float(other == order) for other in ORDERS), 0.0, 1.0)
+    found = AngleFindings(0, (), sure, Calibration(), mosaic=True)
+    assert f"{option} {value}" in found.correction(0.0)
+    assert option not in replace(found, mosaic=False).correction(0.0)
 
 
 def test_swaps_in_words() -> None:

@@ -61,6 +61,27 @@ def test_a_fault_is_flagged_by_its_check(tmp_path, change, expected) -> None:
         assert not others
 
 
+@pytest.mark.parametrize(
+    ("gamma", "verdict"),
+    [(0.95, "ok"), (0.9, "warning"), (0.8, "warning"), (0.7, "wrong"), (1.05, "ok"), (1.12, "warning")],
+)
+def test_the_curvature_tells_the_gamma(tmp_path, gamma: float, verdict: str) -> None:
+    check = checked(write_scene(tmp_path / "s", lambda v: v**gamma))["encoding"]
+    assert check.verdict == verdict, check.finding
+    assert check.figures["curvature"] == pytest.approx((1 - 1 / gamma) / 2, rel=0.15, abs=2e-3)
+
+
+@pytest.mark.parametrize(("stops", "verdict"), [(0.05, "ok"), (0.2, "warning"), (1 / 3, "wrong")])
+def test_exposures_that_leave_the_pair_sums_alike_are_measured(tmp_path, stops: float, verdict: str) -> None:
+    """0 degrees by half of it longer, 90 degrees by half of it shorter: the ratio of the pair sums stays 1."""
+    longer = 2 ** (stops / 2)
+    check = checked(write_scene(tmp_path / "s", gained(longer, 1, 1 / longer, 1)))["exposure"]
+    assert abs(check.figures["pair_ratio"] - 1) < 0.02  # a warning at most
+    assert check.verdict == verdict, check.finding
+    if verdict != "ok":
+        assert check.figures["exposures"] == pytest.approx([longer, 1, 1 / longer, 1], rel=0.02)
+
+
 def test_dark_and_unscaled_files_are_flagged(tmp_path) -> None:
     found = checked(write_scene(tmp_path / "s", lambda v: v * 0.004))
     assert found["noise"].verdict == "wrong"

@@ -1,19 +1,31 @@
 """What cameras write beside the usual: exposures that differ, bits, mirrored mosaics, defects, and kinds of files."""
 
+import io
+import struct
+
 import cv2
 import numpy as np
 import pytest
 import tifffile
+from camera_files import pack
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from polarguide.capture.filter.develop import align_shots, estimate_shifts
+from polarguide.capture.filter.develop import (
+    align_shots,
+    decide_transfer,
+    estimate_shifts,
+    require_known_encoding,
+)
+from polarguide.capture.filter.shots import Shots
+from polarguide.capture.formats.icc import stated_exponent
 from polarguide.capture.formats.pictures import decode_picture
 from polarguide.capture.pair_sums import measured_gains, pair_moments
 from polarguide.capture.sensor.defects import defects
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
-from polarguide.capture.sensor.raw_file import RawFormat, read_mosaic
+from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
 from polarguide.core.errors import PolarguideError
+from polarguide.optics.color import srgb_encode_array as srgb_encode
 from polarguide.preparation.mosaic_source import MosaicFiles
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.shot_exposures import exposures_of_view, stated_exposures
@@ -144,17 +156,36 @@ def test_mirrored_mosaics_are_turned_back(tmp_path, flip):
     assert (files.read(tmp_path / "v.npy") == values).all()
 
 
-def test_wrong_packing_is_refused(tmp_path):
-    values = np.rint(mosaic(four()) * 4095).astype(np.uint16).reshape(-1, 2)
-    packed = np.stack(
-        [values[:, 0] & 255, values[:, 0] >> 8 | (values[:, 1] & 15) << 4, values[:, 1] >> 4], 1
-    )
+@pytest.mark.parametrize(
+    ("stored", "asked"),
+    [("12p", "12packed"), ("12packed", "12p"), ("12mipi", "12packed"), ("10mipi", "10p"), ("16be", "16")],
+)
+def test_wrong_packing_is_refused(tmp_path, stored, asked):
+    values = np.rint(mosaic(four()) * ((1 << PACKINGS[stored][2]) - 1)).astype(np.uint16)
     path = tmp_path / "v.raw"
-    path.write_bytes(packed.astype(np.uint8).tobytes())
-    assert (read_mosaic(path, RawFormat(128, 96, "12p")).reshape(-1, 2) == values).all()
+    path.write_bytes(pack(values, stored))
+    assert (read_mosaic(path, RawFormat(128, 96, stored)) == values).all()
     with pytest.raises(PolarguideError) as caught:
-        read_mosaic(path, RawFormat(128, 96, "12packed"))
-    assert "12p" in caught.value.remedy
+        read_mosaic(path, RawFormat(128, 96, asked))
+    assert caught.value.remedy.rstrip(".").endswith(f"--packing {stored}")
+
+
+def test_four_pictures_side_by_side_are_no_mosaic(tmp_path):
+    """What viewers of polarization cameras show, of one view, behind 0 and 45, 90 and 135 degrees, with noise."""
+    rng = np.random.default_rng(4)
+    texture = 0.5 + 8 * (cv2.GaussianBlur(rng.random((192, 256)), (0, 0), 3) - 0.5)
+    light = four(192, 256) * np.clip(texture, 0.05, 1)
+    small = light[:, ::2, ::2]
+    for name, picture in (
+        ("quarters", np.block([[small[0], small[1]], [small[2], small[3]]])),
+        ("mosaic", mosaic(light)),
+    ):
+        noisy = rng.poisson(np.clip(picture, 0, 1) * 4095)
+        np.save(tmp_path / f"{name}.npy", np.minimum(noisy, 4095).astype(np.uint16))
+    assert read_mosaic(tmp_path / "mosaic.npy", RawFormat()).shape == (192, 256)
+    with pytest.raises(PolarguideError) as caught:
+        read_mosaic(tmp_path / "quarters.npy", RawFormat())
+    assert "four times" in caught.value.found
 
 
 def test_hot_pixels_are_found_and_noise_is_not():
@@ -185,3 +216,69 @@ def test_a_turned_camera_is_turned_back():
     moved, bad = align_shots(stack, np.zeros(stack.shape[:3], bool), motions)
     off = np.abs(moved[..., 0] - light)[:, ~bad.any(axis=0)]
     assert np.median(off) < 0.3 * np.median(np.abs(shots - light))
+
+
+def profile(kind, *numbers):
+    """An ICC profile with one curve: curveType of one exponent or of none, or parametricCurveType."""
+    curve = kind + bytes(4)
+    if kind == b"curv":
+        curve += struct.pack(">I", len(numbers)) + b"".join(
+            struct.pack(">H", round(n * 256)) for n in numbers
+        )
+    else:
+        form = {1: 0, 3: 1, 4: 2, 5: 3, 7: 4}[len(numbers)]
+        curve += struct.pack(">Hxx", form) + b"".join(struct.pack(">i", round(n * 65536)) for n in numbers)
+    return bytes(128) + struct.pack(">I4sII", 1, b"rTRC", 144, len(curve)) + curve
+
+
+SRGB = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg", ".webp"])
+@pytest.mark.parametrize(
+    ("curve", "exponent"),
+    [
+        (profile(b"curv", 1.8), 1.8),
+        (profile(b"curv"), 1.0),
+        (profile(b"para", 2.2), 2.2),
+        (profile(b"para", *SRGB), 2.224),
+        (profile(b"para", *SRGB, 0.0, 0.0), 2.224),
+        (None, None),
+    ],
+)
+def test_profiles_state_how_a_picture_is_encoded(tmp_path, suffix, curve, exponent):
+    path = tmp_path / f"v{suffix}"
+    Image.new("RGB", (16, 16), (90, 120, 60)).save(path, **({} if curve is None else {"icc_profile": curve}))
+    found = stated_exponent(path.read_bytes())
+    assert found == (None if exponent is None else pytest.approx(exponent, abs=0.01))
+    if exponent != 1.8:
+        return require_known_encoding(path)
+    with pytest.raises(PolarguideError) as caught:
+        require_known_encoding(path)
+    assert "1.80" in caught.value.found
+
+
+def test_damaged_profiles_state_nothing():
+    whole = profile(b"para", *SRGB)
+    image = io.BytesIO()
+    Image.new("RGB", (16, 16)).save(image, "JPEG", icc_profile=whole)
+    data, at = image.getvalue(), image.getvalue().index(whole)
+    for place in range(at + 128, at + len(whole)):
+        found = stated_exponent(data[:place] + b"\xff" + data[place + 1 :])
+        assert found is None or found > 0
+
+
+@pytest.mark.parametrize(
+    ("encode", "transfer", "doubtful"),
+    [
+        (lambda light: light, "linear", False),
+        (srgb_encode, "srgb", False),
+        (lambda light: srgb_encode(light) ** 1.6, "srgb", True),
+        (lambda light: light ** (1 / 1.5), "srgb", True),
+    ],
+)
+def test_a_tone_curve_that_is_neither_is_doubted(encode, transfer, doubtful):
+    codes = np.rint(np.clip(encode(four()), 0, 1) * 65535).astype(np.uint16)
+    pictures, none = np.repeat(codes[..., None], 3, axis=3), np.zeros(codes.shape, bool)
+    found = decide_transfer([Shots(pictures, 1, none, none[0])], lossy=True)
+    assert (found.transfer, bool(found.doubt)) == (transfer, doubtful)

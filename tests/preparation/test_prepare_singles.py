@@ -283,6 +283,34 @@ def test_developed_first_and_posed_later(tmp_path: Path) -> None:
     assert np.abs(gain_errors(capture, scene)).max() < 0.05
 
 
+@pytest.mark.parametrize(
+    ("names", "angles"),
+    [
+        ("cup_{}.png", range(10, 180, 30)),
+        ("{}.png", range(0, 180, 20)),
+        ("{}/cup.png", range(10, 180, 30)),
+        ("cup_{}.png", range(0, 360, 40)),
+        ("cup_a{}.png", (0, 60, 120, 180, 240)),
+        ("cup_{}.png", (0, 45, 90, -45)),
+        ("{}/cup.png", (0, 45, 90, -45)),
+        ("{}.png", range(-80, 100, 20)),
+    ],
+)
+def test_sweeps_are_named_as_for_priors(tmp_path: Path, names: str, angles: range | tuple[int, ...]) -> None:
+    """Plain numbers that go evenly around, and pictures half a turn apart."""
+    light, source = smooth_light(), tmp_path / "cup"
+    for angle, values in zip(angles, behind(light, angles), strict=True):
+        write_picture(source / names.format(angle), values)
+    prepare_scene(source, tmp_path / "out", PLAIN)
+    rows = table(tmp_path / "out")
+    assert sorted(float(row["angle"]) for row in rows) == sorted(a % 180 for a in angles)
+    assert {row["view"] for row in rows} == {"cup"}
+    assert summary(tmp_path / "out")["format"] == "singles"
+    for row in rows:
+        expected = malus(light, np.radians(float(row["angle"])))
+        assert np.abs(read_one(tmp_path / "out" / "polar" / row["file"]) - expected).max() < 2e-3
+
+
 def test_four_shots_of_a_tripod_stay_what_they_were(tmp_path: Path) -> None:
     write_shots(tmp_path / "in", "v", behind(smooth_light()))
     prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
@@ -314,7 +342,7 @@ TABLES = {
     "too many cells": ("file,angle\na.png,0,1\nb.png,0\n", "line 2.: expected 2 cells, found 3"),
     "empty": ("", "found an empty file"),
     "no text": (b"\xff\xfe\x00", "expected CSV text in UTF-8"),
-    "twice one angle": ("file,angle,view\na.png,0,v\nb.png,180,v\n", "one photograph of v at 180 degrees"),
+    "twice one angle": ("file,angle,view\na.png,0,v\nb.png,0,v\n", "one photograph of v at 0 degrees"),
     "twice no filter": (
         "file,angle,view\na.png,none,v\nb.png,none,v\n",
         "one photograph of v without a filter",
@@ -356,7 +384,7 @@ def refused(root: Path, settings: PrepareSettings, message: str) -> None:
         (("img_001.jpg", "img_002.jpg"), {}, "--angles unknown, or angles.csv"),
         (("img_001.jpg", "img_002.jpg"), {}, "prepare .*in --out in-scene --angles none"),
         (("a_a30.jpg", "a-30.png"), {}, "one photograph of a at 30 degrees"),
-        (("a_a30.jpg", "b_a30.png"), {}, r"one kind of file.*JPEG or WebP \(.*\) and PNG, TIFF or BMP"),
+        (("a_a30.jpg", "b_a30.png"), {}, r"one kind of file.*JPEG, WebP or HEIC \(.*\) and PNG, TIFF or BMP"),
         (("IMG_1.jpg", "IMG_1.png"), {"angles": "unknown"}, "one file called IMG_1"),
         (("IMG_1.jpg", "IMG_2.jpg"), {"angles": "0,60,120"}, "a multiple of 3 photographs.*found 2"),
         (("IMG_1.jpg", "IMG_2.jpg"), {"angles": "0,left"}, "--angles: expected unknown, none"),

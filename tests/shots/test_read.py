@@ -85,6 +85,25 @@ def test_a_mosaic(tmp_path: Path, sensor: str, mode: str) -> None:
     assert maps.usable.mean() > 0.99
 
 
+@pytest.mark.parametrize("mode", ["full", "half"])
+def test_hot_pixels_of_a_mosaic_are_masked(tmp_path: Path, mode: str) -> None:
+    path = tmp_path / "part.png"
+    write_mosaic(path)
+    values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert read_shot(path, MONO).notes == ()
+    values[[20, 31, 40], [30, 51, 70]] = 4000
+    assert cv2.imwrite(str(path), values)
+    maps = read_shot(path, replace(MONO, demosaic=mode))
+    step = SHAPE[0] // maps.size[1]
+    masked = maps.reason == Reason.MASKED
+    assert masked[[20 // step, 31 // step, 40 // step], [30 // step, 51 // step, 70 // step]].all()
+    assert masked.sum() <= 3 * 25
+    s0, s1, s2 = (part[::step, ::step] for part in light())
+    wrong = np.abs(maps.dolp - np.hypot(s1, s2) / s0) > 0.05
+    assert not wrong[~masked].any()
+    assert any("3 samples" in note for note in maps.notes)
+
+
 @pytest.mark.parametrize(
     "names",
     [CUP, ("I0.png", "I45.png", "I90.png", "I135.png"), ("0/cup.png", "45/cup.png", "90/cup.png", "135/cup.png")],

@@ -16,7 +16,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_folder
 
 _PICTURE_STEM = re.compile(r"(?P<view>.+)_(?P<angle>000|045|090|135)")
-_ANGLE_FOLDER = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>\d{1,3})(?:deg)?", re.IGNORECASE)
+_ANGLE_FOLDER = re.compile(r"(?:(?:i|pol|angle)[-_ ]?|[_ ])?(?P<angle>\d{1,3})(?:deg)?", re.IGNORECASE)
 _READ_FOLDERS = ("polar", "masks", "materials", "invalid", "gt", "sparse")
 _NUMBER = re.compile(r"(?<!\d)\d{1,3}(?!\d)")
 _HINT = (

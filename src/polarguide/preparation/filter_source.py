@@ -34,6 +34,7 @@ from polarguide.capture.filter.develop import (
     estimate_shifts,
     kind_of_file,
     linear_intensities,
+    require_known_encoding,
     rounding_of_bytes,
     transfer_of_kind,
 )
@@ -209,11 +210,14 @@ class FilterSource(ShotsSource):
         levels, counted = levels_of_shots(self._shots, self._white, self._settings)
         notes += counted
         if transfer == "auto":
+            require_known_encoding(self._shots[0])
             step = max(1, math.ceil(len(self.views) / _JUDGED_VIEWS))
             judged = [read_stack(self._of_view[view], self._white, levels) for view in self.views[::step]]
             decision = decide_transfer(judged, lossy=is_lossy(self.paths[0]))
             transfer = decision.transfer
             notes.append(f"Transfer {decision.reason}.")
+            if decision.doubt:
+                warnings.warn(decision.doubt, PolarguideWarning, stacklevel=2)
         stated = stated_exposures(self._of_view, advance) if asked.gains == "auto" else {}
         notes += exposure_notes(stated, len(self.views))
         # One scale for all shots, with room for the largest gain that is corrected.
@@ -421,6 +425,8 @@ class SinglesSource(ShotsSource):
         for path in self._shots:
             kinds.setdefault(kind_of_file(path), path)
         self._require_one(kinds, "kind of file", "Keep one kind: their brightness cannot be compared.")
+        if self._settings.transfer == "auto":
+            require_known_encoding(self._shots[0])
         return transfer_of_kind(next(iter(kinds)), self._settings.transfer)
 
     def _summary(self) -> str:

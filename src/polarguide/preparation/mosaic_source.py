@@ -20,7 +20,7 @@ from polarguide.capture.layout import index_files
 from polarguide.capture.memory import require_memory, require_memory_of_each
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import spread_to_cells
-from polarguide.capture.sensor.defects import defects
+from polarguide.capture.sensor.defects import defects, defects_note
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
 from polarguide.capture.sensor.pattern import (
     FULL_16,
@@ -296,11 +296,7 @@ class MosaicSource(Source):
         notes += level_notes(levels, counts, container, asked.bits)
         standing_out = int(self._defects(levels).sum())
         if standing_out:
-            share = standing_out / (shape[0][0] * shape[0][1])
-            notes.append(
-                f"{standing_out} samples ({share:.3%}) stand out from all alike beside them (hot or dead pixels): "
-                "invalid."
-            )
+            notes.append(defects_note(standing_out, shape[0][0] * shape[0][1]))
         white = self._white or gray_world(colors[:, usable])
         peak = max(white) / min(gains) * asked.calibration.peak * brighter
         return {

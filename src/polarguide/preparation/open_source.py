@@ -10,7 +10,8 @@ from pathlib import Path
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
 from polarguide.capture.exposures import TABLE
-from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots, folders_of_angles, split_name
+from polarguide.capture.filter.names import angles_of_names, folders_of_angles
+from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
 from polarguide.capture.layout import angle_folders, describe_contents, index_files, list_files
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import read_pose_file
@@ -68,7 +69,7 @@ def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
     files = list_files(root, SHOT_SUFFIXES)
     if not files:
         return any(angle not in ANGLES for angle in folders_of_angles(root).values())
-    named = [split_name(path.stem) for path in files]
+    named = angles_of_names([path.stem for path in files])
     found = [name for name in named if name is not None]
     if any(angle not in ANGLES for _, angle in found):
         return True

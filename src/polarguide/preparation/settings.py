@@ -15,6 +15,7 @@ from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, Sense, checked, read_calibration
 from polarguide.capture.sensor.analyzer_file import is_analyzer_file
+from polarguide.capture.sensor.raw_file import Packing
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options, option_name
 from polarguide.core.text import decimal
@@ -48,7 +49,7 @@ class PrepareSettings:
         format: What the source is; auto looks for datasets, the four shots of a filter, and singles (photographs
             through a filter at any angles, each with a pose of its own), else takes mosaics.
         sensor: Sensor of raw mosaics: MYR are color, MZR is monochrome.
-        packing: Packing of .raw files (two different 12-bit packings exist; never guessed).
+        packing: Packing of .raw files (there are several of 10 and of 12 bits; never guessed).
         width: Width of .raw files in pixels.
         height: Height of .raw files in pixels.
         bits: Bits of a sensor value in 16-bit files; without it those of the value at which samples pile up, else 12 if
@@ -88,7 +89,7 @@ class PrepareSettings:
 
     format: Literal["auto", "mosaic", "filter", "singles"] | Dataset = "auto"
     sensor: Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"] | None = None
-    packing: Literal["8", "16", "10p", "12p", "12packed"] | None = None
+    packing: Packing | None = None
     width: _Positive | None = None
     height: _Positive | None = None
     bits: Annotated[int, Meta(ge=8, le=16)] | None = None

@@ -18,6 +18,7 @@ from polarguide.capture.filter.develop import (
     decide_transfer,
     estimate_shifts,
     linear_intensities,
+    require_known_encoding,
 )
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import read_shots, require_four_shots
@@ -26,6 +27,7 @@ from polarguide.capture.layout import find_layout, select_views
 from polarguide.capture.memory import KEPT, READ, require_memory_of_each
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
+from polarguide.capture.sensor.defects import defects, defects_note
 from polarguide.capture.sensor.demosaic import demosaic
 from polarguide.capture.sensor.pattern import (
     SENSOR_SIZE,
@@ -169,10 +171,12 @@ def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
     ratio = pair_ratio(angles, usable)
     gains, said = _gains(ratio, options)
     saturated, black = unusable_samples(values, levels, dark)
+    defective = defects([np.minimum(values, levels.white)], pattern.period)
+    notes += [defects_note(int(defective.sum()), values.size)] if defective.any() else []
     linear = levels.linear(values, dark)
     if analyzers is not None:
         linear = analyzers.apply(linear, offset=(x, y))
-        saturated, black = spread_to_cells(saturated), spread_to_cells(black)
+        saturated, black, defective = map(spread_to_cells, (saturated, black, defective))
     if gains != UNIT_GAINS:
         of_angle = dict(zip(ANGLES, gains, strict=True))
         linear *= tiled(np.vectorize(lambda a: np.float32(1 / of_angle[a]))(pattern.angles), linear.shape)
@@ -180,21 +184,24 @@ def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
     cells = {int(pattern.angles[r, c]): linear[r::2, c::2] for r, c in np.ndindex(2, 2)}
     noise = given_noise(options, lsb)
     if noise is None:
-        bad = saturated | black
+        bad = saturated | black | defective
         good = ~(bad[::2, ::2] | bad[1::2, ::2] | bad[::2, 1::2] | bad[1::2, 1::2])
         noise = estimated_noise([cells[angle] for angle in ANGLES], good, lsb)
     mode, way = options.demosaic, options.interpolation
     picture = demosaic(linear, saturated, pattern, mode=mode, interpolation=way, colored=False)
     lost = picture.invalid
-    blacks = np.zeros(lost.shape, bool)
-    if black.any():
-        blacks = demosaic(linear, black, pattern, mode=mode, interpolation=way).invalid
-    shape = lost.shape
+
+    def spoiled(samples: Mask) -> Mask:
+        """The pixels that are made from some samples."""
+        if not samples.any():
+            return np.zeros(lost.shape, bool)
+        return demosaic(linear, samples, pattern, mode=mode, interpolation=way, colored=False).invalid
+
     return Developed(
         intensities=oriented(picture.intensities, options.calibration),
-        dark=blacks,
+        dark=spoiled(black),
         saturated=lost,
-        masked=np.zeros(shape, bool),
+        masked=spoiled(defective),
         noise=noise,
         factors=_placed(interpolation_factors(options.sensor, x, y, mode), options.calibration),
         pair_ratio=ratio,
@@ -278,9 +285,10 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
         shots = read_shots(shot.files, levels=levels)
     transfer: str = options.transfer
     if transfer == "auto":
+        require_known_encoding(paths[0])
         decision = decide_transfer([shots], lossy=is_lossy(shot.files[0]))
         transfer = decision.transfer
-        notes.append(f"Transfer {decision.reason}.")
+        notes += [f"Transfer {decision.reason}.", *filter(None, [decision.doubt])]
     linear = linear_intensities(shots.pictures, transfer)
     lsb = 1 / float(np.iinfo(shots.pictures.dtype).max if levels is None else levels.white)
     clipped, dark = shots.clipped, shots.dark

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from polarguide.capture.exposures import TABLE
 from polarguide.capture.filter import shots as filter_shots
+from polarguide.capture.filter.names import covers_turn
 from polarguide.capture.layout import (
     Layout,
     angle_folders,
@@ -73,7 +74,7 @@ class ExposureSet:
     def whole(self) -> bool:
         """Whether no more pictures of a set are expected: a table lists them, or they cover half a turn evenly."""
         angles = [picture.angle for picture in self.pictures if not isinstance(picture.angle, str)]
-        return self.table is not None or sets.covers_turn([angle % 180 for angle in angles])
+        return self.table is not None or covers_turn([angle % 180 for angle in angles])
 
     @property
     def nothing(self) -> bool:

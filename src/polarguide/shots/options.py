@@ -10,6 +10,7 @@ import tyro
 from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, checked
+from polarguide.capture.sensor.raw_file import Packing
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options, option_name
 from polarguide.preparation.settings import PrepareSettings
@@ -54,7 +55,7 @@ class ShotOptions:
 
     Attributes:
         sensor: Sensor of raw mosaics: MYR are color, MZR is monochrome. Without it files are shots through a filter.
-        packing: Packing of .raw files (two different 12-bit packings exist; never guessed).
+        packing: Packing of .raw files (there are several of 10 and of 12 bits; never guessed).
         width: Width of .raw files in pixels; others must have it, too.
         height: Height of .raw files in pixels.
         bits: Bits of a value in 16-bit files; without it 16 for shots through a filter, for mosaics 12 if no value
@@ -81,7 +82,7 @@ class ShotOptions:
     """
 
     sensor: Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"] | None = None
-    packing: Literal["8", "16", "10p", "12p", "12packed"] | None = None
+    packing: Packing | None = None
     width: _Positive | None = None
     height: _Positive | None = None
     bits: Annotated[int, Meta(ge=8, le=16)] | None = None

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import ANGLES, Calibration
 from polarguide.capture.exposures import Angle, Exposure, analyzers, nominal, turned
-from polarguide.capture.filter.develop import kind_of_file, transfer_of_kind
+from polarguide.capture.filter.develop import kind_of_file, require_known_encoding, transfer_of_kind
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import Shots, read_stack
 from polarguide.capture.formats.pictures import linear_codes, rescaled
@@ -255,6 +255,8 @@ def _transfer(pictures: Sequence[SetPicture], asked: str) -> tuple[str, str]:
             found=" and ".join(f"{kind} ({path.name})" for kind, path in kinds.items()),
             remedy="Keep one kind: their brightness cannot be compared.",
         )
+    if asked == "auto" and "video" not in kinds:
+        require_known_encoding(pictures[0].path)
     return transfer_of_kind(next(iter(kinds)), asked)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,18 +18,12 @@ from polarguide.capture.exposures import (
     normalized,
     read_table,
 )
-from polarguide.capture.filter.shots import SHOT_SUFFIXES, group_files, split_name
+from polarguide.capture.filter.names import FEWEST, angles_of_names
+from polarguide.capture.filter.shots import SHOT_SUFFIXES, group_files
 from polarguide.capture.layout import ambiguous, list_files
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
 from polarguide.shots.video import VIDEO_SUFFIXES, frame_table, read_frame_table
-
-FEWEST = 3
-"""Different angles that determine a Stokes vector."""
-_NUMBERED = re.compile(r"(?:(?P<view>.+?)[-_ .]+)?(?P<number>\d{1,3}(?:\.\d+)?)")
-_SMALLEST_STEP = 2.0
-"""Degrees: numbers that rise by one may count pictures."""
-_ALIKE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -138,47 +130,6 @@ def _order(picture: SetPicture) -> tuple[bool, float, str, int]:
     word = isinstance(picture.angle, str)
     angle = 0.0 if isinstance(picture.angle, str) else picture.angle
     return word, angle, picture.path.name, picture.frame or 0
-
-
-def angles_of_names(names: Sequence[str], *, folders: bool = False) -> list[tuple[str, Angle] | None]:
-    """View ("" where the name is an angle alone) and angle that each name states; None where it states none.
-
-    A number counts as an angle where ``prepare`` takes it for one, and where all numbers of a view are evenly spaced
-    over half a turn or a whole one: 10, 40, ..., 160, or 0 to 175 by 5. ``folders``: names such as I_10 are angles
-    alone, and no view I.
-    """
-    found = [_stated(name, folders) for name in names]
-    numbered: dict[str, list[tuple[int, float]]] = {}
-    for place, name in enumerate(names):
-        match = _NUMBERED.fullmatch(name)
-        if match is not None:
-            numbered.setdefault(match["view"] or "", []).append((place, float(match["number"])))
-    for view, places in numbered.items():
-        if covers_turn([number for _, number in places]):
-            for place, number in places:
-                if not folders or found[place] is None:
-                    found[place] = view, number
-    return found
-
-
-def _stated(name: str, folder: bool) -> tuple[str, Angle] | None:
-    """View and angle by ``prepare``'s rule for the names of pictures, or of folders."""
-    found = None if folder else split_name(name)
-    if found is None and (alone := split_name(f"x_{name}")) is not None and alone[0] == "x":
-        return "", alone[1]
-    return found
-
-
-def covers_turn(angles: Sequence[float]) -> bool:
-    """Whether angles in degrees are evenly spaced over half a turn or a whole one, its end included or not."""
-    different = sorted(set(angles))
-    if len(different) < FEWEST:
-        return False
-    steps = [b - a for a, b in itertools.pairwise(different)]
-    step, count = steps[0], len(different)
-    even = step >= _SMALLEST_STEP and all(abs(other - step) < _ALIKE for other in steps)
-    return even and any(abs(span - turn) < _ALIKE for span in (step * count, step * (count - 1))
-                        for turn in (180.0, 360.0))  # fmt: skip
 
 
 def by_name(files: Sequence[Path]) -> tuple[list[PictureSet], list[Path]]:

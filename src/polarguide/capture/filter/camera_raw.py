@@ -24,6 +24,7 @@ from polarguide.core.files import read_file
 
 CAMERA_RAW = (".dng", ".nef", ".nrw", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 """Suffixes that are read as camera raw."""
+_FULL = 65535
 _EXIF_OF_FLIP = {0: 1, 3: 3, 5: 8, 6: 6}
 
 
@@ -56,6 +57,7 @@ def read_camera_raw(
                 raise ValueError(f"{raw.sizes.raw_width}x{raw.sizes.raw_height} pixels")
             flip = int(raw.sizes.flip)  # before user_flip takes its place
             pixels = np.asarray(raw.postprocess(**libraw_parameters(gains)))
+            reached = _reached(raw)
     except Exception as error:  # LibRaw's errors have a class each; damaged files raise others, too
         said = _words(error)
         raise PolarguideError(
@@ -71,7 +73,26 @@ def read_camera_raw(
             found=array_kind(pixels),
             remedy="Develop it to 16-bit linear TIFF.",
         )
-    return pixels, _EXIF_OF_FLIP.get(flip, 1)
+    return _to_full_scale(pixels, reached), _EXIF_OF_FLIP.get(flip, 1)
+
+
+def _reached(raw: Any) -> float:
+    """The code at which LibRaw puts the white level.
+
+    Of files that are no mosaics (linear DNG, such as a telephone's ProRAW) it subtracts the black levels of three
+    channels from the samples, and that of a fourth one, which is 0, from the white level.
+    """
+    if raw.raw_type.name != "Stack":
+        return _FULL
+    black, white = raw.black_level_per_channel, raw.white_level
+    return float((white - max(black[:3])) / (white - min(black)) * _FULL)
+
+
+def _to_full_scale(pixels: NDArray[np.uint16], reached: float) -> NDArray[np.uint16]:
+    """Pixels whose white level is at 65535: what clipped in the camera has to be known. LibRaw rounds down."""
+    if reached < _FULL:
+        pixels = np.minimum(np.rint(pixels * np.float32(_FULL / reached)), _FULL).astype(np.uint16)
+    return np.where(pixels >= _FULL - 1, np.uint16(_FULL), pixels)
 
 
 def stored_frame(path: Path) -> tuple[tuple[int, int], int]:

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from polarguide.capture import checks
 from polarguide.capture.filter.camera_raw import is_camera_raw
 from polarguide.capture.filter.shots import Shots
-from polarguide.capture.formats.pictures import is_lossy, linear_codes
+from polarguide.capture.formats.icc import stated_exponent
+from polarguide.capture.formats.pictures import is_lossy, linear_codes, read_picture
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.write import Rounding, rounding_of
+from polarguide.core.errors import PolarguideError
 from polarguide.optics.color import srgb_decode_array
 
 SMALLEST = 0.2
@@ -200,10 +202,11 @@ def _turn(reference: NDArray[np.float32], other: NDArray[np.float32], shift: Shi
 
 @dataclass(frozen=True)
 class TransferDecision:
-    """The chosen transfer function, and the reason."""
+    """The chosen transfer function, the reason, and what to warn of: "" or a sentence."""
 
     transfer: str
     reason: str
+    doubt: str = ""
 
 
 def linear_intensities(pictures: NDArray[Any], transfer: str) -> NDArray[np.float32]:
@@ -221,7 +224,7 @@ def rounding_of_bytes(transfer: str, smallest: float) -> Rounding:
     return rounding_of(FULL_CODE * smallest * (srgb_decode_array(shown) if transfer == "srgb" else shown))
 
 
-LOSSY, PLAIN, CAMERA_RAW = "JPEG or WebP", "PNG, TIFF or BMP", "camera raw"
+LOSSY, PLAIN, CAMERA_RAW = "JPEG, WebP or HEIC", "PNG, TIFF or BMP", "camera raw"
 """Kinds of picture files by their usual encoding."""
 
 
@@ -240,24 +243,64 @@ def transfer_of_kind(kind: str, asked: str) -> tuple[str, str]:
     return usual, f"Transfer {usual}, as {kind} files usually are (--transfer sets it)."
 
 
+_SRGB_EXPONENT, _NEAR = 2.22, 0.1
+"""Of sRGB at half scale; share by which an exponent may differ. DoLP is off by as much as the exponent."""
+
+
+def require_known_encoding(path: Path) -> None:
+    """Refuse a photograph whose color profile states an encoding that is neither linear nor like sRGB.
+
+    Raises:
+        PolarguideError: it does.
+    """
+    exponent = None if is_camera_raw(path) else stated_exponent(read_picture(path))
+    if exponent is None or any(abs(exponent / known - 1) <= _NEAR for known in (1.0, _SRGB_EXPONENT)):
+        return
+    raise PolarguideError(
+        path,
+        expected="a linear picture, or one encoded as sRGB (gamma 2.2)",
+        found=f"a color profile (ICC) that states gamma {exponent:.2f}",
+        remedy="Export with a linear profile or sRGB: DoLP would be wrong by the ratio of the two. If the profile is "
+        "wrong, give --transfer linear or srgb.",
+    )
+
+
 def decide_transfer(shots: Sequence[Shots], *, lossy: bool) -> TransferDecision:
     """The transfer by the curvature of the response (``checks.encoding``), as ``inspect`` judges it.
 
     Args:
         shots: some views, aligned well enough (as from a tripod).
-        lossy: whether the files are JPEG or WebP, for the default where the curvature does not decide.
+        lossy: whether the files are JPEG, WebP or HEIC, for the default where the curvature does not decide.
     """
-    measures = [
-        checks.measure(linear_codes(view.pictures, "linear"), ~(view.clipped.any(axis=0) | view.dark))
-        for view in shots
-    ]
-    slope = checks.curvature(measures)
+    slope = _slope(shots, "linear")
     found = checks.encoding(slope)
     said = "too few pixels are polarized to tell"
     if slope is not None:
         said = f"the curvature of the response is {slope:+.2f}; linear files have 0, sRGB about -0.6"
     if found is not None:
-        return TransferDecision(found, f"{found}: {said}")
+        return TransferDecision(found, f"{found}: {said}", _doubt(shots, found))
     fallback = "srgb" if lossy else "linear"
-    kind = "JPEG and WebP files" if lossy else "PNG, TIFF and BMP files"
-    return TransferDecision(fallback, f"{fallback}, as {kind} usually are: {said} (--transfer sets it)")
+    kind = "JPEG, WebP and HEIC files" if lossy else "PNG, TIFF and BMP files"
+    reason = f"{fallback}, as {kind} usually are: {said} (--transfer sets it)"
+    return TransferDecision(fallback, reason, _doubt(shots, fallback))
+
+
+def _slope(shots: Sequence[Shots], transfer: str) -> float | None:
+    """The curvature of the response that a transfer leaves, over all views."""
+    return checks.curvature(
+        [
+            checks.measure(linear_codes(view.pictures, transfer), ~(view.clipped.any(axis=0) | view.dark))
+            for view in shots
+        ]
+    )
+
+
+def _doubt(shots: Sequence[Shots], transfer: str) -> str:
+    """What to say where the chosen transfer leaves the response bent, as a camera's own tone curve does."""
+    left = _slope(shots, transfer)
+    if left is None or checks.ENCODED[0] <= left <= checks.DECODED[0]:
+        return ""
+    return (
+        f"Read as {transfer}, the response still has a curvature of {left:+.2f} (0 if it is linear): the files have "
+        "another tone curve, and DoLP is wrong. Export 16-bit TIFF without a tone curve, or take camera raw."
+    )

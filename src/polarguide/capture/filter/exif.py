@@ -16,6 +16,7 @@ from PIL import Image
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.filter.camera_raw import is_camera_raw
+from polarguide.capture.formats.heif import heif_head, heif_tags, is_heif
 from polarguide.capture.formats.integrity import ORIENTATION, TIFF, jpeg_segments, png_chunks
 from polarguide.capture.formats.pictures import read_picture
 from polarguide.capture.formats.plain import is_webp, webp_chunks
@@ -38,7 +39,13 @@ TURNS = {
 
 
 def orientation(data: bytes) -> int:
-    """The orientation tag of a picture file, 1 to 8; 1 (as stored) where there is none that can be read."""
+    """The orientation tag of a picture file, 1 to 8; 1 (as stored) where there is none that can be read.
+
+    HEIC states its turn in the header; its tag is for information only.
+    """
+    if is_heif(data):
+        head = heif_head(data)
+        return 1 if head is None else head.orientation
     value = tags_of(data).get(ORIENTATION)
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
@@ -74,6 +81,8 @@ def tags_of(data: bytes) -> dict[int, Any]:
     elif is_webp(data):
         tiff = next((data[at:end] for kind, at, end in webp_chunks(data) if kind == b"EXIF"), b"")
         tiff = tiff.removeprefix(b"Exif\0\0")
+    elif is_heif(data):
+        tiff = heif_tags(data).removeprefix(b"Exif\0\0")
     if tiff[:4] not in TIFF:
         return {}
     exif = Image.Exif()

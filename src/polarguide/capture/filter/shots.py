@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from polarguide.capture.exposures import TABLE, Angle, Line, angle_text, parse_angle, read_table
 from polarguide.capture.filter.camera_raw import CAMERA_RAW, is_camera_raw, read_camera_raw
 from polarguide.capture.filter.exif import orientation
+from polarguide.capture.filter.names import NAMING, angles_of_names, folders_of_angles
 from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, is_lossy, read_picture, rescaled
 from polarguide.capture.layout import ambiguous, angle_folders, index_files, list_files, require_angle_folders
 from polarguide.capture.memory import require_memory_of_each
@@ -28,11 +29,12 @@ SHOT_SUFFIXES = (*SUFFIXES, *CAMERA_RAW)
 Candidates = dict[str, dict[int, list[Path]]]
 """View -> angle -> the files that may be its shot: one, unless names are ambiguous."""
 _SUFFIX = re.compile(
-    r"(?P<view>.+?)[-_ .]+(?:i|pol|angle)?[-_ ]?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE
+    r"(?P<view>.+?)[-_ .]+(?:i|pol|angle)?[-_ ]?(?<![_ .]-)(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?",
+    re.IGNORECASE,
 )
-_BARE = re.compile(r"(?:i|pol|angle)?[-_ ]?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE)
-# Compression smears the edge of clipped areas over a few values.
-_LOSSY_FULL = 250
+_BARE = re.compile(r"(?:(?:i|pol|angle)[-_ ]?|[_ ])?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE)
+# Compression smears the edge of clipped areas over a few values of 8 bits.
+_LOSSY_FULL = 250 / 255
 # Bytes that a pixel of four shots takes at least: as decoded, and stacked.
 _READ = 4 * 3 * (2 + 2)
 
@@ -217,7 +219,8 @@ def read_stack(
                 remedy="Keep the camera still between the shots of a view, or export them all alike.",
             )
     stack = np.stack(pictures)
-    full = _LOSSY_FULL if is_lossy(paths[0]) else int(np.iinfo(stack.dtype).max)
+    full = int(np.iinfo(stack.dtype).max)
+    full = round(_LOSSY_FULL * full) if is_lossy(paths[0]) else full
     if levels is not None:
         full = min(full, levels.saturation)
     # By the largest of the three colors, written out: NumPy reduces a last axis of three slowly.
@@ -234,18 +237,6 @@ def _read_shot(path: Path, gains: tuple[float, float, float]) -> tuple[NDArray[A
         return read_camera_raw(path, gains)
     data = read_picture(path)
     return decode_picture(path, data), orientation(data)
-
-
-NAMING = (
-    "Name files like cup_045.jpg, cup_a30.jpg, cup_unknown.jpg or cup_none.jpg (numbers without a letter are multiples "
-    "of 15), or write angles.csv with the columns file,angle, or give --angles unknown."
-)
-_WORDS = "unknown|none"
-_NUMBER = r"(?P<mark>angle|pol|a|i)?[-_ ]?(?P<angle>\d{1,3}(?:\.\d+)?)(?P<unit>deg)?"
-_SINGLE = re.compile(rf"(?P<view>.+?)[-_ .]+(?:{_NUMBER}|(?P<word>{_WORDS}))", re.IGNORECASE)
-_FOLDER = re.compile(rf"{_NUMBER}|(?P<word>{_WORDS})", re.IGNORECASE)
-# Degrees between the marks of a filter's ring: other numbers need a letter, as they may count pictures.
-_MARKS = 15
 
 
 @dataclass(frozen=True)
@@ -304,7 +295,12 @@ def find_single_shots(root: Path, angles: str | None = None) -> tuple[list[Singl
             for stem, path in index_files(folder, SHOT_SUFFIXES).items()
         ]
         return _checked(root, shots), []
-    named = {path: split_name(path.stem) for path in files}
+    names = angles_of_names([path.stem for path in files])
+    alone = all(name is not None and not name[0] for name in names)
+    named = {
+        path: None if name is None or not (name[0] or alone) else (name[0] or root.resolve().name, name[1])
+        for path, name in zip(files, names, strict=True)
+    }
     without = [path.name for path, found in named.items() if found is None]
     if without:
         raise PolarguideError(
@@ -315,33 +311,6 @@ def find_single_shots(root: Path, angles: str | None = None) -> tuple[list[Singl
         )
     shots = [SingleShot(path, *found) for path, found in named.items() if found is not None]
     return _checked(root, shots), []
-
-
-def split_name(stem: str) -> tuple[str, Angle] | None:
-    """View and angle in a file's name; None where it states no angle."""
-    match = _SINGLE.fullmatch(stem)
-    angle = None if match is None else _angle_of(match)
-    return None if match is None or angle is None else (match["view"], angle)
-
-
-def folders_of_angles(root: Path) -> dict[Path, Angle]:
-    """The folders in a folder that are named like angles, in the order of their names."""
-    found: dict[Path, Angle] = {}
-    for path in sorted(root.iterdir()):
-        match = _FOLDER.fullmatch(path.name) if path.is_dir() else None
-        angle = None if match is None else _angle_of(match)
-        if angle is not None:
-            found[path] = angle
-    return found
-
-
-def _angle_of(match: re.Match[str]) -> Angle | None:
-    """The angle that a name states; None for numbers that may count pictures."""
-    if match["word"]:
-        return parse_angle(match["word"])
-    number = float(match["angle"])
-    certain = match["mark"] or match["unit"] or (number % _MARKS == 0 and number < 180)
-    return number if certain and number <= 360 else None
 
 
 def _all_alike(root: Path, angles: str) -> list[SingleShot]:
@@ -437,7 +406,7 @@ def _checked(root: Path, shots: list[SingleShot]) -> list[SingleShot]:
             )
         if shot.angle == "unknown":
             continue
-        key = (shot.view, shot.angle if isinstance(shot.angle, str) else shot.angle % 180)
+        key = (shot.view, shot.angle)  # half a turn apart, two pictures are as good as one taken twice
         if key in seen:
             at = "without a filter" if shot.angle == "none" else f"at {angle_text(shot.angle)} degrees"
             raise ambiguous(root, f"one photograph of {shot.view} {at}", seen[key], shot.path)

@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
+from polarguide.capture.formats.heif import heif_damage, heif_head, is_heif
 from polarguide.capture.formats.plain import (
     BMP,
     PNM,
@@ -38,7 +39,6 @@ MOST_ENTRIES = 4096
 _MOST_SCANS = 200
 LARGEST_PIXELS = 150_000_000
 """More pixels than any camera has: a file that claims more is refused before memory is taken for it."""
-_HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif")
 _TIFF_STRIPS = ((273, 279), (324, 325))
 
 
@@ -71,13 +71,8 @@ def find_damage(data: bytes) -> str | None:
     if data[:2] == BMP or data[:2] in PNM or is_webp(data):
         return plain_damage(data)
     if is_heif(data):
-        return "a HEIC or AVIF file"
+        return heif_damage(data)
     return "a file that is none of these"
-
-
-def is_heif(data: bytes) -> bool:
-    """Whether a file is one of telephones, HEIC or AVIF, by its first twelve bytes."""
-    return data[4:8] == b"ftyp" and data[8:12] in _HEIF_BRANDS
 
 
 def declared_size(data: bytes) -> tuple[int, int] | None:
@@ -91,6 +86,9 @@ def declared_size(data: bytes) -> tuple[int, int] | None:
     if data[:2] == BMP or data[:2] in PNM:
         head = plain_head(data)
         return None if head is None else head.size
+    if is_heif(data):
+        turned = heif_head(data)
+        return None if turned is None else turned.size
     return _tiff_size(data) if data[:4] in (*TIFF, *BIG_TIFF) else None
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.formats.arrays import BROKEN, array_header, exr_size, hdr_size
+from polarguide.capture.formats.heif import heif_pixels, is_heif
 from polarguide.capture.formats.integrity import (
     BIG_TIFF,
     LARGEST_PIXELS,
@@ -32,8 +33,8 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import LARGEST_FILE, read_file
 from polarguide.optics.color import srgb_decode_array
 
-SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".webp")
-_LOSSY = (".jpg", ".jpeg", ".webp")
+SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".webp", ".heic", ".heif")
+_LOSSY = (".jpg", ".jpeg", ".webp", ".heic", ".heif")
 TRANSFERS = ("linear", "srgb")
 # Bytes of a pixel: four channels of 16 bits, and as much for what a decoder works on.
 _DECODED = 16
@@ -50,9 +51,9 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
 
     Args:
         path: where ``data`` came from, for messages.
-        data: the whole file: PNG, JPEG, WebP, BMP, PGM, PPM or TIFF of 8 or 16 bits a channel, gray or color; TIFF
-            of floating-point numbers from 0 to 1, which become 16 bits (larger ones are at full scale). Those of fewer
-            bits (10 to 14 in TIFF, PGM of another full scale) are brought to the full scale of 8 or 16. Alpha is
+        data: the whole file: PNG, JPEG, WebP, HEIC, BMP, PGM, PPM or TIFF of 8 or 16 bits a channel, gray or color;
+            TIFF of floating-point numbers from 0 to 1, which become 16 bits (larger ones are at full scale). Those of
+            fewer bits (10 to 14 in TIFF, PGM of another full scale) are brought to the full scale of 8 or 16. Alpha is
             dropped, an orientation tag is not applied (poses belong to the stored pixels).
 
     Returns:
@@ -212,11 +213,26 @@ def _decoded(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
             pixels, bits = decode_tiff(data)
             full = (1 << bits) - 1
         except UnreadableTiffError as error:
-            raise _unreadable(path, str(error)) from None
+            raise PolarguideError(
+                path,
+                expected="one ordinary gray or RGB picture in a TIFF file",
+                found=str(error),
+                remedy="Export it as such. Of four angles in one file, save each as a shot of its own, such as "
+                f"{path.stem}_0.tif and {path.stem}_45.tif; or give the raw mosaic.",
+            ) from None
         except Exception:  # tifffile and its codecs raise what they please for damaged files
             pixels = None
     elif head is not None:
         return plain_pixels(data, head), head.full
+    elif is_heif(data):
+        try:
+            return heif_pixels(path, data)
+        except PolarguideError:
+            raise
+        except ValueError as error:
+            raise _unreadable(path, str(error)) from None
+        except Exception:  # pillow-heif raises what it pleases for damaged files
+            pixels = None
     else:
         with contextlib.suppress(cv2.error):
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -230,18 +246,18 @@ def _decoded(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
 
 def _unreadable(path: Path, found: str) -> PolarguideError:
     """The error that a file is none that is read; ``found``: a noun phrase."""
-    if "HEIC" in found:
+    if "HEIC" in found or "AVIF" in found:
         return PolarguideError(
             path,
-            expected="a PNG, JPEG, WebP, BMP, PGM or TIFF file",
+            expected="a PNG, JPEG, WebP, BMP, PGM or TIFF file, or an ordinary HEIC file",
             found=found,
             remedy="Export it as 16-bit TIFF or JPEG of the highest quality; telephones can be set to JPEG or raw.",
         )
-    return damaged(path, "a complete PNG, JPEG or TIFF file (or WebP, BMP, PGM)", found)
+    return damaged(path, "a complete PNG, JPEG or TIFF file (or WebP, BMP, PGM, HEIC)", found)
 
 
 def is_lossy(path: Path) -> bool:
-    """Whether a file is of a kind that loses detail, and that is sRGB by custom: JPEG or WebP, by its suffix."""
+    """Whether a file is of a kind that loses detail, and that is sRGB by custom: JPEG, WebP or HEIC, by its suffix."""
     return path.suffix.lower() in _LOSSY
 
 
@@ -306,7 +322,7 @@ ROOM = 1 << 26
 def stated_size(path: Path) -> tuple[int, int] | None:
     """Width and height in the header of a picture or an array; None where there is none to be read.
 
-    PNG, JPEG, WebP, BMP, PGM, TIFF, Radiance HDR, OpenEXR and ``.npy`` state them; other files do not.
+    PNG, JPEG, WebP, HEIC, BMP, PGM, TIFF, Radiance HDR, OpenEXR and ``.npy`` state them; other files do not.
     """
     if not path.is_file():  # a pipe, a folder, a link to nowhere: whoever reads it says so
         return None

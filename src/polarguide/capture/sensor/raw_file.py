@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,23 +14,29 @@ from polarguide.capture.formats.pictures import decode_stored, read_picture
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
 
-PACKINGS = {"8": (1, 1, 8), "16": (2, 1, 16), "10p": (5, 4, 10), "12p": (3, 2, 12), "12packed": (3, 2, 12)}
+Packing = Literal["8", "16", "16be", "10p", "10packed", "10mipi", "12p", "12packed", "12mipi"]
+PACKINGS: dict[Packing, tuple[int, int, int]] = {
+    "8": (1, 1, 8), "16": (2, 1, 16), "16be": (2, 1, 16),
+    "10p": (5, 4, 10), "10packed": (3, 2, 10), "10mipi": (5, 4, 10),
+    "12p": (3, 2, 12), "12packed": (3, 2, 12), "12mipi": (3, 2, 12),
+}  # fmt: skip
 """Bytes of a group, pixels of a group, bits of a pixel."""
 
 
-def packed_size(width: int, height: int, packing: str) -> int:
+def packed_size(width: int, height: int, packing: Packing) -> int:
     """Bytes of a packed picture: rows follow one another without padding, the last group is filled up."""
     group, pixels, _ = PACKINGS[packing]
     return -(-width * height // pixels) * group
 
 
-def unpack(data: bytes, width: int, height: int, packing: str) -> NDArray[Any]:
+def unpack(data: bytes, width: int, height: int, packing: Packing) -> NDArray[Any]:
     """Unpack a picture.
 
-    ``8`` and ``16`` are whole bytes, the low one first. ``10p`` and ``12p`` are little-endian bit streams, low bits
-    first: bit b of pixel k is bit ``bits * k + b`` of the file (GenICam PFNC). In ``12packed`` (GigE
-    Vision) bytes 0 and 2 are the high eight bits of two pixels, the low nibble of byte 1 the low four bits of the
-    first, its high nibble those of the second.
+    ``8`` and ``16`` are whole bytes, the low one first, ``16be`` the high one. ``10p`` and ``12p`` are little-endian
+    bit streams, low bits first: bit b of pixel k is bit ``bits * k + b`` of the file (GenICam PFNC). The others have
+    the high eight bits of each pixel in a byte. In ``10packed`` and ``12packed`` (GigE Vision) these are bytes 0 and 2
+    of two pixels; the low bits of the first are the lowest of byte 1, those of the second begin at its bit 4. In
+    ``10mipi`` and ``12mipi`` (MIPI CSI-2) the last byte of a group has the low bits of its pixels in turn.
 
     Args:
         data: exactly ``packed_size`` bytes.
@@ -40,23 +46,22 @@ def unpack(data: bytes, width: int, height: int, packing: str) -> NDArray[Any]:
     Returns:
         [height, width] values from 0 to 2^bits - 1, uint16 but for ``8``.
     """
-    if packing in ("8", "16"):
-        kind = np.dtype("u1" if packing == "8" else "<u2")
+    group, pixels, bits = PACKINGS[packing]
+    if pixels == 1:
+        kind = np.dtype({"8": "u1", "16": "<u2"}.get(packing, ">u2"))
         return np.frombuffer(data, kind).astype(kind.newbyteorder("=")).reshape(height, width)
-    group, pixels, _ = PACKINGS[packing]
     parts = np.frombuffer(data, np.uint8).reshape(-1, group).astype(np.uint16)
     values = np.empty((len(parts), pixels), np.uint16)
-    if packing == "12p":
-        values[:, 0] = parts[:, 0] | (parts[:, 1] & 0x0F) << 8
-        values[:, 1] = parts[:, 1] >> 4 | parts[:, 2] << 4
-    elif packing == "12packed":
-        values[:, 0] = parts[:, 0] << 4 | parts[:, 1] & 0x0F
-        values[:, 1] = parts[:, 2] << 4 | parts[:, 1] >> 4
-    else:
-        for pixel in range(pixels):
-            # Pixel k starts 2k bits into byte k and reaches into the next one.
-            low, high = parts[:, pixel] >> 2 * pixel, parts[:, pixel + 1] << 8 - 2 * pixel
-            values[:, pixel] = (low | high) & 0x3FF
+    low = bits - 8
+    for pixel in range(pixels):
+        if packing.endswith("p"):
+            # Pixel k starts ``bits * k`` bits into the group, and reaches into the next byte.
+            byte, shift = divmod(bits * pixel, 8)
+            values[:, pixel] = (parts[:, byte] >> shift | parts[:, byte + 1] << 8 - shift) & (1 << bits) - 1
+        elif packing.endswith("packed"):
+            values[:, pixel] = parts[:, 2 * pixel] << low | parts[:, 1] >> 4 * pixel & (1 << low) - 1
+        else:
+            values[:, pixel] = parts[:, pixel] << low | parts[:, -1] >> low * pixel & (1 << low) - 1
     return values.reshape(-1)[: width * height].reshape(height, width)
 
 
@@ -69,7 +74,7 @@ class RawFormat:
 
     width: int | None = None
     height: int | None = None
-    packing: str | None = None
+    packing: Packing | None = None
 
     def container(self, path: Path, kind: np.dtype[Any]) -> int:
         """Bits that a pixel of type ``kind`` takes in a file."""
@@ -89,7 +94,8 @@ def read_mosaic(path: Path, raw: RawFormat, *, least: int = 1) -> NDArray[Any]:
         [H, W] uint8 or uint16, the values as stored.
 
     Raises:
-        PolarguideError: the file cannot be read, is damaged, has color channels or another size, or is too small.
+        PolarguideError: the file cannot be read, is damaged, has color channels or another size, is too small, or holds
+            four pictures.
     """
     packed = path.suffix.lower() == ".raw"
     values = _read_packed(path, read_file(path), raw) if packed else _read_plain(path, raw)
@@ -100,6 +106,7 @@ def read_mosaic(path: Path, raw: RawFormat, *, least: int = 1) -> NDArray[Any]:
             found=f"{values.shape[1]}x{values.shape[0]}",
             remedy="Give the whole picture of the sensor.",
         )
+    _require_one_picture(path, values)
     return values
 
 
@@ -150,6 +157,51 @@ def _read_packed(path: Path, data: bytes, raw: RawFormat) -> NDArray[Any]:
     return values
 
 
+_CELLS = 4
+"""Pixels along a block whose mean is free of analyzers and colors on every sensor."""
+_LEAST_BLOCKS, _MOST_BLOCKS = 8, 128
+"""Along a quarter: with fewer, chance correlates them; more need not be compared."""
+_TILED = 0.4
+"""Correlation of the detail in every quarter with that in the first: over 0.55 of one view, 0.2 at most of others."""
+
+
+def is_tiled(values: NDArray[Any]) -> bool:
+    """Whether a picture holds the same view four times, in two rows of two, as cameras show the four angles apart.
+
+    The detail (means of blocks less those of the blocks around) of each quarter is compared with that of the first.
+    """
+    down, across = (min(side // 2 // _CELLS, _MOST_BLOCKS) for side in values.shape)
+    if min(down, across) < _LEAST_BLOCKS:
+        return False
+    half = [side // 2 for side in values.shape]
+    detail = []
+    for row, column in ((0, 0), (0, half[1]), (half[0], 0), (half[0], half[1])):
+        part = values[row : row + down * _CELLS, column : column + across * _CELLS]
+        means = part.reshape(down, _CELLS, across, _CELLS).mean(axis=(1, 3))
+        around = sum(np.roll(means, (y, x), (0, 1)) for y in (-1, 0, 1) for x in (-1, 0, 1))
+        # Logarithms of ratios: a quarter that is brighter everywhere has the same detail.
+        fine = np.log((means + 1) / (around / 9 + 1))[1:-1, 1:-1].ravel()
+        detail.append(fine - fine.mean())
+    first, *others = (fine / max(float(np.linalg.norm(fine)), 1e-12) for fine in detail)
+    return min(float(first @ other) for other in others) > _TILED
+
+
+def _require_one_picture(path: Path, values: NDArray[Any]) -> None:
+    """Refuse four pictures side by side in place of a mosaic: nothing later would tell.
+
+    Raises:
+        PolarguideError: the file holds them.
+    """
+    if is_tiled(values):
+        raise PolarguideError(
+            path,
+            expected="a raw mosaic, in which the four angles take turns from pixel to pixel",
+            found="the same view four times, side by side",
+            remedy="Save what the sensor delivers (a pixel format such as Mono12 or BayerRG12), not one that shows the "
+            "four angles apart; or cut the file into four shots, NAME_0, NAME_45, NAME_90 and NAME_135.",
+        )
+
+
 _APART = 4
 """Pixels after which analyzer and color are the same on every sensor."""
 _ROUGHER = 2.0
@@ -179,14 +231,14 @@ def _roughness(columns: NDArray[Any]) -> float:
     return float(near / spread) if spread > 0 else 0.0
 
 
-def _require_alike_neighbors(path: Path, data: bytes, values: NDArray[Any], packing: str) -> None:
+def _require_alike_neighbors(path: Path, data: bytes, values: NDArray[Any], packing: Packing) -> None:
     """Refuse a packing or a size that makes noise of a picture, where another one of the same bytes does not.
 
     Raises:
         PolarguideError: there is such a one.
     """
     height, width = values.shape
-    others = {
+    others: dict[str, tuple[int, int, Packing]] = {
         f"--packing {other}": (width, height, other)
         for other in PACKINGS
         if other != packing and packed_size(width, height, other) == len(data)
@@ -194,8 +246,10 @@ def _require_alike_neighbors(path: Path, data: bytes, values: NDArray[Any], pack
     if width != height:
         others[f"--width {height} --height {width}"] = (height, width, packing)
     mine = roughness(values)
-    for options, (w, h, other) in others.items():
-        if mine > _ROUGHER * roughness(unpack(data, w, h, other)) > 0:
+    rough = {options: roughness(unpack(data, *other)) for options, other in others.items()}
+    # The smoothest one: of two packings that differ in the low bits alone, both are smooth.
+    for options in sorted(rough, key=lambda options: rough[options])[:1]:
+        if mine > _ROUGHER * rough[options] > 0:
             raise PolarguideError(
                 path,
                 expected="a picture, in which neighbors behind one analyzer are alike",

@@ -13,6 +13,7 @@ from msgspec import Meta
 
 from polarguide.capture.calibration import Sense
 from polarguide.capture.sensor.pattern import sensor_pattern
+from polarguide.capture.sensor.raw_file import Packing
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options
 from polarguide.core.text import decimal
@@ -43,7 +44,7 @@ class CalibrateSettings:
         black_level: Stored value without light.
         saturation: Stored value from which the sensor saturates; without it full scale.
         bits: Bits of a sensor value in 16-bit files; without it 12 if no value exceeds 4095, else 16.
-        packing: Packing of .raw files (two different 12-bit packings exist; never guessed).
+        packing: Packing of .raw files (there are several of 10 and of 12 bits; never guessed).
         width: Width of .raw files in pixels.
         height: Height of .raw files in pixels.
         offset_x: Column of the sensor at which the region of interest starts.
@@ -63,7 +64,7 @@ class CalibrateSettings:
     black_level: Annotated[float, Meta(ge=0)] = 0.0
     saturation: _Positive | None = None
     bits: Annotated[int, Meta(ge=8, le=16)] | None = None
-    packing: Literal["10p", "12p", "12packed"] | None = None
+    packing: Packing | None = None
     width: _Positive | None = None
     height: _Positive | None = None
     offset_x: _NotNegative = 0
