@@ -114,8 +114,8 @@ CELLS: dict[str, tuple[str, Callable[[Path], object], str]] = {
     ),
     "pandora: no pictures": ("pandora", lambda d: shutil.rmtree(d / "images"), "intrinsics belong to, found none"),
     "pandora: another aspect": (
-        "pandora", lambda d: write_picture(d / "images" / "01.png", np.ones((50, 200, 3)), bits=8),
-        "expected the size of the pictures, 64x48.*found 200x50",
+        "pandora", lambda d: write_picture(d / "images" / "01.png", np.ones((96, 140, 3)), bits=8),
+        "expected the size of the pictures, 64x48.*found 140x96",
     ),
     "pandora: mixed sizes": (
         "pandora", lambda d: shutil.copy(

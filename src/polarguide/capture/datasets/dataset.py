@@ -299,8 +299,10 @@ def read_projections(path: Path) -> Projections:
             raise missing_entry(path, scale_key, arrays)
         world = finite_numbers(f"{path} ({key})", arrays[key], _SQUARE)
         scale = finite_numbers(f"{path} ({scale_key})", arrays[scale_key], ((4, 4),))
-        size = max(np.linalg.norm(scale[:3, :3], 2), 1e-12)  # else the object would be stretched
-        checked_pose(f"{path} ({scale_key})", scale[:3] / size)
+        if size := float(
+            np.linalg.norm(scale[:3, :3], 2)
+        ):  # of a rotation and one scale: nothing is stretched
+            checked_pose(f"{path} ({scale_key})", scale[:3] / size)
         found[number] = decompose_projection(f"{path} ({key} @ {scale_key})", (world @ scale)[:3])
     if not found:
         raise missing_entry(path, "world_mat_<i>", arrays)
