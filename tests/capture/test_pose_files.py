@@ -41,7 +41,9 @@ LENS = {
 }
 
 
-def write_metashape(path: Path, lens: dict[str, float], labels: list[str], more: str = "") -> None:
+def write_metashape(
+    path: Path, lens: dict[str, float], labels: list[str], more: str = "", kind: str = "frame"
+) -> None:
     values = "".join(f"<{name}>{value!r}</{name}>" for name, value in lens.items())
     cameras = ""
     for label, (rotation, translation) in zip(labels, poses(), strict=True):
@@ -51,24 +53,28 @@ def write_metashape(path: Path, lens: dict[str, float], labels: list[str], more:
         cameras += f'<camera id="0" sensor_id="0" label="{label}"><transform>{numbers}</transform></camera>'
     path.write_text(
         '<?xml version="1.0" encoding="UTF-8"?><document version="2.0.0"><chunk label="Chunk 1"><sensors>'
-        f'<sensor id="0" label="x" type="frame"><resolution width="{WIDTH}" height="{HEIGHT}"/>'
-        f'<calibration type="frame" class="adjusted"><resolution width="{WIDTH}" height="{HEIGHT}"/>{values}'
+        f'<sensor id="0" label="x" type="{kind}"><resolution width="{WIDTH}" height="{HEIGHT}"/>'
+        f'<calibration type="{kind}" class="adjusted"><resolution width="{WIDTH}" height="{HEIGHT}"/>{values}'
         f"</calibration></sensor></sensors><cameras>{cameras}"
         f'<camera id="9" sensor_id="0" label="unaligned"/>{more}</cameras></chunk></document>'
     )
 
 
-def test_metashape_projects_as_its_manual_says(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["frame", "fisheye", "equidistant_fisheye"])
+def test_metashape_projects_as_its_manual_says(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "cameras.xml"
-    write_metashape(path, LENS, ["a.JPG", "b.JPG", "c.JPG", "d.JPG"])
+    k4 = 0.0 if kind == "frame" else -0.01
+    write_metashape(path, LENS | {"k4": k4}, ["a.JPG", "b.JPG", "c.JPG", "d.JPG"], kind=kind)
     found = read_pose_file(path, VIEWS, unknown)
     assert sorted(found) == VIEWS
     points = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 3))
     for view, (rotation, translation) in zip(VIEWS, poses(), strict=True):
         local = points @ rotation.T + translation
         x, y = local[:, 0] / local[:, 2], local[:, 1] / local[:, 2]
+        if kind != "frame":
+            x, y = np.stack([x, y]) * np.arctan(np.hypot(x, y)) / np.hypot(x, y)
         r2 = x * x + y * y
-        bend = 1 + LENS["k1"] * r2 + LENS["k2"] * r2**2 + LENS["k3"] * r2**3
+        bend = 1 + LENS["k1"] * r2 + LENS["k2"] * r2**2 + LENS["k3"] * r2**3 + k4 * r2**4
         xd = x * bend + LENS["p1"] * (r2 + 2 * x * x) + 2 * LENS["p2"] * x * y
         yd = y * bend + LENS["p2"] * (r2 + 2 * y * y) + 2 * LENS["p1"] * x * y
         u = WIDTH * 0.5 + LENS["cx"] + xd * LENS["f"] + xd * LENS["b1"]
@@ -120,6 +126,7 @@ def test_idr_cameras_belong_to_views_by_number_or_in_order(tmp_path: Path) -> No
 
 
 FOCAL = {"fl_x": 90.0, "fl_y": 92.0}
+MATRIX = [[90.0, -1e-4, 33.0], [0.0, 92.0, 23.0], [0.0, 0.0, 1.0]]
 WHOLE = {**FOCAL, "cx": 33.0, "cy": 23.0, "w": WIDTH, "h": HEIGHT}
 ANGLE = 2 * math.atan(WIDTH / 2 / 90)
 
@@ -130,7 +137,8 @@ def write_json(path: Path, top: dict, frame: dict | None = None) -> Path:
     for view, (rotation, translation) in zip(VIEWS, poses(), strict=True):
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = rotation.T, -rotation.T @ translation
-        matrix[:3, 1:3] *= -1
+        if not top.get("from_na"):
+            matrix[:3, 1:3] *= -1
         frames.append({"file_path": f"./train/{view}", "transform_matrix": matrix.tolist(), **(frame or {})})
     path.write_text(json.dumps({**top, "frames": frames}))
     return path
@@ -156,6 +164,9 @@ def write_json(path: Path, top: dict, frame: dict | None = None) -> Path:
          (90, HEIGHT / 2 / math.tan(math.radians(15)), WIDTH / 2, HEIGHT / 2)),
         ({**FOCAL, "cx": 33.0, "cy": 23.0, "aabb_scale": 16}, {}, "PINHOLE", (90, 92, 33, 23)),
         (WHOLE, {"transform_matrix_start": None, "sharpness": 3.0}, "PINHOLE", (90, 92, 33, 23)),
+        # NeuS2, with other axes, and in those of instant-ngp
+        ({"from_na": True, "w": WIDTH, "h": HEIGHT}, {"intrinsic_matrix": MATRIX}, "PINHOLE", (90, 92, 33, 23)),
+        ({"w": WIDTH, "h": HEIGHT}, {"intrinsic_matrix": MATRIX}, "PINHOLE", (90, 92, 33, 23)),
     ],
 )  # fmt: skip
 def test_every_field_of_transforms_is_used(
@@ -184,6 +195,9 @@ def test_every_field_of_transforms_is_used(
         ({"latlong": True}, {}, "latlong"),
         ({"fisheye_crop_radius": 20}, {}, "fisheye_crop_radius"),
         ({"rolling_shutter": [0, 0, 1, 0]}, {}, "rolling_shutter"),
+        ({}, {"rolling_shutter_time": 0.005}, "rolling_shutter"),
+        ({"intrinsic_matrix": MATRIX}, {}, "fl_x"),
+        ({}, {"file_path": "", "rgb_path": "a.png", "camtoworld": MATRIX}, "camtoworld, "),
         ({"normal_mts_args": {}}, {}, "normal_mts_args"),
         ({}, {"transform_matrix_end": np.diag([1.0, 1, 1, 1]).tolist()}, "transform_matrix_end"),
         # resized pictures: the angle contradicts the focal length
@@ -229,6 +243,7 @@ def test_a_size_that_the_file_lacks_is_that_of_the_pictures_it_fits(
         ("camera_mat_1", np.diag([1.8, 1.8, 1.0, 1.0]), "camera_mat_1"),
         ("camera_mat_1", np.zeros(()), "camera_mat_1"),
         ("world_mat_02", np.eye(4), "two"),
+        ("scale_mat_1", np.diag([1.0, 1.0, 2.0, 1.0]), "singular values"),
     ],
 )
 def test_idr_cameras_of_another_unit_or_number_are_refused(
@@ -236,7 +251,7 @@ def test_idr_cameras_of_another_unit_or_number_are_refused(
 ) -> None:
     np.savez(tmp_path / "c.npz", **idr_cameras(), camera_mat_0=np.eye(4), world_mat_inv_0=np.eye(4))
     read_pose_file(tmp_path / "c.npz", VIEWS, stated)
-    np.savez(tmp_path / "c.npz", **idr_cameras(), **{entry: matrix})
+    np.savez(tmp_path / "c.npz", **{**idr_cameras(), entry: matrix})
     with pytest.raises(PolarguideError) as error:
         read_pose_file(tmp_path / "c.npz", VIEWS, stated)
     assert found in error.value.found
@@ -261,6 +276,7 @@ def test_views_never_take_the_cameras_of_others_by_number(tmp_path: Path) -> Non
         ("</f>", "</f><b2>2.5</b2>", "b2 = 2.5"),
         ('calibration type="frame"', 'calibration type="fisheye"', "a fisheye camera"),
         ('type="frame"><resolution', 'type="spherical"><resolution', "a spherical camera"),
+        ('type="frame"><resolution', 'type="equisolid_fisheye"><resolution', "a equisolid_fisheye camera"),
         ("</sensor>", "<rolling_shutter>full</rolling_shutter></sensor>", "rolling_shutter"),
         ('label="a.JPG"', 'component_id="1" label="a.JPG"', "none with 3"),
         ("</chunk>", '</chunk><chunk label="C2"><cameras><camera><transform>1</transform></camera></cameras></chunk>',
@@ -290,6 +306,19 @@ def test_metashape_cameras_that_are_not_enabled_are_left_out_and_other_elements_
     texts = [str(one.message) for one in caught]
     assert any("1 cameras that are not enabled" in text for text in texts)
     assert any(text.endswith("does not use: q1.") for text in texts)
+
+
+def test_points_in_names_of_views_begin_no_suffix(tmp_path: Path) -> None:
+    """Metashape's labels have none; what has no label is no picture. Frames may be in a second list."""
+    views = ["a.left", "a.right", "b.v2", "c"]
+    write_metashape(tmp_path / "c.xml", {"f": 90.0}, ["a.left", "a.right.JPG", "b.v2", "c.png"], 2 * UNNAMED)
+    assert sorted(read_pose_file(tmp_path / "c.xml", views, unknown)) == views
+    frames = [{"file_path": f"images/{v}", "transform_matrix": np.eye(4).tolist()} for v in views]
+    (tmp_path / "t.json").write_text(json.dumps({**WHOLE, "frames": frames[:2], "test_frames": frames[2:]}))
+    assert sorted(read_pose_file(tmp_path / "t.json", views, unknown)) == views
+
+
+UNNAMED = '<camera id="7" sensor_id="0"><transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1</transform></camera>'
 
 
 @pytest.mark.parametrize(

@@ -114,8 +114,8 @@ CELLS: dict[str, tuple[str, Callable[[Path], object], str]] = {
     ),
     "pandora: no pictures": ("pandora", lambda d: shutil.rmtree(d / "images"), "intrinsics belong to, found none"),
     "pandora: another aspect": (
-        "pandora", lambda d: write_picture(d / "images" / "01.png", np.ones((50, 200, 3)), bits=8),
-        "expected the size of the pictures, 64x48.*found 200x50",
+        "pandora", lambda d: write_picture(d / "images" / "01.png", np.ones((96, 140, 3)), bits=8),
+        "expected the size of the pictures, 64x48.*found 140x96",
     ),
     "pandora: mixed sizes": (
         "pandora", lambda d: shutil.copy(
@@ -161,6 +161,8 @@ CELLS: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "gnerp: broken json": ("gnerp", lambda d: (d / "cameras.json").write_text("{"), "JSON file, found broken"),
     "gnerp: bottomless json": ("gnerp", lambda d: (d / "cameras.json").write_text("[" * 100_000), "a JSON file"),
     "gnerp: a list": ("gnerp", lambda d: (d / "cameras.json").write_text("[]"), r"found \[\]"),
+    "gnerp: degrees": ("gnerp", lambda d: multiply(d / "aop", 180 / np.pi), "expected angles in radians, found up to"),
+    "gnerp: percent": ("gnerp", lambda d: multiply(d / "dop", 100.0), "from 0 to 1, found a median of"),
     "gnerp: no intrinsics": ("gnerp", cameras(lambda c: c.pop("intrinsic")), "expected the entry intrinsic"),
     "gnerp: no cameras": ("gnerp", cameras(lambda c: c.clear()), "expected the entry w2c_mat_<i>, found no entry"),
     "gnerp: a camera too few": ("gnerp", cameras(lambda c: c.pop("w2c_mat_2")), "the entry w2c_mat_2 for view 2"),
@@ -203,6 +205,11 @@ CELLS: dict[str, tuple[str, Callable[[Path], object], str]] = {
         "pisr", npz("cameras_sphere.npz", world_mat_0=None, scale_mat_0=None), "the entry world_mat_0 for view 000"
     ),
 }  # fmt: skip
+
+
+def multiply(folder: Path, factor: float) -> None:
+    for path in folder.iterdir():
+        np.save(path, np.load(path) * factor)
 
 
 def write_hdr_of(root: Path, height: int, width: int) -> Path:

@@ -19,7 +19,7 @@ from polarguide.capture.filter.develop import (
 )
 from polarguide.capture.filter.shots import Shots
 from polarguide.capture.formats.icc import stated_exponent
-from polarguide.capture.formats.pictures import decode_picture
+from polarguide.capture.formats.pictures import decode_mask, decode_picture
 from polarguide.capture.pair_sums import measured_gains, pair_moments
 from polarguide.capture.sensor.defects import defects
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
@@ -129,6 +129,20 @@ def test_transparent_gray_tiff_is_refused(tmp_path):
     with pytest.raises(PolarguideError) as caught:
         decode_picture(path, path.read_bytes())
     assert "transparent" in caught.value.found
+
+
+@pytest.mark.parametrize("levels", [(1, 2, 3), (80, 160, 240)])
+def test_labels_of_objects_are_no_mask(tmp_path, levels):
+    """The lower half of them would be taken for background; soft edges are none."""
+    path = tmp_path / "v.png"
+    discs = [np.hypot(*(np.mgrid[:60, :90] - np.array([[[30]], [[15 + 30 * k]]]))) < 9 for k in range(3)]
+    cv2.imwrite(str(path), np.sum([d * v for d, v in zip(discs, levels, strict=True)], 0).astype(np.uint8))
+    with pytest.raises(PolarguideError) as caught:
+        decode_mask(path, path.read_bytes(), any_value=False)
+    assert f"areas of {levels[0]} beside a maximum of {levels[2]}" in caught.value.found
+    cv2.imwrite(str(path), cv2.GaussianBlur(np.any(discs, 0) * np.uint8(255), (0, 0), 3))
+    off = decode_mask(path, path.read_bytes(), any_value=False) ^ np.any(discs, 0)
+    assert off.mean() < 0.04
 
 
 @pytest.mark.parametrize("bits", [10, 12, 14])

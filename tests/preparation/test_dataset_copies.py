@@ -10,7 +10,17 @@ import cv2
 import numpy as np
 import pytest
 from camera_files import write_model
-from dataset_files import HEIGHT, WIDTH, WRITERS, disc, light_of, poses, write_nersp, write_pandora
+from dataset_files import (
+    HEIGHT,
+    WIDTH,
+    WRITERS,
+    disc,
+    idr_cameras,
+    light_of,
+    poses,
+    write_nersp,
+    write_pandora,
+)
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.datasets.dataset import Dataset, read_mask
@@ -73,6 +83,21 @@ def mapped(root: Path) -> None:
         assert cv2.imwrite(str(root / "input_azimuth_maps" / f"{index:04d}.png"), pixels)
 
 
+def masks_from(first: int) -> Change:
+    """Masks of three digits, which count from ``first``."""
+
+    def change(root: Path) -> None:
+        for index, path in enumerate(sorted((root / "mask").iterdir())):
+            path.rename(path.with_name(f"{index + first:03d}.png"))
+
+    return change
+
+
+def cameras_of_light(root: Path) -> None:
+    """Intrinsics of the size of the Stokes vectors, beside pictures of twice this size."""
+    np.savez(root / "cameras.npz", **idr_cameras())
+
+
 ALL = (0, 1, 2, 3)
 POLGS = {"image": "train", "input_azimuth_maps": "train_input_azimuth_maps"}
 CASES: dict[str, tuple[str, tuple[Change, ...], tuple[int, ...]]] = {
@@ -84,6 +109,8 @@ CASES: dict[str, tuple[str, tuple[Change, ...], tuple[int, ...]]] = {
     "pandora, padded, without the last": ("pandora", (renumbered("%02d", 1), removed("*/04*")), (0, 1, 2)),
     "pandora, from 0, without the first": ("pandora", (removed("*/01*"),), (1, 2, 3)),
     "pandora, from 0, without the last": ("pandora", (removed("*/04*"),), (0, 1, 2)),
+    "pandora, masks of other digits": ("pandora", (masks_from(1),), ALL),
+    "pandora, resized pictures": ("pandora", (cameras_of_light,), ALL),
     "pandora in NeRSP": ("pandora", (mapped,), ALL),
     "pandora in PolGS": (
         "pandora",
@@ -121,6 +148,7 @@ def test_every_view_has_its_light_its_camera_and_its_mask(tmp_path: Path, case: 
         camera = dataset.cameras[view]
         np.testing.assert_allclose(camera.rotation, rotation, atol=1e-6)
         np.testing.assert_allclose(camera.translation, translation, atol=1e-6)
+        assert camera.parameters[2] / camera.width == pytest.approx(33 / WIDTH)
         assert dataset.read_stokes is not None
         stokes, _ = dataset.read_stokes(view)
         s0, s1, s2 = light_of(index)
@@ -130,6 +158,20 @@ def test_every_view_has_its_light_its_camera_and_its_mask(tmp_path: Path, case: 
         np.testing.assert_array_equal(
             dataset.read_mask(dataset.masks[view]), np.roll(disc(), shifted, axis=1)
         )
+
+
+def test_sizes_that_no_principal_point_fits_are_warned_of(tmp_path: Path) -> None:
+    def shrink(root: Path) -> None:
+        for path in (root / "images").iterdir():
+            assert cv2.imwrite(str(path), cv2.imread(str(path))[::2, ::2])
+
+    with pytest.warns(PolarguideWarning, match="far from the middle of the pictures, 64x48"):
+        changed(tmp_path / "in", "pandora", (shrink,))
+
+
+def test_no_view_takes_the_mask_of_another_by_number(tmp_path: Path) -> None:
+    with pytest.warns(PolarguideWarning, match=r"no mask called like 4 of 4 views \(01, 02, 03, 04\)"):
+        assert not changed(tmp_path / "in", "pandora", (masks_from(0),)).masks
 
 
 def test_a_missing_camera_is_named_and_no_view_is_to_be_removed(tmp_path: Path) -> None:

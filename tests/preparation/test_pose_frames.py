@@ -9,7 +9,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_files import ANGLES, behind, read_polar, smooth_light, write_model, write_shots
+from camera_files import (
+    ANGLES,
+    behind,
+    read_mask,
+    read_polar,
+    smooth_light,
+    write_model,
+    write_picture,
+    write_shots,
+)
 from heard import Heard
 from test_prepare_filter import with_orientation
 
@@ -75,6 +84,27 @@ def test_pictures_are_those_that_the_poses_are_of(
     assert inner == pytest.approx([larger * number for number in numbers])
     (line,) = [text for text in heard.said if text.startswith("EXIF orientation of 3 of 3 views")]
     assert f"--poses-of {'displayed' if as_stored else 'stored'}" in line
+
+
+@pytest.mark.parametrize("code", [5, 6, 8])
+@pytest.mark.parametrize("as_stored", [True, False])
+@pytest.mark.parametrize("mask_as_stored", [True, False])
+def test_masks_follow_their_pictures(
+    tmp_path: Path, code: int, as_stored: bool, mask_as_stored: bool
+) -> None:
+    """Masks of displayed pictures beside pictures as stored, and the reverse: by their size."""
+    write_turned(tmp_path / "in", code, (128, 96))
+    mask = np.zeros((96, 128), bool)
+    mask[10:40, 20:90] = True
+    drawn = mask if mask_as_stored else apply_orientation(mask, code)
+    for name in NAMES:
+        write_picture(tmp_path / "masks" / f"{name}.png", drawn.astype(float), bits=8)
+    model = write_model(tmp_path / "model", NAMES, "PINHOLE 128 96 110 112 61 50")
+    poses = str(model) if as_stored else "none"
+    settings = replace(SETTINGS, poses=poses, masks=str(tmp_path / "masks"))
+    prepare_scene(tmp_path / "in", tmp_path / "out", settings)
+    expected = mask if as_stored else apply_orientation(mask, code)
+    assert (read_mask(tmp_path / "out", "v001") == expected).all()
 
 
 def test_pictures_that_were_turned_before_poses_were_there_are_written_anew(tmp_path: Path) -> None:

@@ -53,6 +53,9 @@ NAMES = ("v000", "v001", "v002")
         ("half", "SIMPLE_PINHOLE 128 96 160 66 50", (40, 40, 16.5, 12.5)),
         ("quarter", "PINHOLE 64 48 80 82 33 25", (20, 20.5, 8.25, 6.25)),
         ("full", "SIMPLE_RADIAL 64 48 80 33 25 0", (80, 80, 33, 25)),
+        # of pictures of 1.55 times the size, and of 0.64, both rounded to whole pixels
+        ("full", "PINHOLE 99 74 99 74 49.5 37", (64, 48, 32, 24)),
+        ("full", "PINHOLE 41 30 41 30 20.5 15", (64, 48, 32, 24)),
     ],
 )
 def test_intrinsics_follow_the_size(
@@ -90,7 +93,30 @@ def test_views_without_a_pose_are_left_out_and_named(tmp_path: Path) -> None:
     done = prepare_scene(tmp_path / "in", tmp_path / "out", replace(MOSAIC, poses=str(model)), heard)
     assert done.left_out == ["v002"]
     assert any("1 of 4 views have no pose and are left out (v002)" in text for text in heard.said)
+    assert not any("another model" in text for text in heard.said)
     assert len(load_scene(tmp_path / "out").views) == 3
+
+
+def test_views_that_are_in_the_model_beside_are_told(tmp_path: Path) -> None:
+    write_mosaics(tmp_path / "in", 4)
+    for number, names in enumerate((NAMES, (*NAMES, "v003"))):
+        write_model(tmp_path / "sparse" / str(number), names, "PINHOLE 64 48 80 82 32 24")
+    heard = Heard()
+    settings = replace(MOSAIC, poses=str(tmp_path))
+    assert prepare_scene(tmp_path / "in", tmp_path / "out", settings, heard).left_out == ["v003"]
+    assert any(f"{tmp_path / 'sparse' / '1'} is another model, with 4 views" in text for text in heard.said)
+
+
+@pytest.mark.parametrize(
+    ("camera", "found"), [("PINHOLE 67 50 80 82 33 25", "67x50"), ("PINHOLE 99 80 99 74 49 37", "99x80")]
+)
+def test_sizes_of_a_crop_are_refused(tmp_path: Path, camera: str, found: str) -> None:
+    write_mosaics(tmp_path / "in")
+    model = write_model(tmp_path / "model", NAMES, camera)
+    settings = replace(MOSAIC, demosaic="full", poses=str(model))
+    with pytest.raises(PolarguideError) as error:
+        prepare_scene(tmp_path / "in", tmp_path / "out", settings)
+    assert error.value.found == found
 
 
 def test_one_map_undistorts_all_four_intensities(tmp_path: Path) -> None:
@@ -189,6 +215,23 @@ def test_wrong_use_is_told(tmp_path: Path, changes: dict[str, Any], words: str) 
     with pytest.raises(PolarguideError, match=words):
         prepare_scene(tmp_path / "in", tmp_path / "out", replace(FILTER, **changes))
     assert not (tmp_path / "out").exists()
+
+
+def test_masks_are_called_as_colmap_and_metashape_call_them(tmp_path: Path) -> None:
+    disc = np.hypot(*(np.mgrid[:48, :64] - np.array([20, 30])[:, None, None])) < 12
+    names = {"v0": "v0", "v1": "v1.png", "v2": "v2_mask", "v3.JPG": "v3.JPG"}
+    for view, name in names.items():
+        write_shots(tmp_path / "in", view, behind(smooth_light()))
+        shifted = np.roll(disc, 3 * len(name), axis=1)
+        write_picture(tmp_path / "masks" / f"{name}.png", shifted.astype(float), bits=8)
+    write_shots(tmp_path / "in", "v4", behind(smooth_light()))
+    write_picture(tmp_path / "masks" / "v4.png", np.zeros((48, 64)), bits=8)
+    settings = replace(FILTER, masks=str(tmp_path / "masks"), poses="none")
+    heard = Heard()
+    prepare_scene(tmp_path / "in", tmp_path / "out", settings, heard)
+    assert [text for text in heard.said if "mask" in text] == ["v4: its mask shows no object."]
+    for view, name in names.items():
+        assert (read_mask(tmp_path / "out", view) == np.roll(disc, 3 * len(name), axis=1)).all()
 
 
 def test_masks_have_to_fit(tmp_path: Path) -> None:

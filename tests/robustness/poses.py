@@ -93,7 +93,7 @@ CASES += table(
     Case("of a width of infinity", _written(_xml(w="inf")), ci=True),
     Case("of a width of words", _written(_xml(w="wide")), ci=True),
     Case("of a skew", _written(_xml(lens="<b2>10</b2>"))),
-    Case("of a fisheye", _written(_xml(kind="fisheye"))),
+    Case("of a fisheye", _written(_xml(kind="equisolid_fisheye"))),
     Case("of a camera twice", _written(_xml(cameras=2 * _camera('sensor_id="0" label="v001"'))), ci=True),
     Case("of a camera without a sensor", _written(_xml(cameras=_camera('sensor_id="9" label="v001"')))),
 )  # fmt: skip

@@ -14,6 +14,14 @@ Sizes = Callable[[str], tuple[Size, ...]]
 _OFF_CENTER = 0.125
 
 
+def is_centered(size: Size, center: tuple[float | None, float | None]) -> bool:
+    """Whether a principal point, as far as it is known, lies near the middle of a picture."""
+    return all(
+        place is None or abs(place - side / 2) <= _OFF_CENTER * side
+        for place, side in zip(center, size, strict=True)
+    )
+
+
 def settled_size(
     where: object, sizes: Sequence[Size], center: tuple[float | None, float | None], *, in_pixels: bool
 ) -> Size:
@@ -31,14 +39,7 @@ def settled_size(
     expected = "width and height of the pictures that the camera was made for, w and h"
     if not sizes:
         raise wrong_camera(where, expected, "none")
-    fitting = [
-        size
-        for size in sizes
-        if all(
-            place is None or abs(place - side / 2) <= _OFF_CENTER * side
-            for place, side in zip(center, size, strict=True)
-        )
-    ]
+    fitting = [size for size in sizes if is_centered(size, center)]
     named = " or ".join(f"{width}x{height}" for width, height in sizes)
     if not fitting:
         raise wrong_camera(

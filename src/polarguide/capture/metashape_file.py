@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from polarguide.capture.colmap.files import PosedCamera
 from polarguide.capture.colmap.model import view_of_name
 from polarguide.capture.datasets.dataset import require_known_names
 from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
-from polarguide.capture.transforms_file import camera_to_world
+from polarguide.capture.transforms_file import brown_camera, camera_to_world
 from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import read_file
@@ -25,6 +25,8 @@ _LARGEST_XML = 1 << 24
 _LENS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 # Pixels by which skew may move those at the edge of the picture: less than what two ways to count pixels differ by.
 _LARGEST_SKEW = 0.25
+# Fisheyes are equidistant, under their name since version 2.3.
+_EQUIDISTANT = ("fisheye", "equidistant_fisheye")
 _OFF = ("", "0", "false", "none", "disabled")
 _READ = {
     "sensor": {"resolution", "calibration", "rolling_shutter"},
@@ -48,8 +50,12 @@ _IRRELEVANT = {
 }  # fmt: skip
 
 
-def read_metashape(path: Path) -> dict[str, PosedCamera]:
-    """Cameras by their labels, without the suffix of a picture.
+def read_metashape(path: Path, views: Collection[str]) -> dict[str, PosedCamera]:
+    """Cameras by the views that their labels mean.
+
+    Args:
+        path: the file.
+        views: names of the capture's views.
 
     Raises:
         PolarguideError: the file cannot be read, or its cameras are not all in one frame, or have another lens.
@@ -57,7 +63,8 @@ def read_metashape(path: Path) -> dict[str, PosedCamera]:
     chunk = _chunk(path, _parsed(path))
     cameras = list(chunk.iter("camera"))
     enabled = [camera for camera in cameras if camera.get("enabled", "true") not in _OFF]
-    posed = [camera for camera in enabled if camera.findtext("transform") is not None]
+    # Cameras without a label are of no picture.
+    posed = [camera for camera in enabled if camera.get("label") and camera.findtext("transform") is not None]
     _require_one_component(path, chunk, posed)
     if len(enabled) < len(cameras):
         _warn(path, f"{len(cameras) - len(enabled)} cameras that are not enabled, which are left out")
@@ -71,7 +78,7 @@ def read_metashape(path: Path) -> dict[str, PosedCamera]:
     found: dict[str, PosedCamera] = {}
     for camera in posed:
         label = camera.get("label") or ""
-        where, view = f"{path} (camera {label})", view_of_name(label)
+        where, view = f"{path} (camera {label})", view_of_name(label, views)
         sensor = sensors.get(camera.get("sensor_id"))
         if sensor is None:
             raise wrong_camera(where, "the sensor it names", "none")
@@ -80,8 +87,8 @@ def read_metashape(path: Path) -> dict[str, PosedCamera]:
         _require_known(path, camera, sensor)
         text = camera.findtext("transform") or ""
         numbers = finite_numbers(where, [number_or_nan(part) for part in text.split()], ((16,),))
-        size, inner, radial = _lens_of(where, sensor)
-        found[view] = camera_to_world(where, size, inner, radial, numbers.reshape(4, 4))
+        size, lens = _lens_of(where, sensor)
+        found[view] = camera_to_world(where, size, lens, numbers.reshape(4, 4))
     return found
 
 
@@ -154,18 +161,23 @@ def _require_known(path: Path, camera: ElementTree.Element, sensor: ElementTree.
         require_known_names(path, names - _READ[kind] - _IRRELEVANT[kind])
 
 
-def _lens_of(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[float, ...], list[float]]:
-    """Size, intrinsics and OpenCV's coefficients of a sensor; the adjusted calibration goes first.
+def _lens_of(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[str, tuple[float, ...]]]:
+    """Size of a sensor, and COLMAP's model of its lens with parameters; the adjusted calibration goes first.
+
+    Metashape's p1 bends along x, and so does p2 of OpenCV and COLMAP. Its fisheye distorts the angle from the axis by
+    the same terms as a frame camera its tangent.
 
     Raises:
-        PolarguideError: the lens is not that of a frame camera, or has terms that OpenCV's does not have.
+        PolarguideError: it is a panorama or another lens that is not read, or has terms that COLMAP's does not have.
     """
     calibrations = sensor.findall("calibration")
     adjusted = [c for c in calibrations if c.get("class") == "adjusted"]
     best = next(iter(adjusted or calibrations), None)
     kinds = {sensor.get("type", "frame"), *([] if best is None else [best.get("type", "frame")])}
-    if kinds != {"frame"}:
-        raise wrong_camera(where, "a frame camera", f"a {' and '.join(sorted(kinds - {'frame'}))} camera")
+    fisheye = kinds <= set(_EQUIDISTANT)
+    if kinds != {"frame"} and not fisheye:
+        found = f"a {' and '.join(sorted(kinds - {'frame'}))} camera"
+        raise wrong_camera(where, f"a camera of the type frame, {' or '.join(_EQUIDISTANT)}", found)
     resolution = None if best is None else best.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     if best is None or resolution is None or best.findtext("f") is None:
@@ -176,19 +188,31 @@ def _lens_of(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[float, ...
     if not (1 <= width < 1e5 and 1 <= height < 1e5 and value["f"] > 0):
         found = f"{width:g}x{height:g}, f = {value['f']:g}"
         raise wrong_camera(where, "a size and a positive focal length", found)
+    _require_terms(where, value, height, ("p3", "p4") if fisheye else ("k4", "p3", "p4"))
+    inner = (value["f"] + value["b1"], value["f"], width / 2 + value["cx"], height / 2 + value["cy"])
+    names = ("k1", "k2", "p2", "p1", "k3")
+    terms = [value[name] for name in names]
+    if fisheye:
+        return (int(width), int(height)), ("THIN_PRISM_FISHEYE", (*inner, *terms, value["k4"], 0.0, 0.0))
+    return (int(width), int(height)), brown_camera(inner, terms)
+
+
+def _require_terms(where: str, value: Mapping[str, float], height: float, others: Sequence[str]) -> None:
+    """Refuse a lens with terms that its model does not have: ``others``, and a skew that moves pixels.
+
+    Raises:
+        PolarguideError: it has one.
+    """
     skew = abs(value["b2"]) * height / 2 / value["f"]
-    others = [name for name in ("k4", "p3", "p4") if value[name]] + ["b2"] * (skew > _LARGEST_SKEW)
-    if others:
-        found = ", ".join(f"{name} = {value[name]:g}" for name in others)
+    named = [name for name in others if value[name]] + ["b2"] * (skew > _LARGEST_SKEW)
+    if named:
+        terms = [name for name in _LENS if name not in (*others, "b2")]
         raise PolarguideError(
             where,
-            expected="a lens with f, cx, cy, b1, k1, k2, k3, p1 and p2",
-            found=found,
+            expected=f"a lens with {listed(terms, len(terms))}",
+            found=", ".join(f"{name} = {value[name]:g}" for name in named),
             remedy="Optimize the cameras in Metashape without these terms, and export them again.",
         )
-    inner = (value["f"] + value["b1"], value["f"], width / 2 + value["cx"], height / 2 + value["cy"])
-    # Metashape's p1 bends along x, OpenCV's p2 does.
-    return (int(width), int(height)), inner, [value[name] for name in ("k1", "k2", "p2", "p1", "k3")]
 
 
 def _parsed(path: Path) -> ElementTree.Element:

@@ -30,7 +30,8 @@ def read_pose_file(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, 
     suffix = path.suffix.lower()
     if suffix == ".npz":
         return _idr(path, views, sizes)
-    found = read_metashape(path) if suffix == ".xml" else read_transforms(path, sizes)
+    names = frozenset(views)
+    found = read_metashape(path, names) if suffix == ".xml" else read_transforms(path, names, sizes)
     if not found:
         raise PolarguideError(
             path,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,8 +19,9 @@ from msgspec import Meta
 from polarguide.capture.camera_sizes import Size, Sizes, settled_size
 from polarguide.capture.colmap.files import PosedCamera
 from polarguide.capture.colmap.model import view_of_name
-from polarguide.capture.datasets.dataset import checked_pose, require_known_names
+from polarguide.capture.datasets.dataset import checked_intrinsics, checked_pose, require_known_names
 from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
+from polarguide.capture.view import listed
 from polarguide.core.records import decode, read_record
 
 _SQUARE = ((3, 4), (4, 4))
@@ -39,6 +40,7 @@ class _Lens(msgspec.Struct):
     camera_model: str | None = None
     fl_x: float | None = None
     fl_y: float | None = None
+    intrinsic_matrix: list[list[float]] | None = None
     cx: float | None = None
     cy: float | None = None
     w: float | None = None
@@ -58,6 +60,7 @@ class _Lens(msgspec.Struct):
     k5: float | None = None
     k6: float | None = None
     rolling_shutter: list[float] | None = None
+    rolling_shutter_time: float | None = None
     ftheta_p0: float | None = None
     latlong: Any = None
     equirectangular: Any = None
@@ -73,8 +76,10 @@ class _Frame(_Lens):
 
 class _Transforms(_Lens):
     frames: Annotated[list[_Frame], Meta(max_length=MOST_FRAMES)] = []
+    test_frames: Annotated[list[_Frame], Meta(max_length=MOST_FRAMES)] = []
     camera: Any = None
     normal_mts_args: Any = None
+    from_na: bool | None = None
 
 
 # What these say changes no camera: where a program puts the scene, what it trains on, depth, masks and points.
@@ -86,15 +91,17 @@ _IRRELEVANT = {
     "integer_depth_scale", "depth_unit_scale_factor", "sharpness_discard_threshold", "train_filenames",
     "val_filenames", "test_filenames", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4", "rotation",
     "sharpness", "time", "mask_path", "depth_file_path", "depth_path", "normal_file_path", "semantics_path",
-    "segmentation_path", "colmap_im_id", "camera_id", "driver_parameters", "bg_color",
+    "segmentation_path", "colmap_im_id", "camera_id", "driver_parameters", "bg_color", "has_mask", "is_bad",
+    "camera_linear_velocity", "camera_angular_velocity", "exposure_time", "motion_blur_score",
 }  # fmt: skip
 
 
-def read_transforms(path: Path, sizes: Sizes) -> dict[str, PosedCamera]:
-    """Cameras by the names of the frames' files.
+def read_transforms(path: Path, views: Collection[str], sizes: Sizes) -> dict[str, PosedCamera]:
+    """Cameras by the views that the names of the frames' files mean.
 
     Args:
         path: the file.
+        views: names of the capture's views.
         sizes: what a view's camera may have been made for, where the file does not say.
 
     Raises:
@@ -102,43 +109,63 @@ def read_transforms(path: Path, sizes: Sizes) -> dict[str, PosedCamera]:
     """
     content = read_record(path, dict[str, Any], remedy="Export transforms.json again.")
     record = decode(content, _Transforms, path, remedy="Export transforms.json again.")
-    names = set(content) | {name for frame in content.get("frames", ()) for name in frame}
-    known = {*_Transforms.__struct_fields__, *_Frame.__struct_fields__, *_IRRELEVANT}
-    require_known_names(path, names - known)
+    listed_frames = [frame for key in ("frames", "test_frames") for frame in content.get(key, ())]
+    names = set(content).union(*listed_frames)
     if record.camera is not None or record.normal_mts_args is not None:
         name = "camera" if record.camera is not None else "normal_mts_args"
         raise wrong_camera(path, "cameras that look along -z with y up (OpenGL)", f"{name}, of other axes")
     found: dict[str, PosedCamera] = {}
-    for number, frame in enumerate(record.frames):
+    for number, frame in enumerate((*record.frames, *record.test_frames)):
         where = f"{path} (frame {number}, {frame.file_path})"
-        view = view_of_name(frame.file_path)
+        if not frame.file_path:
+            named = listed(sorted(listed_frames[number]))
+            raise wrong_camera(where, "file_path and transform_matrix, as nerfstudio writes them", named)
+        view = view_of_name(frame.file_path, views)
         if view in found:
             raise wrong_camera(where, f"one frame called {view}", "two")
-        lens = _lens_of(frame, record)
-        found[view] = _camera_of(where, lens, _pose_of(where, frame), functools.partial(sizes, view))
+        lens = _lens_of(where, frame, record)
+        # NeuS2 says by ``from_na`` that its axes are right, down, forward.
+        to_world = _pose_of(where, frame) @ (np.eye(4) if record.from_na else _OPENGL)
+        found[view] = _camera_of(where, lens, to_world, functools.partial(sizes, view))
+    known = {*_Transforms.__struct_fields__, *_Frame.__struct_fields__, *_IRRELEVANT}
+    require_known_names(path, names - known)
     return found
 
 
-_FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
+_MATRIX = ("fl_x", "fl_y", "cx", "cy")
+_FOCAL = ("fl_x", "fl_y", "intrinsic_matrix", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
-def _lens_of(frame: _Lens, record: _Lens) -> dict[str, Any]:
-    """The fields of a frame's lens: its own, else those of the file.
+def _lens_of(where: str, frame: _Lens, record: _Lens) -> dict[str, Any]:
+    """The fields of a frame's lens: its own, else those of the file; ``intrinsic_matrix`` as the four numbers it holds.
 
     Focal lengths and coefficients are statements as a whole: a frame that makes one takes nothing of the file's.
+
+    Raises:
+        PolarguideError: the matrix is none of a camera, or stands beside other numbers.
     """
     lens = {name: getattr(frame, name) for name in _Lens.__struct_fields__}
     whole = (_FOCAL, (*_COEFFICIENTS, "distortion_params"))
     stated = {name for names in whole if any(lens[n] is not None for n in names) for name in names}
-    return {
+    used = {
         name: getattr(record, name) if own is None and name not in stated else own
         for name, own in lens.items()
     }
+    if used["intrinsic_matrix"] is None:
+        return used
+    beside = {name: used[name] for name in (*_FOCAL, *_MATRIX) if name != "intrinsic_matrix"}
+    named = [name for name, number in beside.items() if number is not None]
+    if named:
+        raise wrong_camera(where, "intrinsic_matrix alone", f"{', '.join(named)} beside it")
+    matrix = finite_numbers(where, used["intrinsic_matrix"], ((3, 3), *_SQUARE))[:3, :3]
+    inner = checked_intrinsics(where, matrix)
+    numbers = (inner[0, 0], inner[1, 1], inner[0, 2], inner[1, 2])
+    return used | dict(zip(_MATRIX, map(float, numbers), strict=True))
 
 
 def _pose_of(where: str, frame: _Frame) -> Any:
-    """The matrix from the camera to the world, [4, 4], with axes right, down, forward."""
+    """The matrix from the camera to the world, [4, 4], with the axes of the file."""
     given = [
         matrix
         for matrix in (frame.transform_matrix, frame.transform_matrix_start, frame.transform_matrix_end)
@@ -148,7 +175,7 @@ def _pose_of(where: str, frame: _Frame) -> Any:
     if any(not np.allclose(numbers[0], other) for other in numbers[1:]):
         found = "transform_matrix_start and transform_matrix_end that differ"
         raise wrong_camera(where, "a camera that stands still", found)
-    return np.vstack([numbers[0], [0, 0, 0, 1]]) @ _OPENGL
+    return np.vstack([numbers[0], [0, 0, 0, 1]])
 
 
 def _camera_of(
@@ -164,7 +191,9 @@ def _camera_of(
         size = settled_size(where, sizes(), center, in_pixels=in_pixels)
     focal = _focal_lengths(where, lens, size, fisheye)
     middle = [size[k] / 2 if center[k] is None else float(center[k]) for k in range(2)]
-    return camera_to_world(where, size, (*focal, *middle), coefficients, to_world, fisheye=fisheye)
+    inner = (*focal, *middle)
+    lens_model = (_FISHEYE, (*inner, *coefficients)) if fisheye else brown_camera(inner, coefficients)
+    return camera_to_world(where, size, lens_model, to_world)
 
 
 def _is_fisheye(where: str, lens: Mapping[str, Any]) -> bool:
@@ -179,7 +208,7 @@ def _is_fisheye(where: str, lens: Mapping[str, Any]) -> bool:
     named = next((name for name in others if lens[name]), None)
     if named is not None:
         raise wrong_camera(where, expected, f"{named} {lens[named]}")
-    if any(lens["rolling_shutter"] or ()):
+    if any(lens["rolling_shutter"] or ()) or lens["rolling_shutter_time"]:
         raise wrong_camera(where, "a shutter that opens for all rows at once", "rolling_shutter")
     if model is not None and model not in (*_PERSPECTIVE, _FISHEYE):
         raise wrong_camera(where, expected, model)
@@ -197,16 +226,16 @@ def _distortion(where: str, lens: Mapping[str, Any], fisheye: bool) -> list[floa
     """
     given = [lens[name] for name in _COEFFICIENTS]
     value = [float(number or 0.0) for number in given]
-    listed = lens["distortion_params"]
-    if listed is not None:
-        if len(listed) != len(_COEFFICIENTS):
+    params = lens["distortion_params"]
+    if params is not None:
+        if len(params) != len(_COEFFICIENTS):
             raise wrong_camera(
-                where, "six distortion_params: k1, k2, k3, k4, p1, p2", f"{len(listed)} numbers"
+                where, "six distortion_params: k1, k2, k3, k4, p1, p2", f"{len(params)} numbers"
             )
-        if any(own is not None and own != other for own, other in zip(given, listed, strict=True)):
-            found = f"{listed} beside {dict(zip(_COEFFICIENTS, given, strict=True))}"
+        if any(own is not None and own != other for own, other in zip(given, params, strict=True)):
+            found = f"{params} beside {dict(zip(_COEFFICIENTS, given, strict=True))}"
             raise wrong_camera(where, "distortion_params that agree with k1 to p2", found)
-        value = [float(number) for number in listed]
+        value = [float(number) for number in params]
     k1, k2, k3, k4, p1, p2 = value
     if fisheye:
         if p1 or p2:
@@ -262,21 +291,24 @@ def _focal_lengths(
     return float(x or y or 0.0), float(y or x or 0.0)
 
 
+def brown_camera(inner: Sequence[float], coefficients: Sequence[float]) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's model and parameters of a perspective camera with OpenCV's k1, k2, p1, p2 and k3.
+
+    ``inner``: focal lengths and principal point.
+    """
+    if not any(coefficients):
+        return "PINHOLE", tuple(inner)
+    return "FULL_OPENCV", (*inner, *coefficients, 0.0, 0.0, 0.0)
+
+
 def camera_to_world(
-    where: str,
-    size: tuple[int, int],
-    inner: tuple[float, ...],
-    coefficients: list[float],
-    to_world: Any,
-    *,
-    fisheye: bool = False,
+    where: str, size: tuple[int, int], lens: tuple[str, tuple[float, ...]], to_world: Any
 ) -> PosedCamera:
     """A camera from its pose in the world.
 
     Args:
         where: for messages. size: width and height.
-        inner: focal lengths and principal point; pixel centers at 0.5.
-        coefficients: OpenCV's k1, k2, p1, p2, k3, or k1 to k4 of a fisheye.
+        lens: COLMAP's model and its parameters; pixel centers at 0.5.
         to_world: [4, 4], with axes right, down, forward; a scale is taken out.
 
     Raises:
@@ -287,9 +319,4 @@ def camera_to_world(
         raise wrong_camera(where, "a rotation and a translation", "a singular matrix")
     axes, center = checked_pose(where, np.column_stack([to_world[:3, :3] / scale, to_world[:3, 3]]))
     rotation = axes.T
-    pose = (rotation, -rotation @ center)
-    if fisheye:
-        return PosedCamera(*size, "OPENCV_FISHEYE", (*inner, *coefficients), *pose)
-    if not any(coefficients):
-        return PosedCamera(*size, "PINHOLE", tuple(inner), *pose)
-    return PosedCamera(*size, "FULL_OPENCV", (*inner, *coefficients, 0.0, 0.0, 0.0), *pose)
+    return PosedCamera(*size, *lens, rotation, -rotation @ center)

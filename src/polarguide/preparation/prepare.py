@@ -155,6 +155,7 @@ def _write_scene(
         reporter.warn(
             f"{len(poses.missing)} of {len(pictures.views)} views have no pose and are left out "
             f"({listed(poses.missing)})."
+            + "".join(f" {folder} is another model, with {count} views." for folder, count in poses.others())
         )
     _write_views(folder, pictures, poses, reporter)
     if note := _turns(folder):
@@ -244,7 +245,9 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
     for text in faults[:_NOTES]:
         reporter.warn(text)
     if len(faults) > _NOTES:
-        reporter.warn(f"{len(faults) - _NOTES} more views are black or saturated; {SCENE} has their figures.")
+        reporter.warn(
+            f"{len(faults) - _NOTES} more views are black, saturated or masked; {SCENE} has their figures."
+        )
     for note in notes[:_NOTES]:
         reporter.say(note)
     if len(notes) > _NOTES:
@@ -265,7 +268,7 @@ def _write_view(
         warped = warp.record()
     record = {**done.record, "geometry": asdict(done.geometry), "warp": warped}
     folder.write_view(view, intensities, invalid, record, mask, done.angles)
-    faults = []
+    faults = [] if mask is None or mask.any() else [f"{view}: its mask shows no object."]
     if record["clipped_share"] > MOSTLY:
         faults.append(f"{view}: {record['clipped_share']:.0%} of its pixels are saturated.")
     elif not all(picture.any() for picture in intensities):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import Sense, oriented
 from polarguide.capture.colmap.files import PosedCamera
+from polarguide.capture.colmap.model import view_of_name
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.datasets.dataset import Dataset, not_as_published, read_mask, resized_mask
 from polarguide.capture.datasets.sense import RimAgreement, rim_agreement, sense_of_rims
 from polarguide.capture.exposures import Angle
-from polarguide.capture.filter.exif import QUARTER_TURNS
+from polarguide.capture.filter.exif import INVERSE, QUARTER_TURNS, apply_orientation
 from polarguide.capture.formats.pictures import SUFFIXES, stated_size
 from polarguide.capture.memory import require_memory_of_each
 from polarguide.capture.view import listed
@@ -117,6 +118,18 @@ class Source(Protocol):
         return False
 
 
+def _views_of_masks(files: Iterable[Path], views: Sequence[str]) -> dict[str, Path]:
+    """Masks by view: called like it, as COLMAP and Metashape name masks (``cup.jpg.png``, ``cup_mask.png``), or so."""
+    found: dict[str, Path] = {}
+    pictures = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
+    for shorten in (str, view_of_name, lambda name: name.removesuffix("_mask")):
+        for path in pictures:
+            view = shorten(path.stem)
+            if view in views:
+                found.setdefault(view, path)
+    return found
+
+
 class MaskedSource(Source):
     """A source with object masks from a folder; the object is where a mask has at least half of its maximum."""
 
@@ -137,13 +150,12 @@ class MaskedSource(Source):
                 found=f"{folder}, which is not a folder",
                 remedy="Give the folder that holds <view>.png.",
             )
-        found = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix.lower() in SUFFIXES}
-        self._masks = {view: found[view] for view in pictures.views if view in found}
+        self._masks = _views_of_masks(folder.iterdir(), pictures.views)
         if not self._masks:
             raise PolarguideError(
                 folder,
                 expected=f"masks named like the views ({listed(pictures.views, 3)})",
-                found=listed(sorted(found), 3) or "no picture",
+                found=listed(sorted(path.name for path in folder.iterdir()), 3) or "no file",
                 remedy="Rename them; views without a mask are used whole.",
             )
         self._pictures = pictures
@@ -180,14 +192,28 @@ class MaskedSource(Source):
         """
         done = self._pictures.develop(view, measured)
         path = self._masks.get(view)
-        return done if path is None else replace(done, mask=_fitted(path, done))
+        if path is None:
+            return done
+        code = self.stored(view).orientation
+        return replace(done, mask=_fitted(path, done, INVERSE[code] if self.used_as_stored(view) else code))
 
 
-def _fitted(path: Path, view: DevelopedView) -> NDArray[np.bool_]:
-    """A mask at the size of the developed picture: True where at least half of a pixel is object."""
+def _fitted(path: Path, view: DevelopedView, code: int) -> NDArray[np.bool_]:
+    """A mask at the size of the developed picture: True where at least half of a pixel is object.
+
+    Masks are of the picture as it is used; if width and height are exchanged, of the other way that its orientation tag
+    allows.
+
+    Args:
+        path: its file. view: the developed picture.
+        code: orientation that makes the used picture of the other one.
+    """
     mask = read_mask(path)
     geometry = view.geometry
-    size = (mask.shape[1], mask.shape[0])
+    turned, size = mask.shape, mask.shape[::-1]
+    fitting = (geometry.size, geometry.stored)
+    if code in QUARTER_TURNS and size not in fitting and turned in fitting:
+        mask, size = apply_orientation(mask, code), turned
     if size == geometry.size:
         return mask
     if size != geometry.stored:

@@ -6,7 +6,7 @@ import contextlib
 import difflib
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -217,8 +217,8 @@ def _whole(folder: Path, kind: str, images: bytes | None = None) -> Iterator[Pat
         yield Path(made)
 
 
-def posed_images(model: Any) -> dict[str, list[Any]]:
-    """The images with a pose of pycolmap's ``Reconstruction``, by name without folder and suffix."""
+def posed_images(model: Any, views: Collection[str] = ()) -> dict[str, list[Any]]:
+    """The images with a pose of pycolmap's ``Reconstruction``, by the view that their name means."""
     images: dict[str, list[Any]] = {}
     for number, image in model.images.items():
         if image.has_pose:
@@ -231,16 +231,19 @@ def posed_images(model: Any) -> dict[str, list[Any]]:
                     found="another encoding",
                     remedy="Rename the picture, and export the model again.",
                 ) from None
-            images.setdefault(view_of_name(name), []).append(image)
+            images.setdefault(view_of_name(name, views), []).append(image)
     return images
 
 
-def view_of_name(name: str) -> str:
+def view_of_name(name: str, views: Collection[str] = ()) -> str:
     """The view that a picture's name in a file of poses means: without folders, and without a suffix with a letter.
 
-    Suffixes without one are no kinds of files: ``./train/r_0.5`` is called so.
+    Suffixes without one are no kinds of files: ``./train/r_0.5`` is called so. Nor is what follows a point in the name
+    of one of ``views``: Metashape's labels have no suffix.
     """
     path = PurePosixPath(name.replace("\\", "/"))
+    if path.name in views:
+        return path.name
     return path.stem if any(sign.isalpha() for sign in path.suffix) else path.name
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import tempfile
@@ -100,11 +101,11 @@ def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
     width, height = geometry.size
     size = (camera.width, camera.height)
     if size == geometry.size:
-        crop, step = (0.0, 0.0), 1.0
+        crop, steps = (0.0, 0.0), (1.0, 1.0)
     elif size == geometry.stored:
-        crop, step = (float(geometry.crop[0]), float(geometry.crop[1])), float(geometry.step)
-    elif size[0] > 0 and size[0] * height == size[1] * width:
-        crop, step = (0.0, 0.0), size[0] / width
+        crop, steps = (float(geometry.crop[0]), float(geometry.crop[1])), (float(geometry.step),) * 2
+    elif _is_resized(size, geometry.size):
+        crop, steps = (0.0, 0.0), (size[0] / width, size[1] / height)
     else:
         apart = geometry.stored != geometry.size
         files = f", or of the files, {geometry.stored[0]}x{geometry.stored[1]}" if apart else ""
@@ -116,11 +117,27 @@ def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
         )
     fitted = copy.copy(camera)
     params = np.array(camera.params, dtype=np.float64)
-    params[list(camera.focal_length_idxs())] /= step
-    for index, cut in zip(camera.principal_point_idxs(), crop, strict=True):
+    for index, step in zip(camera.focal_length_idxs(), steps, strict=False):  # some models have one for both
+        params[index] /= step
+    for index, cut, step in zip(camera.principal_point_idxs(), crop, steps, strict=True):
         params[index] = (params[index] - cut) / step
     fitted.params, fitted.width, fitted.height = params, width, height
     return fitted
+
+
+# Sizes nearer to one another than this may differ by the crop of an undistortion.
+_LEAST_STEP = 1.5
+
+
+def _is_resized(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes differ by one factor, up to the rounding of the smaller one to whole pixels."""
+    if size[0] * other[1] == size[1] * other[0]:
+        return size[0] > 0
+    small, large = sorted((size, other))
+    if min(small) < 2 or large[0] < _LEAST_STEP * small[0]:
+        return False
+    least = max(long / (short + 1) for long, short in zip(large, small, strict=True))
+    return least < min(long / (short - 1) for long, short in zip(large, small, strict=True))
 
 
 def undistortion(camera: Any) -> Undistortion:
@@ -165,7 +182,7 @@ class Poses:
         self.folder = where
         self.files = tuple(files)
         self._model = model
-        images = posed_images(self._model)
+        images = posed_images(self._model, frozenset(views))
         self.views = [view for view in views if view in images]
         self.missing = [view for view in views if view not in images]
         if not self.views:
@@ -207,6 +224,19 @@ class Poses:
         with tempfile.TemporaryDirectory() as made:
             write_cameras(Path(made), cameras)
             return cls(load_model(Path(made), ".bin"), where, views, files)
+
+    def others(self) -> list[tuple[Path, int]]:
+        """Models beside this one (``sparse/1`` beside ``sparse/0``), and how many of the views each has poses of."""
+        names = {*self.views, *self.missing}
+        found = []
+        for folder in sorted(self.folder.parent.glob("[0-9]*")) if self.folder.name.isdigit() else []:
+            if folder != self.folder and any(
+                (folder / f"images{kind}").exists() for kind in (".bin", ".txt")
+            ):
+                with contextlib.suppress(PolarguideError):
+                    model = load_model(*find_model(folder, points=False))
+                    found.append((folder, len(names & posed_images(model, names).keys())))
+        return [(folder, count) for folder, count in found if count]
 
     @property
     def points(self) -> int:
@@ -286,6 +316,14 @@ class Poses:
         camera = self._model.cameras[image.camera_id]
         if not is_sound(image, camera, 1e-3):
             pose = image.cam_from_world()
+            length = float(np.linalg.norm(pose.rotation.quat))
+            if 1e-3 < abs(length - 1) < FARTHEST:
+                raise PolarguideError(
+                    f"{self.folder} (image {image.name})",
+                    expected="a quaternion of length 1",
+                    found=f"one of length {length:g}",
+                    remedy="Divide it by its length, or export the model again.",
+                )
             raise PolarguideError(
                 f"{self.folder} (image {image.name})",
                 expected=f"a pose and a lens of numbers up to {FARTHEST:g}, {LENS}",

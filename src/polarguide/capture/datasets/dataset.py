@@ -75,9 +75,26 @@ class Dataset:
     notes: tuple[str, ...] = ()
 
 
-def masks_beside(root: Path) -> dict[str, Path]:
-    """Object masks by view: the pictures in ``mask/`` or ``masks/``, whichever there is."""
-    return index_files(root / "mask", SUFFIXES) or index_files(root / "masks", SUFFIXES)
+def masks_beside(root: Path, views: Mapping[str, int]) -> dict[str, Path]:
+    """Object masks by view: the pictures in ``mask/`` or ``masks/``, whichever there is, called like the views.
+
+    Names may be numbers with more or fewer zeros before them, if every view has one. Views without a mask beside others
+    with one are warned of.
+
+    Args:
+        root: the dataset.
+        views: view -> its number.
+    """
+    pictures = index_files(root / "mask", SUFFIXES) or index_files(root / "masks", SUFFIXES)
+    found = {view: pictures[view] for view in views if view in pictures}
+    by_number = {number: pictures[stem] for stem, number in numbered_views(set(pictures)).items()}
+    if not found and set(views.values()) <= by_number.keys():
+        found = {view: by_number[number] for view, number in views.items()}
+    without = [view for view in views if view not in found]
+    if pictures and without:
+        text = f"{next(iter(pictures.values())).parent} has no mask called like {len(without)} of {len(views)} views"
+        warnings.warn(f"{text} ({listed(without)}).", PolarguideWarning, stacklevel=2)
+    return found
 
 
 def not_as_published(where: object, expected: str, found: str) -> PolarguideError:
@@ -233,7 +250,7 @@ def resized_mask(dataset: Dataset, view: str, size: tuple[int, int]) -> NDArray[
 
 _LARGEST_SKEW = 1e-3
 # Of IDR and the files that it was made after.
-_IDR_ENTRY = re.compile(r"(world|scale|camera)_mat_(inv_)?\d{1,6}")
+_IDR_ENTRY = re.compile(r"((world|scale|camera)_mat_(inv_)?|pose_mat_)\d{1,6}")
 _SQUARE = ((3, 4), (4, 4))
 Matrix = NDArray[np.float64]
 
@@ -282,6 +299,10 @@ def read_projections(path: Path) -> Projections:
             raise missing_entry(path, scale_key, arrays)
         world = finite_numbers(f"{path} ({key})", arrays[key], _SQUARE)
         scale = finite_numbers(f"{path} ({scale_key})", arrays[scale_key], ((4, 4),))
+        if size := float(
+            np.linalg.norm(scale[:3, :3], 2)
+        ):  # of a rotation and one scale: nothing is stretched
+            checked_pose(f"{path} ({scale_key})", scale[:3] / size)
         found[number] = decompose_projection(f"{path} ({key} @ {scale_key})", (world @ scale)[:3])
     if not found:
         raise missing_entry(path, "world_mat_<i>", arrays)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.camera_sizes import Size, is_centered
 from polarguide.capture.colmap.files import PosedCamera
 from polarguide.capture.datasets.dataset import (
     Dataset,
@@ -27,8 +29,9 @@ from polarguide.capture.datasets.dataset import (
 )
 from polarguide.capture.formats.arrays import BROKEN, array_kind, unpacked
 from polarguide.capture.formats.integrity import LARGEST_PIXELS, damaged
-from polarguide.capture.formats.pictures import SUFFIXES, decode_stored, read_picture
+from polarguide.capture.formats.pictures import SUFFIXES, decode_stored, read_picture, stated_size
 from polarguide.capture.layout import index_files
+from polarguide.core.errors import PolarguideWarning
 from polarguide.core.files import read_file
 
 # Of the releases and of NeRSP's, PolGS's and PhyGaP's copies of them.
@@ -58,11 +61,13 @@ def open_pandora(root: Path) -> Dataset:
     # PhyGaP's copy has a COLMAP model in place of the cameras.
     if cameras_file.exists() or not (root / "sparse").is_dir():
         offsets = (0,) if first == 0 else None
-        found, numbers = _cameras(root, cameras_file, {view: int(view) for view in views}, pictures, offsets)
+        light = files[views[0]][0] if views else None
+        by_number = {view: int(view) for view in views}
+        found, numbers = _cameras(root, cameras_file, by_number, pictures, light, offsets)
         cameras, posed_by = cameras_of_views(cameras_file, numbers, found, "world_mat_"), cameras_file
         shift = next(iter(numbers.values())) - int(next(iter(numbers))) if numbers else 0
         notes = (f"Files count from {first}, cameras from {first + shift}.",)
-    masks, read = _masks(root, {view: int(view) - first for view in views})
+    masks, read = _masks(root, {view: int(view) for view in views}, first)
     return stokes_dataset(
         "pandora", _PANDORA_PARTS, files, _stokes, posed_by, cameras, masks, read_mask=read, notes=notes
     )
@@ -91,9 +96,10 @@ def open_nersp(root: Path) -> Dataset:
     stems = set(archives) or {stem for part in _NERSP_PARTS for stem in index_files(root / part, (".npy",))}
     views = numbered_views(stems)
     pictures = index_files(_folder(root, _PICTURES), SUFFIXES)
-    found, numbers = _cameras(root, cameras_file, views, pictures, (0,))
+    light = None if archives else next(iter(sorted((root / _NERSP_PARTS[0]).glob("*.npy"))), None)
+    found, numbers = _cameras(root, cameras_file, views, pictures, light, (0,))
     cameras = cameras_of_views(cameras_file, numbers, found, "world_mat_")
-    masks, read = _masks(root, views)
+    masks, read = _masks(root, views, 0)
     if archives:
         return _archived(archives, cameras_file, cameras, masks, read)
     files = {view: [root / part / f"{view}.npy" for part in _NERSP_PARTS] for view in views}
@@ -167,6 +173,7 @@ def _cameras(
     path: Path,
     views: Mapping[str, int],
     pictures: Mapping[str, Path],
+    light: Path | None,
     offsets: tuple[int, ...] | None,
 ) -> tuple[dict[int, PosedCamera], dict[str, int]]:
     """Cameras by their number, and the number of each view's camera.
@@ -179,11 +186,13 @@ def _cameras(
         root, path: the dataset and the file of its cameras.
         views: view -> number of its files.
         pictures: what the intrinsics were made for.
+        light: a file of Stokes vectors, whose size the cameras have if the pictures were resized later.
         offsets: of cameras' numbers from those of files that count from 0; None for files that count from 1.
     """
     projections = read_projections(path)
     known = projections.cameras
     size = first_picture_size(pictures, _folder(root, _PICTURES)) if views else (1, 1)
+    size = _size_of(path, [inner for inner, *_ in known.values()], size, light) if views else size
     if offsets is None:
         offsets = (-1,) if 0 in known else (0, -1)
     elif projections.padded and 0 not in known and "00" not in pictures:
@@ -196,19 +205,43 @@ def _cameras(
     return cameras, {view: number + chosen for view, number in views.items()}
 
 
+def _size_of(path: Path, inner: Sequence[NDArray[np.float64]], size: Size, light: Path | None) -> Size:
+    """The size that cameras were made for: of the pictures, or of the Stokes vectors if those were resized later.
+
+    Args:
+        path: their file, for messages.
+        inner: their intrinsics.
+        size: of the pictures. light: a file of Stokes vectors.
+    """
+    centers = [(float(matrix[0, 2]), float(matrix[1, 2])) for matrix in inner]
+    other = None if light is None else stated_size(light)
+    for asked in (size, *([] if other is None else [other])):
+        if all(is_centered(asked, center) for center in centers):
+            return asked
+    warnings.warn(
+        f"{path.name}: principal points lie far from the middle of the pictures, {size[0]}x{size[1]}, as "
+        "those of pictures that were cropped or resized do. The size is taken as it is.",
+        PolarguideWarning,
+        stacklevel=2,
+    )
+    return size
+
+
 def _masks(
-    root: Path, indices: Mapping[str, int]
+    root: Path, views: Mapping[str, int], first: int
 ) -> tuple[dict[str, Path], Callable[[Path], NDArray[np.bool_]]]:
     """Object masks by view and what reads them: ``mask/`` or ``masks/``, else the alpha of NeRSP's azimuth maps.
 
     Args:
         root: the dataset.
-        indices: view -> number of its map, which counts from 0.
+        views: view -> its number.
+        first: the number that they count from; maps count from 0.
     """
     maps = index_files(_folder(root, _MAPS), (".png",))
     if not maps:
-        return masks_beside(root), read_mask
+        return masks_beside(root, views), read_mask
     by_index = {int(stem): path for stem, path in maps.items() if stem.isascii() and stem.isdigit()}
+    indices = {view: number - first for view, number in views.items()}
     return {view: by_index[index] for view, index in indices.items() if index in by_index}, _last_channel
 
 

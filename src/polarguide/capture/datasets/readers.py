@@ -67,7 +67,7 @@ def open_neisf(root: Path) -> Dataset:
     files = {view: [root / part / f"{view}.exr" for part in _NEISF_PARTS] for view in numbers}
     cameras_file = root / "poses_bounds.npy"
     cameras = cameras_of_views(cameras_file, numbers, _llff_cameras(cameras_file), "row ")
-    masks = masks_beside(root)
+    masks = masks_beside(root, numbers)
     return stokes_dataset(
         "neisf", _NEISF_PARTS, files, lambda planes: planes, cameras_file, cameras, masks, sense_known=False
     )
@@ -114,7 +114,7 @@ def open_gnerp(root: Path, *, transfer: str) -> Dataset:
     angles, degrees = ({view: root / part / f"{view}.npy" for view in numbers} for part in ("aop", "dop"))
     require_files(angles, "AoP")
     require_files(degrees, "DoP")
-    masks = masks_beside(root)
+    masks = masks_beside(root, numbers)
     cameras_file = root / "cameras.json"
     size = (
         first_picture_size({view: pictures[view] for view in numbers}, root / "images") if numbers else (1, 1)
@@ -123,6 +123,10 @@ def open_gnerp(root: Path, *, transfer: str) -> Dataset:
     def read_stokes(view: str) -> StokesImage:
         stored = decode_picture(pictures[view], read_picture(pictures[view]))
         aop, dop = (_plane(files[view], stored.shape, pictures[view]) for files in (angles, degrees))
+        if (largest := float(np.nanmax(np.abs(aop)))) > 2 * math.pi:
+            raise not_as_published(angles[view], "angles in radians", f"up to {largest:g}")
+        if (middle := float(np.nanmedian(dop))) > 1:
+            raise not_as_published(degrees[view], "degrees from 0 to 1", f"a median of {middle:g}")
         s0 = 2 * linear_codes(stored, transfer).astype(np.float32) / np.float32(FULL_CODE)
         stokes = [s0, s0 * (dop * np.cos(2 * aop))[..., None], s0 * (dop * np.sin(2 * aop))[..., None]]
         return np.stack(stokes), np.asarray((stored == np.iinfo(stored.dtype).max).any(axis=2))
@@ -223,7 +227,7 @@ def open_phygap(root: Path) -> Dataset:
         stokes: Any = np.stack([s0, -s1, -s2])
         return stokes, np.zeros(s0.shape[:2], bool)
 
-    masks = masks_beside(root)
+    masks = masks_beside(root, numbers)
     return Dataset(
         name="phygap",
         views=sorted(numbers),
@@ -268,7 +272,7 @@ def open_pisr(root: Path) -> Dataset:
         number: distorted_camera(f"{inner_file} (dist_coeffs)", _PISR_SIZE, inner, coefficients, pose)
         for number, (_, *pose) in read_projections(cameras_file).cameras.items()
     }
-    masks = masks_beside(root)
+    masks = masks_beside(root, numbers)
     gamma = _gamma(root)
     note = f"Stored values are the light to the power of {gamma:g} (gamma file): undone."
     return Dataset(

@@ -26,6 +26,8 @@ from polarguide.core.files import read_file
 _MIRRORED = (2, 4, 5, 7)
 QUARTER_TURNS = (5, 6, 7, 8)
 """Orientations that exchange width and height."""
+INVERSE = {code: {6: 8, 8: 6}.get(code, code) for code in range(1, 9)}
+"""The orientation that takes another one back."""
 TURNS = {
     2: "mirrored left to right",
     3: "turned by 180 degrees",

@@ -121,9 +121,38 @@ def decode_mask(path: Path, data: bytes, *, any_value: bool) -> NDArray[np.bool_
     gray = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)
     mask = np.asarray(gray > 0)
     if not any_value:
+        _require_two_levels(path, gray)
         mask &= 2.0 * gray >= float(gray.max())
     _require_one_mask(path, pixels, mask)
     return mask
+
+
+# Of a mask's maximum: what compression leaves of black.
+_BLACK = 0.04
+# Share of a picture: areas of one gray in a soft edge are smaller.
+_SMALL_AREA = 1e-3
+
+
+def _require_two_levels(path: Path, gray: NDArray[Any]) -> None:
+    """Refuse labels of several objects, of which the lower half would be taken for background.
+
+    They have areas of one gray below half of the maximum, while soft edges change from pixel to pixel.
+
+    Raises:
+        PolarguideError: the picture is one.
+    """
+    levels, around = gray.astype(np.float32), np.ones((3, 3), np.uint8)
+    flat = cv2.erode(levels, around) == cv2.dilate(levels, around)
+    largest = float(levels.max())
+    labels = flat & (levels > _BLACK * largest) & (2 * levels < largest)
+    if labels.mean() > _SMALL_AREA:
+        named = ", ".join(f"{level:g}" for level in np.unique(levels[labels])[:4])
+        raise PolarguideError(
+            path,
+            expected="a mask of two levels, background and object",
+            found=f"areas of {named} beside a maximum of {largest:g}, as labels of several objects have",
+            remedy="Save it as a gray picture, white where the mask is.",
+        )
 
 
 def _require_one_mask(path: Path, pixels: NDArray[Any], mask: NDArray[np.bool_]) -> None:
