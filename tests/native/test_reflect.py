@@ -47,7 +47,7 @@ def native(features: Tensor, texels: Tensor, shading: DeferredShading) -> tuple[
     return reflect_native(
         features.flatten(0, 1),
         camera().world_rays().flatten(0, 1),
-        shading.light_levels(texels),
+        shading.light_levels(texels, rough=False),
         ReflectArguments(shading.blend == "fresnel", shading.local, shading.refractive_index),
     )
 

@@ -184,14 +184,13 @@ class DeferredShading(ShadingModel):
             return self.radiance(cubemap_lookup(texels, directions))
         if level is None:
             return cubemap_lookup(self.radiance(texels), directions)
-        return mip_lookup(self.light_levels(texels), directions, level)
+        return mip_lookup(light_levels(self.radiance(texels)), directions, level)
 
-    def light_levels(self, texels: Tensor) -> list[Tensor]:
-        """Radiance from a mirror's level to that of a roughness of 1; of "lerp" the raw texels."""
+    def light_levels(self, texels: Tensor, *, rough: bool) -> list[Tensor]:
+        """Radiance from a mirror's level to that of a roughness of 1, or the first alone; of "lerp" the raw texels."""
         if self.blend == "lerp":
             return [texels]
-        light = self.radiance(texels)
-        return light_levels(light) if self.rough or self.metal else [light]
+        return light_levels(self.radiance(texels)) if rough else [self.radiance(texels)]
 
     @property
     def local_note(self) -> str:
@@ -371,7 +370,8 @@ class DeferredShading(ShadingModel):
     def _shade_native(
         self, splatted: GBuffer, texels: Tensor, camera: Camera, *, detached: bool
     ) -> dict[str, Any]:
-        textures, fresnel = self.light_levels(texels), self.blend == "fresnel"
+        textures = self.light_levels(texels, rough="roughness" in splatted.layout)
+        fresnel = self.blend == "fresnel"
         arguments = reflect_arguments(splatted, fresnel, self.local, self.refractive_index, detached)
         layers: dict[str, Any] = shade_native(splatted, textures, camera, arguments)
         layers |= {"strength": splatted["strength"][..., 0], "index": self._index_picture(splatted)}
@@ -444,7 +444,7 @@ class DeferredShading(ShadingModel):
         return PageShading(
             kind="local" if self.local else "reflection",
             values=values,
-            light=self.light_levels(light["texels"]),
+            light=self.light_levels(light["texels"], rough=rough is not None),
             constants=constants,
             notes=notes,
         )
