@@ -222,10 +222,8 @@ class DeferredShading(ShadingModel):
         [N, 3], ``roughness`` [N, 1] where there is some; where some are metals ``metal`` [N, 4], and where some have
         refractive indices of their own ``index`` [N, 1], these less the run's.
         """
-        channels = {
-            "color": base_colors(gaussians, center, degree),
-            "strength": self.strength(gaussians)[:, None],
-        }
+        strength = self.strength(gaussians)[:, None]
+        channels = {"color": base_colors(gaussians, center, degree), "strength": strength}
         if self._has_metal(gaussians):
             body = 1 - gaussians["metalness"].detach()[:, None]
             channels = {name: values * body for name, values in channels.items()}
@@ -240,9 +238,8 @@ class DeferredShading(ShadingModel):
         if (roughness := self._roughness(gaussians)) is not None:
             further["roughness"] = roughness[:, None]
         if self._has_metal(gaussians):
-            further["metal"] = metal_channels(
-                gaussians["metalness"].detach(), reflectance(gaussians["reflectance_logits"])
-            )
+            metals = gaussians["metalness"].detach(), reflectance(gaussians["reflectance_logits"])
+            further["metal"] = metal_channels(*metals)
         if self._has_indices(gaussians):
             further["index"] = gaussians["index_offset"].detach()[:, None]
         return further
@@ -330,11 +327,8 @@ class DeferredShading(ShadingModel):
         if not fits(splatted.features, texels):
             return super().shade_detached(splatted, light, camera)
         layers = self._shade_native(splatted, texels, camera, detached=True)
-        return layers, (
-            layers.pop("detached specular"),
-            layers.pop("detached diffuse"),
-            layers.get("metal"),
-        )
+        again = layers.pop("detached specular"), layers.pop("detached diffuse")
+        return layers, (*again, layers.get("metal"))
 
     def _with_metals(self, layers: dict[str, Any], splatted: GBuffer, camera: Camera) -> dict[str, Any]:
         """The layers of dielectrics with what metals add to them; as they are where the model knows no metals."""
