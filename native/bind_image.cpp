@@ -1,5 +1,6 @@
 #include "arrays.h"
 #include "image.h"
+#include "mips.h"
 #include "parallel.h"
 
 #include <nanobind/stl/optional.h>
@@ -106,28 +107,12 @@ template <class Add> void sum_texture_gradient(int64_t texels, int64_t channels,
     if (slices > 1) parallel_chunks(size, merge_chunk, merge);
 }
 
-MipArgs mip_args(const std::vector<Array> &textures, const Array &directions, const Array &level) {
-    MipArgs a{};
-    if (textures.empty() || textures.size() > most_mip_levels)
-        throw std::invalid_argument("textures: expected 1 to " + std::to_string(most_mip_levels) + " levels");
+MipArgs placed_mips(const std::vector<Array> &textures, const Array &directions, const Array &level) {
+    MipArgs a = mip_args(textures);
     const int64_t count = rows(directions);
-    expect_shape(level, "level", {count});
-    int64_t texels = 0;
-    for (const Array &texture : textures) {
-        const CubemapArgs one = cubemap_args(texture, directions);
-        a.channels = a.levels ? a.channels : one.channels;
-        if (one.channels != a.channels || a.channels < 1 || a.channels > largest_mip_channels)
-            throw std::invalid_argument("textures: expected the same 1 to " + std::to_string(largest_mip_channels) + " channels");
-        a.resolution[a.levels] = one.resolution, a.textures[a.levels] = one.texture, a.begin[a.levels] = texels * a.channels;
-        texels += int64_t(6) * one.resolution * one.resolution, ++a.levels;
-    }
+    expect_shape(directions, "directions", {count, 3}), expect_shape(level, "level", {count});
     a.directions = directions.data(), a.level = level.data();
     return a;
-}
-
-int64_t texels_of(const MipArgs &a) {
-    const int64_t last = a.resolution[a.levels - 1];
-    return a.begin[a.levels - 1] / a.channels + 6 * last * last;
 }
 
 } // namespace
@@ -170,7 +155,7 @@ void bind_image(nb::module_ &module) {
     module.def(
         "mips_forward",
         [](const std::vector<Array> &textures, const Array &directions, const Array &level, Array out) {
-            MipArgs a = mip_args(textures, directions, level);
+            MipArgs a = placed_mips(textures, directions, level);
             const int64_t count = rows(directions);
             expect_shape(out, "out", {count, a.channels});
             a.out = out.data();
@@ -182,19 +167,22 @@ void bind_image(nb::module_ &module) {
     module.def(
         "mips_backward",
         [](const std::vector<Array> &textures, const Array &directions, const Array &level, const Array &grad_out,
-           std::optional<Array> grad_textures, Array grad_directions, Array grad_level) {
-            MipArgs a = mip_args(textures, directions, level);
+           std::optional<Array> grad_light, std::optional<Array> grad_textures, Array grad_directions, Array grad_level) {
+            MipArgs a = placed_mips(textures, directions, level);
             const int64_t count = rows(directions), texels = texels_of(a);
             expect_shape(grad_out, "grad_out", {count, a.channels}), expect_shape(grad_level, "grad_level", {count});
             expect_shape(grad_directions, "grad_directions", {count, 3});
             if (grad_textures) expect_shape(*grad_textures, "grad_textures", {texels * a.channels});
             a.grad_out = grad_out.data(), a.grad_directions = grad_directions.data(), a.grad_level = grad_level.data();
+            a.grad_light = a.grad_out;
+            if (grad_light) expect_shape(*grad_light, "grad_light", {count, a.channels}), a.grad_light = grad_light->data();
             nb::gil_scoped_release release;
             auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(mips_backward)(a, b, e); };
             parallel_chunks(count, item_chunk, body);
             auto add = [&](int64_t b, int64_t e, float *to) { POLARGUIDE_DISPATCH(mips_backward_textures)(a, b, e, to); };
             if (grad_textures) sum_texture_gradient(texels, a.channels, count, grad_textures->data(), add);
         },
-        nb::arg("textures"), nb::arg("directions"), nb::arg("level"), nb::arg("grad_out"), nb::arg("grad_textures").none(),
-        nb::arg("grad_directions"), nb::arg("grad_level"), "Gradients; those of the textures in a row, if not None.");
+        nb::arg("textures"), nb::arg("directions"), nb::arg("level"), nb::arg("grad_out"), nb::arg("grad_light").none(),
+        nb::arg("grad_textures").none(), nb::arg("grad_directions"), nb::arg("grad_level"),
+        "Gradients; those of the textures in a row, if not None. Those of textures and levels are by grad_light, if not None.");
 }

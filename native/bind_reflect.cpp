@@ -1,5 +1,6 @@
 #include "arrays.h"
 #include "image.h"
+#include "mips.h"
 #include "parallel.h"
 
 #include <nanobind/stl/optional.h>
@@ -51,84 +52,74 @@ float *optional_rows(const MaybeArray &array, const char *name, int64_t n) {
     return array->data();
 }
 
-MetalArgs metal_args(const Array &features, const Array &rays, const Indices &pixels, int first, int local, float least_share,
-                     float blur) {
+MetalArgs metal_args(const Array &features, const Array &rays, const Indices &pixels, int first, float least_share,
+                     const Array &light) {
     const ReflectArgs all = reflect_args(features, rays, true, false, 1.5f, -1);
-    if (first < 7 || first > all.channels - 5 || local < -1 || local > all.channels - 3)
+    if (first < 7 || first > all.channels - 4)
         throw std::invalid_argument("features: expected the channels of metals behind those of dielectrics");
     expect_ascending(pixels, "pixels", int64_t(features.shape(0)));
+    expect_shape(light, "light", {int64_t(features.shape(0)), 3});
     MetalArgs a{};
-    a.channels = all.channels, a.first = first, a.local = local, a.least_share = least_share, a.blur = blur;
-    a.features = features.data(), a.rays = rays.data(), a.pixels = pixels.data();
+    a.channels = all.channels, a.first = first, a.least_share = least_share;
+    a.features = features.data(), a.rays = rays.data(), a.pixels = pixels.data(), a.light = light.data();
     return a;
 }
 
 void bind_metal(nb::module_ &module) {
     module.def(
-        "metal_directions",
-        [](const Array &features, const Array &rays, const Indices &pixels, int first, int local, float least_share, float blur,
-           Array directions, Array level) {
-            MetalArgs a = metal_args(features, rays, pixels, first, local, least_share, blur);
-            const int64_t n = int64_t(pixels.shape(0));
-            expect_shape(directions, "directions", {n, 3}), expect_shape(level, "level", {n});
-            a.directions = directions.data(), a.level = level.data();
-            run(POLARGUIDE_DISPATCH(metal_directions), a, n);
-        },
-        nb::arg("features"), nb::arg("rays"), nb::arg("pixels"), nb::arg("first"), nb::arg("local"), nb::arg("least_share"),
-        nb::arg("blur"), nb::arg("directions"), nb::arg("level"), "Mirrored rays and mip levels of metals.");
-    module.def(
         "metal_layers",
-        [](const Array &features, const Array &rays, const Indices &pixels, int first, int local, float least_share, float blur,
-           const Array &seen, Array share, Array reflected, Array slope, Array final_picture, Array specular) {
-            MetalArgs a = metal_args(features, rays, pixels, first, local, least_share, blur);
+        [](const Array &features, const Array &rays, const Indices &pixels, int first, float least_share, const Array &light,
+           Array share, Array reflected, Array slope, Array final_picture, Array specular) {
+            MetalArgs a = metal_args(features, rays, pixels, first, least_share, light);
             const int64_t n = int64_t(pixels.shape(0)), p = int64_t(rays.shape(0));
-            expect_shape(seen, "seen", {n, 3}), expect_shape(share, "share", {n});
+            expect_shape(share, "share", {n});
             expect_shape(reflected, "reflected", {n, 3}), expect_shape(slope, "slope", {n, 3});
             expect_shape(final_picture, "final", {p, 3}), expect_shape(specular, "specular", {p, 3});
-            a.seen = seen.data(), a.share = share.data(), a.reflected = reflected.data(), a.slope = slope.data();
+            a.share = share.data(), a.reflected = reflected.data(), a.slope = slope.data();
             a.final_picture = final_picture.data(), a.specular = specular.data();
             run(POLARGUIDE_DISPATCH(metal_layers), a, n);
         },
-        nb::arg("features"), nb::arg("rays"), nb::arg("pixels"), nb::arg("first"), nb::arg("local"), nb::arg("least_share"),
-        nb::arg("blur"), nb::arg("seen"), nb::arg("share"), nb::arg("reflected"), nb::arg("slope"), nb::arg("final"),
-        nb::arg("specular"), "What metals reflect, which is added to two layers.");
+        nb::arg("features"), nb::arg("rays"), nb::arg("pixels"), nb::arg("first"), nb::arg("least_share"), nb::arg("light"),
+        nb::arg("share"), nb::arg("reflected"), nb::arg("slope"), nb::arg("final"), nb::arg("specular"),
+        "What metals reflect, which is added to two layers.");
     module.def(
-        "metal_backward_layers",
-        [](const Array &features, const Array &rays, const Indices &pixels, int first, int local, float least_share, float blur,
-           const Array &seen, MaybeArray grad_final, MaybeArray grad_specular, MaybeArray grad_held,
-           MaybeArray grad_reflected, MaybeArray grad_slope, Array grad_seen, Array grad_features) {
-            MetalArgs a = metal_args(features, rays, pixels, first, local, least_share, blur);
+        "metal_backward",
+        [](const Array &features, const Array &rays, const Indices &pixels, int first, float least_share, const Array &light,
+           MaybeArray grad_final, MaybeArray grad_specular, MaybeArray grad_held, MaybeArray grad_reflected,
+           MaybeArray grad_slope, Array grad_light, Array grad_normal, Array grad_metal) {
+            MetalArgs a = metal_args(features, rays, pixels, first, least_share, light);
             const int64_t n = int64_t(pixels.shape(0)), p = int64_t(rays.shape(0));
-            expect_shape(seen, "seen", {n, 3}), expect_shape(grad_seen, "grad_seen", {n, 3});
-            expect_shape(grad_features, "grad_features", {p, a.channels});
+            expect_shape(grad_light, "grad_light", {p, 3});
+            expect_shape(grad_normal, "grad_normal", {n, 3}), expect_shape(grad_metal, "grad_metal", {n, 4});
             a.grad_layers[0] = optional_rows(grad_final, "grad_final", p);
             a.grad_layers[1] = optional_rows(grad_specular, "grad_specular", p);
             a.grad_layers[2] = optional_rows(grad_held, "grad_held", p);
             a.grad_reflected = optional_rows(grad_reflected, "grad_reflected", n);
             a.grad_slope = optional_rows(grad_slope, "grad_slope", n);
-            a.seen = seen.data(), a.grad_seen = grad_seen.data(), a.grad_features = grad_features.data();
-            run(POLARGUIDE_DISPATCH(metal_backward_layers), a, n);
+            a.grad_light = grad_light.data(), a.grad_normal = grad_normal.data(), a.grad_metal = grad_metal.data();
+            run(POLARGUIDE_DISPATCH(metal_backward), a, n);
         },
-        nb::arg("features"), nb::arg("rays"), nb::arg("pixels"), nb::arg("first"), nb::arg("local"), nb::arg("least_share"),
-        nb::arg("blur"), nb::arg("seen"), nb::arg("grad_final").none(), nb::arg("grad_specular").none(),
-        nb::arg("grad_held").none(), nb::arg("grad_reflected").none(), nb::arg("grad_slope").none(), nb::arg("grad_seen"),
-        nb::arg("grad_features"),
-        "Fills the gradient by the look-up, and adds that by the features but for what comes through the look-up.");
-    module.def(
-        "metal_backward_directions",
-        [](const Array &features, const Array &rays, const Indices &pixels, int first, int local, float least_share, float blur,
-           const Array &grad_directions, const Array &grad_level, Array grad_features) {
-            MetalArgs a = metal_args(features, rays, pixels, first, local, least_share, blur);
-            const int64_t n = int64_t(pixels.shape(0)), p = int64_t(rays.shape(0));
-            expect_shape(grad_directions, "grad_directions", {n, 3}), expect_shape(grad_level, "grad_level", {n});
-            expect_shape(grad_features, "grad_features", {p, a.channels});
-            a.grad_directions = grad_directions.data(), a.grad_level = grad_level.data();
-            a.grad_features = grad_features.data();
-            run(POLARGUIDE_DISPATCH(metal_backward_directions), a, n);
-        },
-        nb::arg("features"), nb::arg("rays"), nb::arg("pixels"), nb::arg("first"), nb::arg("local"), nb::arg("least_share"),
-        nb::arg("blur"), nb::arg("grad_directions"), nb::arg("grad_level"), nb::arg("grad_features"),
-        "Adds what comes through the look-up by the features.");
+        nb::arg("features"), nb::arg("rays"), nb::arg("pixels"), nb::arg("first"), nb::arg("least_share"), nb::arg("light"),
+        nb::arg("grad_final").none(), nb::arg("grad_specular").none(), nb::arg("grad_held").none(),
+        nb::arg("grad_reflected").none(), nb::arg("grad_slope").none(), nb::arg("grad_light"), nb::arg("grad_normal"),
+        nb::arg("grad_metal"), "Adds the gradient by the light; fills those by normals, and by reflectance and share as blended.");
+}
+
+// The look-up between levels; of a single one without the work of two.
+void look_up(const MipArgs &mips, int64_t count) {
+    if (mips.levels > 1) return POLARGUIDE_DISPATCH(mips_forward)(mips, 0, count);
+    CubemapArgs one{};
+    one.resolution = mips.resolution[0], one.channels = mips.channels, one.texture = mips.textures[0];
+    one.directions = mips.directions, one.out = mips.out;
+    POLARGUIDE_DISPATCH(cubemap_forward)(one, 0, count);
+}
+
+// The channel of roughness, and what its levels need.
+void set_roughness(ReflectArgs &a, int64_t n, int roughness, float blur, const MaybeArray &alpha) {
+    if (roughness < -1 || roughness >= a.channels) throw std::invalid_argument("roughness: expected a channel, or -1");
+    if (roughness >= 0 && !alpha) throw std::invalid_argument("alpha: needed where there is roughness");
+    if (alpha) expect_shape(*alpha, "alpha", {n});
+    a.roughness = roughness, a.blur = blur, a.alpha = alpha ? alpha->data() : nullptr;
 }
 
 } // namespace
@@ -146,31 +137,34 @@ void bind_reflect(nb::module_ &module) {
         nb::arg("directions"), nb::arg("rotation"), nb::arg("out"), "Rows times a rotation.");
     module.def(
         "reflect_forward",
-        [](const Array &features, const Array &rays, const Array &texture, bool fresnel, bool local, float refractive_index,
-           int index, MaybeArray directions, MaybeArray seen, Array final_picture, Array specular, Array diffuse, Array reflection) {
+        [](const Array &features, const Array &rays, const std::vector<Array> &textures, bool fresnel, bool local,
+           float refractive_index, int index, int roughness, float blur, MaybeArray alpha, MaybeArray directions,
+           MaybeArray level, MaybeArray seen, Array final_picture, Array specular, Array diffuse, Array reflection) {
             ReflectArgs a = reflect_args(features, rays, fresnel, local, refractive_index, index);
-            const int64_t n = int64_t(rays.shape(0)), side = cubemap_side(texture);
-            expect_shape(texture, "texture", {6, side, side, 3});
+            const int64_t n = int64_t(rays.shape(0));
+            set_roughness(a, n, roughness, blur, alpha);
+            const MipArgs look = mip_args(textures);
+            if (look.channels != 3) throw std::invalid_argument("textures: expected three channels, found " + std::to_string(look.channels));
             expect_shape(final_picture, "final", {n, 3}), expect_shape(specular, "specular", {n, 3});
             expect_shape(diffuse, "diffuse", {n, 3}), expect_shape(reflection, "reflection", {n, 3});
             float *all_directions = optional_rows(directions, "directions", n), *all_seen = optional_rows(seen, "seen", n);
-            CubemapArgs look{};
-            look.resolution = int(side), look.channels = 3, look.texture = texture.data();
+            if (level) expect_shape(*level, "level", {n});
             nb::gil_scoped_release release;
             // A piece at a time goes through all three, so that what one leaves the next finds near.
             const Workers workers;
-            std::vector<float> own(size_t(workers.count()) * 7 * item_chunk);
+            std::vector<float> own(size_t(workers.count()) * 8 * item_chunk);
             auto body = [&](int64_t b, int64_t e, int worker) {
-                float *spare = own.data() + int64_t(worker) * 7 * item_chunk;
+                float *spare = own.data() + int64_t(worker) * 8 * item_chunk;
                 ReflectArgs part = a;
-                part.features += b * a.channels, part.rays += 3 * b;
+                part.features += b * a.channels, part.rays += 3 * b, part.alpha += a.alpha ? b : 0;
                 part.along = spare + 6 * item_chunk;
+                part.level = level ? level->data() + b : spare + 7 * item_chunk;
                 part.directions = all_directions ? all_directions + 3 * b : spare;
                 POLARGUIDE_DISPATCH(reflect_directions)(part, 0, e - b);
-                CubemapArgs here = look;
-                here.directions = part.directions;
+                MipArgs here = look;
+                here.directions = part.directions, here.level = part.level;
                 here.out = all_seen ? all_seen + 3 * b : spare + 3 * item_chunk;
-                POLARGUIDE_DISPATCH(cubemap_forward)(here, 0, e - b);
+                look_up(here, e - b);
                 part.seen = here.out;
                 part.final_picture = final_picture.data() + 3 * b, part.specular = specular.data() + 3 * b;
                 part.diffuse = diffuse.data() + 3 * b, part.reflection = reflection.data() + 3 * b;
@@ -178,10 +172,11 @@ void bind_reflect(nb::module_ &module) {
             };
             workers.chunks(n, item_chunk, body);
         },
-        nb::arg("features"), nb::arg("rays"), nb::arg("texture"), nb::arg("fresnel"), nb::arg("local"), nb::arg("refractive_index"),
-        nb::arg("index"), nb::arg("directions").none(), nb::arg("seen").none(), nb::arg("final"), nb::arg("specular"),
-        nb::arg("diffuse"), nb::arg("reflection"),
-        "The layers of the picture; fills mirrored rays, and what the look-up gave, where they are not None.");
+        nb::arg("features"), nb::arg("rays"), nb::arg("textures"), nb::arg("fresnel"), nb::arg("local"), nb::arg("refractive_index"),
+        nb::arg("index"), nb::arg("roughness"), nb::arg("blur"), nb::arg("alpha").none(), nb::arg("directions").none(),
+        nb::arg("level").none(), nb::arg("seen").none(), nb::arg("final"), nb::arg("specular"), nb::arg("diffuse"),
+        nb::arg("reflection"),
+        "The layers of the picture; fills mirrored rays, their levels and what the look-up gave, where they are not None.");
     module.def(
         "reflect_backward_layers",
         [](const Array &features, const Array &rays, const Array &seen, bool fresnel, bool local, float refractive_index,
@@ -212,16 +207,21 @@ void bind_reflect(nb::module_ &module) {
         "the held layers leaves the normals alone: of the two by the look-up it is in grad_texels.");
     module.def(
         "reflect_backward_directions",
-        [](const Array &features, const Array &rays, const Array &grad_directions, Array grad_features) {
+        [](const Array &features, const Array &rays, int roughness, float blur, MaybeArray alpha, const Array &grad_directions,
+           MaybeArray grad_level, Array grad_features) {
             ReflectArgs a = reflect_args(features, rays, false, false, 1.5f, -1);
             const int64_t n = int64_t(rays.shape(0));
+            set_roughness(a, n, roughness, blur, alpha);
+            if (roughness >= 0 && !grad_level) throw std::invalid_argument("grad_level: needed where there is roughness");
+            if (grad_level) expect_shape(*grad_level, "grad_level", {n}), a.grad_level = grad_level->data();
             expect_shape(grad_directions, "grad_directions", {n, 3});
             expect_shape(grad_features, "grad_features", {n, a.channels});
             a.grad_directions = grad_directions.data(), a.grad_features = grad_features.data();
             run(POLARGUIDE_DISPATCH(reflect_backward_directions), a, n);
         },
-        nb::arg("features"), nb::arg("rays"), nb::arg("grad_directions"), nb::arg("grad_features"),
-        "Adds the normals' gradient that comes through the look-up.");
+        nb::arg("features"), nb::arg("rays"), nb::arg("roughness"), nb::arg("blur"), nb::arg("alpha").none(),
+        nb::arg("grad_directions"), nb::arg("grad_level").none(), nb::arg("grad_features"),
+        "Adds the gradients of normals and roughness that come through the look-up.");
     module.def(
         "gbuffer_split",
         [](const Array &features, const Array &alpha, Array normal, std::optional<Array> depth) {

@@ -270,9 +270,10 @@ template <int C> void between_backward(const MipArgs &a, int64_t begin, int64_t 
         for (int l = 0; l < n; ++l) {
             const Texture lower = texture_of(a, b.lower[l]), upper = texture_of(a, b.upper[l]);
             const float *g = a.grad_out + (first + l) * channels, f = b.fraction[l];
+            const float *by_light = a.grad_light + (first + l) * channels;
             look_up<C>(lower, b.below, l, below), look_up<C>(upper, b.above, l, above);
             float by_level = 0.0f, by_lower[3], by_upper[3];
-            for (int c = 0; c < channels; ++c) by_level += g[c] * (above[c] - below[c]);
+            for (int c = 0; c < channels; ++c) by_level += by_light[c] * (above[c] - below[c]);
             a.grad_level[first + l] = b.inside[l] ? by_level : 0.0f;
             by_direction<C>(lower, b.below, l, g, by_lower), by_direction<C>(upper, b.above, l, g, by_upper);
             for (int k = 0; k < 3; ++k)
@@ -288,7 +289,7 @@ template <int C> void between_texels(const MipArgs &a, int64_t begin, int64_t en
         const int n = count_at(first, end), channels = C ? C : a.channels;
         place(a, first, n, &b);
         for (int l = 0; l < n; ++l) {
-            const float *g = a.grad_out + (first + l) * channels, f = b.fraction[l];
+            const float *g = a.grad_light + (first + l) * channels, f = b.fraction[l];
             for (int c = 0; c < channels; ++c) part[c] = (1.0f - f) * g[c];
             by_texels<C>(a.resolution[b.lower[l]], channels, b.below, l, part, sums + a.begin[b.lower[l]]);
             for (int c = 0; c < channels; ++c) part[c] = f * g[c];

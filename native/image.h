@@ -51,6 +51,7 @@ struct MipArgs {
     const float *directions, *level;         // [P,3] [P]
     float *out;                              // [P,C]
     const float *grad_out;                   // [P,C]
+    const float *grad_light;                 // [P,C]: in its place for the textures and the level; may be the same
     float *grad_directions, *grad_level;     // [P,3] [P]
 };
 POLARGUIDE_DECLARE(void mips_forward(const MipArgs &a, int64_t begin, int64_t end))
@@ -69,9 +70,13 @@ POLARGUIDE_DECLARE(void turn(const TurnArgs &a, int64_t begin, int64_t end))
 // may follow. `seen` is what the look-up of `directions` gave.
 struct ReflectArgs {
     int channels;
-    bool fresnel, local; // Fresnel's weight and exponential light, or the lerp and the logistic function
+    bool fresnel, local; // Fresnel's weight of radiance between mip levels, or the lerp and the logistic function
     float refractive_index;
     int index;             // the channel of what is added to it; -1: there is none
+    int roughness;         // the channel of roughness, as blended; -1: everything is a mirror
+    float blur;            // mip levels from a mirror to a roughness of 1
+    const float *alpha;    // [P]; null without roughness
+    float *level;          // [P] of the look-up; null: not wanted
     const float *features; // [P,D]
     const float *rays;     // [P,3] unit
     const float *seen;     // [P,3]
@@ -80,7 +85,7 @@ struct ReflectArgs {
     float *final_picture, *specular, *diffuse, *reflection;
     // Each may be null. The held ones are by the same layers, and have no part in the normal's gradient.
     const float *grad_final, *grad_specular, *grad_diffuse, *grad_reflection, *grad_held_specular, *grad_held_diffuse;
-    const float *grad_directions;
+    const float *grad_directions, *grad_level;
     float *grad_seen, *grad_texels, *grad_features; // by the look-up without and with the held ones
 };
 POLARGUIDE_DECLARE(void reflect_directions(const ReflectArgs &a, int64_t begin, int64_t end))
@@ -88,26 +93,22 @@ POLARGUIDE_DECLARE(void reflect_layers(const ReflectArgs &a, int64_t begin, int6
 POLARGUIDE_DECLARE(void reflect_backward_layers(const ReflectArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void reflect_backward_directions(const ReflectArgs &a, int64_t begin, int64_t end))
 
-// What metals add to the layers (shading.metal), at K pixels. Of the features, channel `first` begins reflectance,
-// metalness and roughness, the latter two times metalness as they are blended; `local` begins their own light, if not -1.
+// What metals add to the layers (shading.metal), at K pixels. Of the features, channel `first` begins reflectance times
+// metalness, and metalness. `light` is what all surfaces mirror there.
 struct MetalArgs {
-    int channels, first, local;
-    float least_share, blur;
-    const float *features, *rays; // [P,D] [P,3]
-    const int64_t *pixels;        // [K] ascending
-    float *directions, *level;    // [K,3] [K]: of the look-up between mips
-    const float *seen;            // [K,3]: what it gave
-    float *share, *reflected, *slope;    // [K] [K,3] [K,3]
-    float *final_picture, *specular;     // [P,3], to which it is added
-    const float *grad_layers[3];         // [P,3] each, by layers it was added to; may be null
+    int channels, first;
+    float least_share;
+    const float *features, *rays, *light; // [P,D] [P,3] [P,3]
+    const int64_t *pixels;                // [K] ascending
+    float *share, *reflected, *slope;     // [K] [K,3] [K,3]
+    float *final_picture, *specular;      // [P,3], to which it is added
+    const float *grad_layers[3];          // [P,3] each, by layers it was added to; may be null
     const float *grad_reflected, *grad_slope; // [K,3] each, may be null
-    const float *grad_directions, *grad_level; // [K,3] [K]
-    float *grad_seen, *grad_features;          // [K,3]; [P,D], to which it is added
+    float *grad_light;                        // [P,3], to which it is added
+    float *grad_normal, *grad_metal;          // [K,3] [K,4]
 };
-POLARGUIDE_DECLARE(void metal_directions(const MetalArgs &a, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(void metal_layers(const MetalArgs &a, int64_t begin, int64_t end))
-POLARGUIDE_DECLARE(void metal_backward_layers(const MetalArgs &a, int64_t begin, int64_t end))
-POLARGUIDE_DECLARE(void metal_backward_directions(const MetalArgs &a, int64_t begin, int64_t end))
+POLARGUIDE_DECLARE(void metal_backward(const MetalArgs &a, int64_t begin, int64_t end))
 
 // What a picture reads of its G-buffer beside the layers: the blended normal, channels 3 to 5, and the depth, the last
 // channel over alpha.

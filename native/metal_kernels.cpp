@@ -68,60 +68,35 @@ template <int W> POLARGUIDE_INLINE void add(const reg *columns, const int64_t *a
 
 // Of some pixels from the i-th on.
 struct Metal {
-    reg share, inverse, given[3], reflectance[3], roughness; // `given` as blended, reflectance and roughness without the share
-    ireg shows;                                              // not under the least share
+    reg share, inverse, given[3], reflectance[3], light[3]; // `given` as blended, reflectance without the share
+    ireg shows;                                             // not under the least share
     Mirror mirror;
 };
 
 POLARGUIDE_INLINE Metal metal_at(const MetalArgs &a, int64_t i, int n) {
     Metal m;
-    reg ray[3], blended[3], rough;
-    gather<3>(a.features, a.channels, 3, a.pixels + i, n, blended), gather<3>(a.rays, 3, 0, a.pixels + i, n, ray);
-    gather<3>(a.features, a.channels, a.first, a.pixels + i, n, m.given);
-    gather<1>(a.features, a.channels, a.first + 3, a.pixels + i, n, &m.share);
-    gather<1>(a.features, a.channels, a.first + 4, a.pixels + i, n, &rough);
+    reg ray[3], blended[3];
+    const int64_t *at = a.pixels + i;
+    gather<3>(a.features, a.channels, 3, at, n, blended), gather<3>(a.rays, 3, 0, at, n, ray);
+    gather<3>(a.features, a.channels, a.first, at, n, m.given), gather<3>(a.light, 3, 0, at, n, m.light);
+    gather<1>(a.features, a.channels, a.first + 3, at, n, &m.share);
     m.mirror = mirror_of(ray, blended);
     m.shows = m.share >= a.least_share;
     m.inverse = 1.0f / (m.shows ? m.share : reg_splat(a.least_share));
     for (int k = 0; k < 3; ++k) m.reflectance[k] = m.given[k] * m.inverse;
-    m.roughness = rough * m.inverse;
     return m;
 }
 
-// What a metal mirrors, and where it is not cut at 0.
-POLARGUIDE_INLINE void light_at(const MetalArgs &a, int64_t i, int n, reg *light, ireg *lit) {
-    reg local[3] = {};
-    load_columns<3>(a.seen + 3 * i, n, light);
-    if (a.local >= 0) gather<3>(a.features, a.channels, a.local, a.pixels + i, n, local);
-    for (int k = 0; k < 3; ++k) {
-        const reg sum = light[k] + local[k];
-        lit[k] = a.local >= 0 ? sum >= 0.0f : ireg{} == ireg{};
-        light[k] = lit[k] ? sum : reg{};
-    }
-}
-
 } // namespace
-
-void metal_directions(const MetalArgs &a, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; i += reg_lanes) {
-        const int n = count_at(i, end);
-        const Metal m = metal_at(a, i, n);
-        reg out[3], level = a.blur * m.roughness;
-        mirrored_ray(m.mirror, out);
-        store_columns<3>(a.directions + 3 * i, n, out), store_columns<1>(a.level + i, n, &level);
-    }
-}
 
 void metal_layers(const MetalArgs &a, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; i += reg_lanes) {
         const int n = count_at(i, end);
         const Metal m = metal_at(a, i, n);
-        reg light[3], reflected[3], slope[3];
-        ireg lit[3];
-        light_at(a, i, n, light, lit);
+        reg reflected[3], slope[3];
         for (int k = 0; k < 3; ++k) {
             const Conductor found = conductor(-m.mirror.along, m.reflectance[k]);
-            reflected[k] = m.share * found.mean.v * light[k], slope[k] = found.slope.v;
+            reflected[k] = m.share * found.mean.v * m.light[k], slope[k] = found.slope.v;
         }
         store_columns<1>(a.share + i, n, &m.share), store_columns<3>(a.reflected + 3 * i, n, reflected);
         store_columns<3>(a.slope + 3 * i, n, slope);
@@ -129,16 +104,13 @@ void metal_layers(const MetalArgs &a, int64_t begin, int64_t end) {
     }
 }
 
-// Gradients by what was seen, and by the features except what comes through the look-up, which
-// metal_backward_directions adds.
-void metal_backward_layers(const MetalArgs &a, int64_t begin, int64_t end) {
+// Gradients by the light, to which they are added, and by the normal, the reflectance and the share as they are blended.
+void metal_backward(const MetalArgs &a, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; i += reg_lanes) {
         const int n = count_at(i, end);
         const int64_t *at = a.pixels + i;
         const Metal m = metal_at(a, i, n);
-        reg light[3], by[3] = {}, by_slope[3] = {}, to_light[3], to_metal[4], to_normal[3], part[3];
-        ireg lit[3];
-        light_at(a, i, n, light, lit);
+        reg by[3] = {}, by_slope[3] = {}, to_light[3], to_metal[4], to_normal[3], part[3];
         if (a.grad_reflected) load_columns<3>(a.grad_reflected + 3 * i, n, by);
         if (a.grad_slope) load_columns<3>(a.grad_slope + 3 * i, n, by_slope);
         for (const float *layer : a.grad_layers) {
@@ -149,34 +121,17 @@ void metal_backward_layers(const MetalArgs &a, int64_t begin, int64_t end) {
         reg by_share = {}, by_inverse = {}, by_cosine = {};
         for (int k = 0; k < 3; ++k) {
             const Conductor found = conductor(-m.mirror.along, m.reflectance[k]);
-            const reg by_mean = m.share * light[k] * by[k];
-            to_light[k] = lit[k] ? m.share * found.mean.v * by[k] : reg{};
-            by_share += found.mean.v * light[k] * by[k];
+            const reg by_mean = m.share * m.light[k] * by[k];
+            to_light[k] = m.share * found.mean.v * by[k];
+            by_share += found.mean.v * m.light[k] * by[k];
             by_cosine += by_mean * found.mean.c + by_slope[k] * found.slope.c;
             const reg by_reflectance = by_mean * found.mean.r + by_slope[k] * found.slope.r;
             to_metal[k] = by_reflectance * m.inverse, by_inverse += by_reflectance * m.given[k];
         }
         to_metal[3] = by_share - (m.shows ? by_inverse * m.inverse * m.inverse : reg{});
         normal_by_along(m.mirror, -by_cosine, to_normal);
-        store_columns<3>(a.grad_seen + 3 * i, n, to_light);
-        add<4>(to_metal, at, n, a.channels, a.first, a.grad_features);
-        add<3>(to_normal, at, n, a.channels, 3, a.grad_features);
-        if (a.local >= 0) add<3>(to_light, at, n, a.channels, a.local, a.grad_features);
-    }
-}
-
-void metal_backward_directions(const MetalArgs &a, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; i += reg_lanes) {
-        const int n = count_at(i, end);
-        const int64_t *at = a.pixels + i;
-        const Metal m = metal_at(a, i, n);
-        reg g[3], by_level, to_normal[3], to_metal[2];
-        load_columns<3>(a.grad_directions + 3 * i, n, g), load_columns<1>(a.grad_level + i, n, &by_level);
-        normal_by_mirrored(m.mirror, g, to_normal);
-        to_metal[1] = a.blur * m.inverse * by_level;
-        to_metal[0] = m.shows ? -a.blur * m.roughness * m.inverse * by_level : reg{};
-        add<3>(to_normal, at, n, a.channels, 3, a.grad_features);
-        add<2>(to_metal, at, n, a.channels, a.first + 3, a.grad_features);
+        add<3>(to_light, at, n, 3, 0, a.grad_light);
+        store_columns<3>(a.grad_normal + 3 * i, n, to_normal), store_columns<4>(a.grad_metal + 4 * i, n, to_metal);
     }
 }
 

@@ -7,7 +7,6 @@ namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
 
-constexpr float brightest = 5.0f; // log of light
 constexpr float least_alpha = 1e-6f, log2_e = 1.44269504f;
 
 // Columns `first` to `first` + W of as many rows as a register has lanes; rows from n on are zero.
@@ -38,7 +37,7 @@ POLARGUIDE_INLINE reg reflectance(reg along, reg refractive_index, reg *by_along
 }
 
 struct Light {
-    reg value[3], slope[3]; // and derivative by the raw texel value
+    reg value[3], slope[3]; // and derivative by what the look-up gave
     ireg lit[3];            // not cut at 0
 };
 
@@ -48,13 +47,11 @@ POLARGUIDE_INLINE Light light_at(const ReflectArgs &a, int64_t i, int n) {
     if (a.local) columns_of<3>(a.features + a.channels * i, a.channels, 7, n, local);
     Light l;
     for (int k = 0; k < 3; ++k) {
-        // Beyond 80 neither has anything left that a float could tell; NaN stays.
-        const float most = a.fresnel ? brightest : 80.0f;
-        const reg bounded = raw[k] < -80.0f ? reg_splat(-80.0f) : raw[k] > most ? reg_splat(most) : raw[k];
         if (a.fresnel) {
-            l.value[k] = exp2(bounded * log2_e);
-            l.slope[k] = raw[k] <= brightest ? l.value[k] : reg{};
+            l.value[k] = raw[k], l.slope[k] = reg_splat(1.0f);
         } else {
+            // Beyond 80 there is nothing left that a float could tell; NaN stays.
+            const reg bounded = raw[k] < -80.0f ? reg_splat(-80.0f) : raw[k] > 80.0f ? reg_splat(80.0f) : raw[k];
             l.value[k] = 1.0f / (1.0f + exp2(-log2_e * bounded));
             l.slope[k] = l.value[k] * (1.0f - l.value[k]);
         }
@@ -69,6 +66,13 @@ POLARGUIDE_INLINE Light light_at(const ReflectArgs &a, int64_t i, int n) {
 POLARGUIDE_INLINE void gradient_at(const float *gradient, int64_t i, int n, reg *columns) {
     if (gradient) return load_columns<3>(gradient + 3 * i, n, columns);
     for (int k = 0; k < 3; ++k) columns[k] = reg{};
+}
+
+// The factor between a pixel's blended roughness and its mip level: the roughness is a mean, weighted as it was blended.
+POLARGUIDE_INLINE reg levels_of(const ReflectArgs &a, int64_t i, int n) {
+    reg alpha;
+    load_columns<1>(a.alpha + i, n, &alpha);
+    return a.blur / (alpha > least_alpha ? alpha : reg_splat(least_alpha));
 }
 
 // How much of the light shows, and of the base color: strength times Fresnel's reflectance, and all, or the lerp.
@@ -107,6 +111,13 @@ void reflect_directions(const ReflectArgs &a, int64_t begin, int64_t end) {
         mirrored_ray(m, out);
         store_columns<3>(a.directions + 3 * i, n, out);
         store_columns<1>(a.along + i, n, &m.along);
+        if (!a.level) continue;
+        reg level = {};
+        if (a.roughness >= 0) {
+            columns_of<1>(a.features + a.channels * i, a.channels, a.roughness, n, &level);
+            level *= levels_of(a, i, n);
+        }
+        store_columns<1>(a.level + i, n, &level);
     }
 }
 
@@ -178,6 +189,11 @@ void reflect_backward_directions(const ReflectArgs &a, int64_t begin, int64_t en
         normal_by_mirrored(mirror_at(a, i, n), g, to);
         for (int k = 0; k < 3; ++k)
             for (int l = 0; l < n; ++l) a.grad_features[a.channels * (i + l) + 3 + k] += to[k][l];
+        if (a.roughness < 0) continue;
+        reg by_level;
+        load_columns<1>(a.grad_level + i, n, &by_level);
+        by_level *= levels_of(a, i, n);
+        for (int l = 0; l < n; ++l) a.grad_features[a.channels * (i + l) + a.roughness] += by_level[l];
     }
 }
 

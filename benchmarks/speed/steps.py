@@ -40,9 +40,8 @@ PARTS = {
     "what is splatted": ("Splatting.forward", "Splatting.backward"),
     "reflection": (
         *("turn", "reflect_forward"),
-        *("reflect_backward_layers", "cubemap_backward", "reflect_backward_directions"),
-        *("gbuffer_split", "gbuffer_join", "metal_directions", "mips_forward", "metal_layers"),
-        *("metal_backward_layers", "mips_backward", "metal_backward_directions"),
+        *("reflect_backward_layers", "cubemap_backward", "mips_backward", "reflect_backward_directions"),
+        *("gbuffer_split", "gbuffer_join", "metal_layers", "metal_backward"),
     ),
     "photometric terms": ("photometric",),
     "normals, Stokes": ("polarization", "direction", "consistency"),

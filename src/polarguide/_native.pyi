@@ -145,6 +145,7 @@ def mips_backward(
     directions: Tensor,
     level: Tensor,
     grad_out: Tensor,
+    grad_light: Tensor | None,
     grad_textures: Tensor | None,
     grad_directions: Tensor,
     grad_level: Tensor,
@@ -183,71 +184,49 @@ def axes_backward(
     grad_quaternions: Tensor,
 ) -> None: ...
 def mirrored_forward(means: Tensor, center: Tensor, normals: Tensor, out: Tensor) -> None: ...
-def metal_directions(
-    features: Tensor,
-    rays: Tensor,
-    pixels: Tensor,
-    first: int,
-    local: int,
-    least_share: float,
-    blur: float,
-    directions: Tensor,
-    level: Tensor,
-) -> None: ...
 def metal_layers(
     features: Tensor,
     rays: Tensor,
     pixels: Tensor,
     first: int,
-    local: int,
     least_share: float,
-    blur: float,
-    seen: Tensor,
+    light: Tensor,
     share: Tensor,
     reflected: Tensor,
     slope: Tensor,
     final: Tensor,
     specular: Tensor,
 ) -> None: ...
-def metal_backward_layers(
+def metal_backward(
     features: Tensor,
     rays: Tensor,
     pixels: Tensor,
     first: int,
-    local: int,
     least_share: float,
-    blur: float,
-    seen: Tensor,
+    light: Tensor,
     grad_final: Tensor | None,
     grad_specular: Tensor | None,
     grad_held: Tensor | None,
     grad_reflected: Tensor | None,
     grad_slope: Tensor | None,
-    grad_seen: Tensor,
-    grad_features: Tensor,
-) -> None: ...
-def metal_backward_directions(
-    features: Tensor,
-    rays: Tensor,
-    pixels: Tensor,
-    first: int,
-    local: int,
-    least_share: float,
-    blur: float,
-    grad_directions: Tensor,
-    grad_level: Tensor,
-    grad_features: Tensor,
+    grad_light: Tensor,
+    grad_normal: Tensor,
+    grad_metal: Tensor,
 ) -> None: ...
 def turn(directions: Tensor, rotation: Sequence[float], out: Tensor) -> None: ...
 def reflect_forward(
     features: Tensor,
     rays: Tensor,
-    texture: Tensor,
+    textures: Sequence[Tensor],
     fresnel: bool,
     local: bool,
     refractive_index: float,
     index: int,
+    roughness: int,
+    blur: float,
+    alpha: Tensor | None,
     directions: Tensor | None,
+    level: Tensor | None,
     seen: Tensor | None,
     final: Tensor,
     specular: Tensor,
@@ -273,7 +252,14 @@ def reflect_backward_layers(
     grad_features: Tensor,
 ) -> None: ...
 def reflect_backward_directions(
-    features: Tensor, rays: Tensor, grad_directions: Tensor, grad_features: Tensor
+    features: Tensor,
+    rays: Tensor,
+    roughness: int,
+    blur: float,
+    alpha: Tensor | None,
+    grad_directions: Tensor,
+    grad_level: Tensor | None,
+    grad_features: Tensor,
 ) -> None: ...
 def gbuffer_split(features: Tensor, alpha: Tensor, normal: Tensor, depth: Tensor | None) -> None: ...
 def gbuffer_join(

@@ -1,4 +1,4 @@
-"""Metals in the deferred picture: the native pass against its reference implementation, forward and gradient."""
+"""Metals and rough surfaces in the deferred picture: the native pass against its reference, forward and gradient."""
 
 from typing import Any
 
@@ -10,15 +10,15 @@ from torch.testing import assert_close
 from polarguide import _native
 from polarguide.geometry.camera import Camera
 from polarguide.shading.deferred import DeferredShading
-from polarguide.shading.metal import BLUR, MINIMUM_SHARE, where_metal
+from polarguide.shading.metal import MINIMUM_SHARE, where_metal
 from polarguide.shading.model import GBuffer
-from polarguide.shading.native import MetalArguments, reflect_native
+from polarguide.shading.native import MetalArguments, ReflectArguments, reflect_native
 from polarguide.shading.result import Layout
 
 HEIGHT, WIDTH, RESOLUTION = 20, 24, 32
 MODELS = [
-    DeferredShading(blend="fresnel", local=True, metal=True),
-    DeferredShading(blend="fresnel", metal=True),
+    DeferredShading(blend="fresnel", local=True, metal=True, rough=True),
+    DeferredShading(blend="fresnel", metal=True, rough=True),
 ]
 
 
@@ -42,10 +42,17 @@ def buffers(shading: DeferredShading) -> tuple[Tensor, Tensor]:
     normals[2] *= -1  # away from the camera
     share = uniform(HEIGHT, WIDTH, 1)
     share[3], share[4], share[5] = 0, 0.005, 1
-    metal = torch.cat((share * uniform(HEIGHT, WIDTH, 3), share, share * uniform(HEIGHT, WIDTH, 1)), dim=-1)
+    metal = torch.cat((share * uniform(HEIGHT, WIDTH, 3), share), dim=-1)
     metal[6, :, :3] = 1.2  # beyond what metals reflect
     own = [uniform(HEIGHT, WIDTH, 3) - 0.6] if shading.local else []
-    parts = [uniform(HEIGHT, WIDTH, 3), normals, uniform(HEIGHT, WIDTH, 1), *own, metal]
+    parts = [
+        uniform(HEIGHT, WIDTH, 3),
+        normals,
+        uniform(HEIGHT, WIDTH, 1),
+        *own,
+        uniform(HEIGHT, WIDTH, 1),
+        metal,
+    ]
     texels = torch.randn(6, RESOLUTION, RESOLUTION, 3, generator=generator)
     return torch.cat([*parts, uniform(HEIGHT, WIDTH, 1)], dim=-1), texels
 
@@ -53,14 +60,16 @@ def buffers(shading: DeferredShading) -> tuple[Tensor, Tensor]:
 def layout(shading: DeferredShading, *, metal: bool = True) -> Layout:
     own = {"local": 3} if shading.local else {}
     return Layout(
-        {"color": 3, "normal": 3, "strength": 1, **own, **({"metal": 5, "depth": 1} if metal else {})}
+        {"color": 3, "normal": 3, "strength": 1, **own, "roughness": 1}
+        | ({"metal": 4, "depth": 1} if metal else {})
     )
 
 
 def results(shading: DeferredShading, dtype: torch.dtype, *, held: bool) -> list[Tensor]:
     """Layers and what metals reflect, then the gradients of a random sum of them by features and texels."""
     features, texels = (t.to(dtype).requires_grad_() for t in buffers(shading))
-    splatted = GBuffer(features, features.new_ones(HEIGHT, WIDTH), layout(shading))
+    alpha = torch.linspace(0, 1, HEIGHT * WIDTH, dtype=dtype).reshape(HEIGHT, WIDTH)
+    splatted = GBuffer(features, alpha, layout(shading))
     if held:
         layers, again = shading.shade_detached(splatted, {"texels": texels}, camera())
         assert again is not None
@@ -98,11 +107,11 @@ def test_threads_do_not_change_a_bit() -> None:
 def test_where_no_pixel_shows_metal_the_layers_are_those_of_dielectrics() -> None:
     shading = MODELS[0]
     features, texels = buffers(shading)
-    features[..., 10:15] = 0
+    features[..., 11:15] = 0
     alpha, light = torch.ones(HEIGHT, WIDTH), {"texels": texels}
     with_channels = shading.shade(GBuffer(features, alpha, layout(shading)), light, camera())
     without = shading.shade(
-        GBuffer(features[..., :10].contiguous(), alpha, layout(shading, metal=False)), light, camera()
+        GBuffer(features[..., :11].contiguous(), alpha, layout(shading, metal=False)), light, camera()
     )
     assert torch.equal(with_channels["final"], without["final"])
     assert len(with_channels["metal"].pixels) == 0
@@ -112,15 +121,15 @@ def test_where_no_pixel_shows_metal_the_layers_are_those_of_dielectrics() -> Non
 def test_a_view_without_metal_has_the_gradients_of_one_of_dielectrics() -> None:
     shading = MODELS[0]
     alpha, found = torch.ones(HEIGHT, WIDTH), []
-    for channels in (16, 10):
+    for channels in (16, 11):
         features, texels = buffers(shading)
-        features[..., 10:15] = 0
+        features[..., 11:15] = 0
         features = features[..., :channels].contiguous().requires_grad_()
         texels.requires_grad_()
         shading.shade(
-            GBuffer(features, alpha, layout(shading, metal=channels > 10)), {"texels": texels}, camera()
+            GBuffer(features, alpha, layout(shading, metal=channels > 11)), {"texels": texels}, camera()
         )["final"].square().sum().backward()
-        found.append((features.grad[..., :10], texels.grad))
+        found.append((features.grad[..., :11], texels.grad))
     for ours, theirs in zip(*found, strict=True):
         assert_close(ours, theirs, rtol=0, atol=0)
 
@@ -151,24 +160,14 @@ def test_light_that_is_not_trained_gets_no_gradient() -> None:
         ("pixels", {"pixels": torch.tensor([3, 3])}),
         ("pixels", {"pixels": torch.tensor([3, HEIGHT * WIDTH])}),
         ("pixels", {"pixels": torch.tensor([-1, 3])}),
-        ("features", {"first": 12}),
+        ("features", {"first": 13}),
         ("features", {"first": 5}),
-        ("features", {"local": 14}),
     ],
 )
 def test_what_does_not_fit_is_refused(name: str, changed: dict[str, Any]) -> None:
     features, texels = buffers(MODELS[0])
     flat = features.flatten(0, 1)
-    given = MetalArguments(where_metal(flat, 10), 10, 7, MINIMUM_SHARE, BLUR)
+    given = MetalArguments(where_metal(flat, 11), 11, MINIMUM_SHARE)._replace(**changed)
     rays = camera().world_rays().flatten(0, 1)
     with pytest.raises(ValueError, match=name):
-        reflect_native(
-            flat,
-            rays,
-            texels,
-            fresnel=True,
-            local=True,
-            refractive_index=1.5,
-            metal=given._replace(**changed),
-            levels=[texels.exp()],
-        )
+        reflect_native(flat, rays, [texels.exp()], ReflectArguments(True, True, 1.5, metal=given))

@@ -104,13 +104,18 @@ def reflect(draw: Draw) -> None:
     index, further = draw.choice((1.5, 0.0, NAN)), draw.choice((-1, -1, 0, d - 1, d, LARGEST))
     model = draw.random() < 0.5, local, index, further
     side = draw.choice((1, 2, 5))
-    texels = draw(6, side, side, draw.choice((3, 3, 3, 4)))
-    looked_up = draw.maybe(three[0]), draw.maybe(three[5])
-    _native.reflect_forward(features, rays, texels, *model, *looked_up, *three[1:5])
+    texels = [draw(6, size, size, draw.choice((3, 3, 3, 4))) for size in (side, 1)[: draw.choice((1, 2, 2))]]
+    rough = (
+        draw.choice((-1, -1, 7, 0, d - 1, d, -2, LARGEST)),
+        draw.choice((4.0, NAN, 3e38)),
+        draw.maybe(draw(n)),
+    )
+    looked_up = draw.maybe(three[0]), draw.maybe(draw(n)), draw.maybe(three[5])
+    _native.reflect_forward(features, rays, texels, *model, *rough, *looked_up, *three[1:5])
     layers = [draw.maybe(values) for values in (*three[1:5], *three[1:3])]
     by_look_up = three[5], draw.maybe(three[6])
     _native.reflect_backward_layers(features, rays, three[0], *model, *layers, *by_look_up, draw(n, d))
-    _native.reflect_backward_directions(features, rays, three[0], draw(n, d))
+    _native.reflect_backward_directions(features, rays, *rough, three[0], draw.maybe(draw(n)), draw(n, d))
 
 
 def splatting(draw: Draw) -> None:
@@ -138,19 +143,15 @@ def finite(draw: Draw) -> None:
 def metal(draw: Draw) -> None:
     n, d = draw.choice(MANY), draw.randint(10, 18)
     first = draw.choice((7, 7, 10, 12, 3, d, LARGEST))
-    local = draw.choice((-1, -1, 7, 0, d - 2, LARGEST, -(2**31)))
     pixels = np.flatnonzero(draw.numbers().random(n) < 0.4)
     if len(pixels) and draw.random() < 0.1:
         pixels[draw.randrange(len(pixels))] = draw.choice((-1, n, 2**62))
-    k, blur = len(pixels), draw.choice((4.0, 4.0, 0.0, NAN, 3e38))
-    given = draw(n, d), draw(n, 3), pixels, first, local, draw.choice((0.01, 0.01, 0.0)), blur
-    rows, looked_up = [draw(k, 3) for _ in range(3)], draw(k, 3)
-    _native.metal_directions(*given, rows[0], draw(k))
-    _native.metal_layers(*given, looked_up, draw(k), *rows[1:], draw(n, 3), draw(n, 3))
+    k = len(pixels)
+    given = draw(n, d), draw(n, 3), pixels, first, draw.choice((0.01, 0.01, 0.0)), draw(n, 3)
+    _native.metal_layers(*given, draw(k), draw(k, 3), draw(k, 3), draw(n, 3), draw(n, 3))
     layers = [draw.maybe(draw(n, 3)) for _ in range(3)]
     by = [draw.maybe(draw(k, 3)) for _ in range(2)]
-    _native.metal_backward_layers(*given, looked_up, *layers, *by, draw(k, 3), draw(n, d))
-    _native.metal_backward_directions(*given, draw(k, 3), draw(k), draw(n, d))
+    _native.metal_backward(*given, *layers, *by, draw(n, 3), draw(k, 3), draw(k, 4))
 
 
 def mips(draw: Draw) -> None:
@@ -159,7 +160,7 @@ def mips(draw: Draw) -> None:
     given = [draw(6, side, side, c) for side in sides], draw(n, 3), 3 * draw(n)
     _native.mips_forward(*given, draw(n, c))
     flat = draw.maybe(draw(sum(6 * side * side * c for side in sides)))
-    _native.mips_backward(*given, draw(n, c), flat, draw(n, 3), draw(n))
+    _native.mips_backward(*given, draw(n, c), draw.maybe(draw(n, c)), flat, draw(n, 3), draw(n))
 
 
 def consistency(draw: Draw) -> None:

@@ -16,7 +16,7 @@ def render(
     /,
     *,
     views: str = "test",
-    layers: str = "final,base,reflection,specular,diffuse,strength,metalness,normal,depth",
+    layers: str = "final,base,reflection,specular,diffuse,strength,roughness,metalness,normal,depth",
     path: str = "",
     frames: int = FRAMES,
     video: Path | None = None,
@@ -35,7 +35,8 @@ def render(
     Args:
         run: Run folder.
         views: test, train, all, or names separated by commas.
-        layers: Any of final, base, reflection, specular, diffuse, strength, metalness, normal, depth, alpha.
+        layers: Any of final, base, reflection, specular, diffuse, strength, roughness, metalness, normal, depth,
+            alpha.
         path: In place of views: orbit, spiral, interpolate (through the photographs), or a JSON file of cameras.
         frames: Pictures along the path (a file has its own).
         video: MP4 file to write of the path, layers side by side; PNG files if not given.

@@ -232,7 +232,12 @@ ABLATIONS_STOKES = varied(
     (
         "without-fresnel",
         "Strength does not depend on the angle: the lerp of 3DGS-DR.",
-        shading(blend="lerp", first_strength=0.05),
+        shading(blend="lerp", first_strength=0.05, rough=False),
+    ),
+    (
+        "without-roughness",
+        "Dielectrics are mirrors; metals alone have a roughness.",
+        shading(rough=False),
     ),
     ("without-local", "Nothing near is reflected: the environment alone.", shading(local=False)),
     (

@@ -96,6 +96,7 @@ SHADING_STOKES = replace(
     local=True,
     local_rate=5e-3,
     first_strength=0.5,
+    rough=True,
     metal=True,
     indices=True,
 )

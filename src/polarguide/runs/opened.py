@@ -249,7 +249,7 @@ class OpenedRun:
 
         Returns:
             By name: linear radiance [H, W, 3] on the scale of S0/2, world normals [H, W, 3] of any length, or [H, W]
-            for strength, metalness, depth and alpha.
+            for strength, roughness, metalness, depth and alpha.
 
         Raises:
             PolarguideError: there is no such layer, or this recipe has not got it.

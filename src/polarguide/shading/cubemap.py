@@ -272,13 +272,31 @@ class _Between(torch.autograd.Function):
 
 
 def mips_backward(
-    levels: Sequence[Tensor], directions: Tensor, level: Tensor, grad: Tensor, textures: bool
+    levels: Sequence[Tensor],
+    directions: Tensor,
+    level: Tensor,
+    grad: Tensor,
+    textures: bool,
+    grad_light: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:
-    """Gradients of the native look-up by directions, level and, with ``textures``, the levels; contiguous tensors."""
-    to_directions, to_level = torch.empty_like(directions), torch.empty_like(level)
+    """Gradients of the native look-up by directions, level and, with ``textures``, the levels; contiguous tensors.
+
+    Args:
+        grad: [P, C]. grad_light: in its place for all but the directions.
+    """
+    to_directions = torch.empty_like(directions)
+    if len(levels) == 1:
+        (texture,) = levels
+        to_texture = torch.empty_like(texture) if textures else None
+        both = None if grad_light is not None else to_texture
+        _native.cubemap_backward(texture, directions, grad, both, to_directions)
+        if grad_light is not None and textures:
+            _native.cubemap_backward(texture, directions, grad_light, to_texture, None)
+        return to_directions, torch.zeros_like(level), [to_texture]
+    to_level = torch.empty_like(level)
     sizes = [texture.numel() for texture in levels]
     flat = grad.new_empty(sum(sizes)) if textures else None
-    _native.mips_backward(levels, directions, level, grad, flat, to_directions, to_level)
+    _native.mips_backward(levels, directions, level, grad, grad_light, flat, to_directions, to_level)
     if flat is None:
         return to_directions, to_level, [None] * len(levels)
     parts = zip(flat.split(sizes), levels, strict=True)

@@ -18,21 +18,16 @@ from polarguide.geometry.camera import Camera
 from polarguide.optics import reflectances_from_cosine
 from polarguide.shading.cubemap import cubemap_lookup, mip_lookup
 from polarguide.shading.metal import (
-    BLUR,
     FIRST_REFLECTANCE,
-    FIRST_ROUGHNESS,
-    MINIMUM_SHARE,
     any_nonzero,
     convert,
     metal_channels,
-    metal_mips,
     metal_pixels,
     metalness_picture,
     mirror_base,
     reflectance,
     reflectance_logits,
     scale_light,
-    where_metal,
     with_metal,
 )
 from polarguide.shading.model import (
@@ -52,8 +47,9 @@ from polarguide.shading.model import (
     local_light,
     mirrored,
 )
-from polarguide.shading.native import MetalArguments, reflect_native, reflect_reference, world_rays_native
-from polarguide.shading.result import LAYERS, DetachedLayers, MetalPixels
+from polarguide.shading.native import reflect_arguments, reflect_reference, shade_native
+from polarguide.shading.result import LAYERS, DetachedLayers
+from polarguide.shading.roughness import LEVELS, blended_roughness, ggx_alpha, gltf_roughness, light_levels
 
 Blend = Literal["lerp", "fresnel"]
 RESET_STRENGTH = 1e-3
@@ -81,9 +77,14 @@ class DeferredShading(ShadingModel):
         environment_spread: first raw texels are uniform in plus or minus this.
         environment_rate: learning rate of the texels.
         environment_resolution: texels along a cube face's side.
+        rough: whether dielectrics have a roughness, too, or metals alone; with the blend "fresnel".
+        first_roughness: that Gaussians begin with, in (0, 1). roughness_rate: its learning rate.
         metal: whether Gaussians can be metals, see ``shading.metal``; with the blend "fresnel".
         indices: whether Gaussians can have refractive indices of their own (never learned); with the blend "fresnel".
-        metal_rate: learning rate of their reflectance and roughness.
+        metal_rate: learning rate of their reflectance.
+
+    With the blend "fresnel" light is read from box-filtered levels of the radiance: at that of a
+    pixel's roughness, see ``shading.roughness``.
     """
 
     blend: Blend = "lerp"
@@ -94,6 +95,9 @@ class DeferredShading(ShadingModel):
     environment_spread: float = 5.0
     environment_rate: float = 0.05
     environment_resolution: int = 128
+    rough: bool = False
+    first_roughness: float = 0.1
+    roughness_rate: float = 0.01
     metal: bool = False
     metal_rate: float = 0.01
     indices: bool = False
@@ -101,31 +105,27 @@ class DeferredShading(ShadingModel):
     stream: ClassVar[int] = 1
 
     def as_recorded(self, data: Mapping[str, Any]) -> ShadingModel:
-        """Without metals and indices where there could be none."""
-        parts = {name: getattr(self, name) and data.get(name, False) for name in ("metal", "indices")}
+        """Without what there could not be then: rough dielectrics, metals, indices."""
+        names = ("rough", "metal", "indices")
+        parts = {name: getattr(self, name) and data.get(name, False) for name in names}
         return replace(self, **parts)
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
-        """``strength_logits``; with ``local`` harmonics of the mirrored direction; with ``metal`` its three; with
-        ``indices`` what is added to the refractive index.
+        """``strength_logits``; with ``local`` harmonics of the mirrored direction; with ``metal`` its two; with
+        ``rough`` or ``metal`` ``roughness_logits``; with ``indices`` what is added to the refractive index.
         """
         minimum = float(torch.logit(torch.tensor(RESET_STRENGTH, dtype=torch.float64)))
-        own = {
-            "local_dc": Parameter((3,), self.local_rate),
-            "local_rest": Parameter((15, 3), self.local_rate / 20),
-        }
-        metals = {
-            "metalness": Parameter((), 0.0),
-            "reflectance_logits": Parameter((3,), self.metal_rate),
-            "roughness_logits": Parameter((), self.metal_rate),
-        }
-        return {
-            "strength_logits": Parameter((), self.strength_rate, minimum),
-            **(own if self.local else {}),
-            **(metals if self.metal else {}),
-            **({"index_offset": Parameter((), 0.0)} if self.indices else {}),
-        }
+        own = {"strength_logits": Parameter((), self.strength_rate, minimum)}
+        if self.local:
+            own["local_dc"] = Parameter((3,), self.local_rate)
+            own["local_rest"] = Parameter((15, 3), self.local_rate / 20)
+        if self.metal:
+            own["metalness"] = Parameter((), 0.0)
+            own["reflectance_logits"] = Parameter((3,), self.metal_rate)
+        if self.rough or self.metal:
+            own["roughness_logits"] = Parameter((), self.roughness_rate)
+        return own | ({"index_offset": Parameter((), 0.0)} if self.indices else {})
 
     @property
     def light_parameters(self) -> Mapping[str, Parameter]:
@@ -142,7 +142,8 @@ class DeferredShading(ShadingModel):
         first = {**zeros, "strength_logits": logit.expand(len(colors)).clone()}
         if self.metal:
             first["reflectance_logits"] = reflectance_logits(torch.full((len(colors), 3), FIRST_REFLECTANCE))
-            first["roughness_logits"] = torch.logit(torch.full((len(colors),), FIRST_ROUGHNESS))
+        if "roughness_logits" in first:
+            first["roughness_logits"] = torch.logit(torch.full((len(colors),), self.first_roughness))
         return first
 
     def initial_light(self, generator: torch.Generator) -> dict[str, Tensor]:
@@ -156,8 +157,9 @@ class DeferredShading(ShadingModel):
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """All, ``metalness`` if there can be metals."""
-        return LAYERS if self.metal else tuple(name for name in LAYERS if name != "metalness")
+        """All, ``metalness`` if there can be metals, ``roughness`` if there is some."""
+        absent = {"metalness": not self.metal, "roughness": not (self.rough or self.metal)}
+        return tuple(name for name in LAYERS if not absent.get(name))
 
     def radiance(self, texels: Tensor) -> Tensor:
         """Radiance of raw texel values."""
@@ -175,6 +177,20 @@ class DeferredShading(ShadingModel):
     def radiance_cubemap(self) -> RadianceCubemap | None:
         """The texels."""
         return RadianceCubemap("texels", self.radiance, self.raw_texels)
+
+    def far_light(self, texels: Tensor, directions: Tensor, level: Tensor | None) -> Tensor:
+        """Radiance [P, 3] from directions [P, 3], blurred by mip levels [P]; None: by none."""
+        if self.blend == "lerp":
+            return self.radiance(cubemap_lookup(texels, directions))
+        if level is None:
+            return cubemap_lookup(self.radiance(texels), directions)
+        return mip_lookup(light_levels(self.radiance(texels)), directions, level)
+
+    def light_levels(self, texels: Tensor, *, rough: bool) -> list[Tensor]:
+        """Radiance from a mirror's level to that of a roughness of 1, or the first alone; of "lerp" the raw texels."""
+        if self.blend == "lerp":
+            return [texels]
+        return light_levels(self.radiance(texels)) if rough else [self.radiance(texels)]
 
     @property
     def local_note(self) -> str:
@@ -203,13 +219,11 @@ class DeferredShading(ShadingModel):
 
     def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
         """``color`` [N, 3] (the base color), ``strength`` [N, 1], with ``local`` the Gaussians' own light ``local``
-        [N, 3]; where some are metals ``metal`` [N, 5], and where some have refractive indices of their own ``index``
-        [N, 1], these less the run's.
+        [N, 3], ``roughness`` [N, 1] where there is some; where some are metals ``metal`` [N, 4], and where some have
+        refractive indices of their own ``index`` [N, 1], these less the run's.
         """
-        channels = {
-            "color": base_colors(gaussians, center, degree),
-            "strength": self.strength(gaussians)[:, None],
-        }
+        strength = self.strength(gaussians)[:, None]
+        channels = {"color": base_colors(gaussians, center, degree), "strength": strength}
         if self._has_metal(gaussians):
             body = 1 - gaussians["metalness"].detach()[:, None]
             channels = {name: values * body for name, values in channels.items()}
@@ -219,8 +233,13 @@ class DeferredShading(ShadingModel):
         return channels | self._further(gaussians)
 
     def _further(self, gaussians: Parameters) -> dict[str, Tensor]:
-        """The channels of metals and of refractive indices, where there are some."""
-        further = {"metal": self._metals(gaussians)} if self._has_metal(gaussians) else {}
+        """The channels of roughness, metals and refractive indices, where there are some."""
+        further = {}
+        if (roughness := self._roughness(gaussians)) is not None:
+            further["roughness"] = roughness[:, None]
+        if self._has_metal(gaussians):
+            metals = gaussians["metalness"].detach(), reflectance(gaussians["reflectance_logits"])
+            further["metal"] = metal_channels(*metals)
         if self._has_indices(gaussians):
             further["index"] = gaussians["index_offset"].detach()[:, None]
         return further
@@ -273,14 +292,16 @@ class DeferredShading(ShadingModel):
         """Whether one of the Gaussians is a metal; without, everything is as if there could be none."""
         return self.metal and any_nonzero(gaussians["metalness"])
 
-    @staticmethod
-    def _metals(gaussians: Parameters) -> Tensor:
-        """Per Gaussian [N, 5], as of ``metal_channels``."""
-        values = reflectance(gaussians["reflectance_logits"]), torch.sigmoid(gaussians["roughness_logits"])
-        return metal_channels(gaussians["metalness"].detach(), *values)
+    def _roughness(self, gaussians: Parameters) -> Tensor | None:
+        """Roughness [N] of each Gaussian; None: all are mirrors."""
+        if self.rough:
+            return torch.sigmoid(gaussians["roughness_logits"])
+        if self._has_metal(gaussians):
+            return gaussians["metalness"].detach() * torch.sigmoid(gaussians["roughness_logits"])
+        return None
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Any]:
-        """``final``, ``specular``, ``diffuse`` and ``reflection`` [H, W, 3], and ``strength`` [H, W].
+        """``final``, ``specular``, ``diffuse`` and ``reflection`` [H, W, 3], ``strength`` and ``roughness`` [H, W].
 
         With ``metal`` also ``metalness`` [H, W] and, where there is some, ``metal``. Where there are several refractive
         indices, ``index`` [H, W].
@@ -290,11 +311,13 @@ class DeferredShading(ShadingModel):
             return self._shade_native(splatted, texels, camera, detached=False)
         strength = splatted["strength"][..., 0]
         local = splatted["local"] if self.local else None
-        index = self._index_picture(splatted)
-        layers = reflect_reference(
-            splatted["color"], splatted["normal"], strength, texels, camera, self, local, index
+        index, rough = self._index_picture(splatted), blended_roughness(splatted)
+        level = None if rough is None else LEVELS * rough
+        layers: dict[str, Any] = reflect_reference(
+            splatted["color"], splatted["normal"], strength, texels, camera, self, local, index, level
         )
-        return self._with_metals({**layers, "strength": strength, "index": index}, splatted, texels, camera)
+        layers |= {"strength": strength, "index": index, **self._shown_roughness(splatted)}
+        return self._with_metals(layers, splatted, camera)
 
     def shade_detached(
         self, splatted: GBuffer, light: Light, camera: Camera
@@ -304,16 +327,11 @@ class DeferredShading(ShadingModel):
         if not fits(splatted.features, texels):
             return super().shade_detached(splatted, light, camera)
         layers = self._shade_native(splatted, texels, camera, detached=True)
-        return layers, (
-            layers.pop("detached specular"),
-            layers.pop("detached diffuse"),
-            layers.get("metal"),
-        )
+        again = layers.pop("detached specular"), layers.pop("detached diffuse")
+        return layers, (*again, layers.get("metal"))
 
-    def _with_metals(
-        self, layers: dict[str, Any], splatted: GBuffer, texels: Tensor, camera: Camera
-    ) -> dict[str, Any]:
-        """The layers of dielectrics with what metals add; as they are where the model knows no metals."""
+    def _with_metals(self, layers: dict[str, Any], splatted: GBuffer, camera: Camera) -> dict[str, Any]:
+        """The layers of dielectrics with what metals add to them; as they are where the model knows no metals."""
         if not self.metal:
             return layers
         features, metal = splatted.features, splatted.metal
@@ -324,10 +342,18 @@ class DeferredShading(ShadingModel):
                 splatted.layout,
                 rays.flatten(0, 1),
                 splatted["normal"].flatten(0, 1),
-                self.radiance(texels),
+                layers["reflection"].flatten(0, 1),
             )
         mixed = layers if metal is None else with_metal(layers, metal)
         return {**mixed, "metalness": metalness_picture(metal, features), "metal": metal}
+
+    def _shown_roughness(self, splatted: GBuffer) -> dict[str, Tensor]:
+        """The layer ``roughness``, where surfaces can have one."""
+        if not (self.rough or self.metal):
+            return {}
+        blended = blended_roughness(splatted)
+        shown = torch.zeros_like(splatted.alpha) if blended is None else blended
+        return {"roughness": gltf_roughness(shown, self.environment_resolution)}
 
     def _index_picture(self, splatted: GBuffer) -> Tensor | None:
         """Refractive indices [H, W]; None: the run's everywhere."""
@@ -338,44 +364,22 @@ class DeferredShading(ShadingModel):
     def _shade_native(
         self, splatted: GBuffer, texels: Tensor, camera: Camera, *, detached: bool
     ) -> dict[str, Any]:
-        features, layout = splatted.features, splatted.layout
-        pixels, metal, levels = features.flatten(0, 1), None, []
-        if "metal" in layout:
-            first, local = layout.first("metal"), layout.first("local")
-            metal = MetalArguments(where_metal(pixels, first), first, local, MINIMUM_SHARE, BLUR)
-            levels = metal_mips(self.radiance(texels))
-        shaded = reflect_native(
-            pixels,
-            world_rays_native(camera),
-            texels,
-            fresnel=self.blend == "fresnel",
-            local=self.local,
-            refractive_index=self.refractive_index,
-            index=layout.first("index"),
-            detached=detached,
-            metal=metal,
-            levels=levels,
-        )
-        names = [
-            "final",
-            "specular",
-            "diffuse",
-            "reflection",
-            *(("detached specular", "detached diffuse") if detached else ()),
-        ]
-        layers: dict[str, Any] = {
-            name: layer.unflatten(0, features.shape[:2]) for name, layer in zip(names, shaded, strict=False)
-        }
+        textures = self.light_levels(texels, rough="roughness" in splatted.layout)
+        fresnel = self.blend == "fresnel"
+        arguments = reflect_arguments(splatted, fresnel, self.local, self.refractive_index, detached)
+        layers: dict[str, Any] = shade_native(splatted, textures, camera, arguments)
         layers |= {"strength": splatted["strength"][..., 0], "index": self._index_picture(splatted)}
+        layers |= self._shown_roughness(splatted)
         if self.metal:
-            metals = None if metal is None else MetalPixels(metal.pixels, *shaded[len(names) :])
-            layers |= {"metalness": metalness_picture(metals, features), "metal": metals}
+            layers["metalness"] = metalness_picture(layers["metal"], splatted.features)
+        else:
+            del layers["metal"]
         return layers
 
     def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
         """Colors [N, 3] of Gaussians by themselves; see ``ShadingModel``."""
-        directions = mirrored(rays, normals).contiguous()
-        reflected = self.radiance(cubemap_lookup(light["texels"], directions))
+        directions, rough = mirrored(rays, normals).contiguous(), self._roughness(gaussians)
+        reflected = self.far_light(light["texels"], directions, None if rough is None else LEVELS * rough)
         if self.local:
             reflected = (reflected + local_light(gaussians, directions, 3)).clamp(min=0)
         cosine = -(rays * normals).sum(dim=-1, keepdim=True).clamp(-1, 0)
@@ -385,12 +389,8 @@ class DeferredShading(ShadingModel):
         specular, diffuse = self.contributions(base, strength, reflected, cosine, index)
         if not self._has_metal(gaussians):
             return specular + diffuse
-        metal = self._metals(gaussians)
-        blurred = mip_lookup(metal_mips(self.radiance(light["texels"])), directions, BLUR * metal[:, 4])
-        if self.local:
-            blurred = (blurred + local_light(gaussians, directions, 3)).clamp(min=0)
         mean, _ = optics.conductor(cosine, reflectance(gaussians["reflectance_logits"]))
-        return torch.where(metal[:, 3:4] > 0, mean * blurred, specular + diffuse)
+        return torch.where(gaussians["metalness"][:, None] > 0, mean * reflected, specular + diffuse)
 
     def diffuse_colors(self, gaussians: Parameters, rays: Tensor) -> Tensor:
         """Linear colors [N, 3] without reflections: none of metals."""
@@ -398,14 +398,17 @@ class DeferredShading(ShadingModel):
         return colors * (1 - gaussians["metalness"][:, None]) if self._has_metal(gaussians) else colors
 
     def fields(self, gaussians: Parameters) -> dict[str, Tensor]:
-        """Linear harmonics of the base color, ``strength`` [N], of metals ``metalness`` [N], ``reflectance`` [N, 3] and
-        ``roughness`` [N], and ``refractive_index`` [N].
+        """Linear harmonics of the base color, ``strength`` [N], ``roughness`` [N] as in glTF (the square root of GGX's
+        alpha), of metals ``metalness`` [N] and ``reflectance`` [N, 3], and ``refractive_index`` [N].
         """
         own = {**super().fields(gaussians), "strength": self.strength(gaussians)}
         if self.metal:
             own["metalness"] = gaussians["metalness"]
             own["reflectance"] = reflectance(gaussians["reflectance_logits"])
-            own["roughness"] = torch.sigmoid(gaussians["roughness_logits"])
+        if self.rough or self.metal:
+            rough = self._roughness(gaussians)
+            rough = torch.zeros_like(own["strength"]) if rough is None else rough
+            own["roughness"] = gltf_roughness(rough, self.environment_resolution)
         if self._has_indices(gaussians):
             own["refractive_index"] = self.refractive_index + gaussians["index_offset"]
         return own
@@ -423,19 +426,19 @@ class DeferredShading(ShadingModel):
         if self.local:
             values |= {"own_color": gaussians["local_dc"], "own_harmonics": gaussians["local_rest"]}
         constants: dict[str, Any] = {"blend": self.blend, "index": drawn}
-        texels = [light["texels"]]
+        if not self.local and (self.rough or self._has_metal(gaussians)):
+            return None  # no recipe has such surfaces, and the page no shaders for them
+        if (rough := self._roughness(gaussians)) is not None:
+            values["roughness"] = rough
+            constants["mirror"] = float(ggx_alpha(torch.zeros(()), self.environment_resolution))
         if self._has_metal(gaussians):
-            if not self.local or self.blend != "fresnel":
-                return None  # no recipe has such metals, and the page no shaders for them
-            metal = self._metals(gaussians)
-            values["metal"] = torch.cat((metal[:, :3], metal[:, 4:]), dim=1)
-            mips = metal_mips(self.radiance(light["texels"]))
-            texels += mips
-            constants |= {"metal": True, "mips": len(mips)}
+            metalness = gaussians["metalness"].detach()[:, None]
+            values["metal"] = metalness * reflectance(gaussians["reflectance_logits"])
+            constants["metal"] = True
         return PageShading(
             kind="local" if self.local else "reflection",
             values=values,
-            light=texels,
+            light=self.light_levels(light["texels"], rough=rough is not None),
             constants=constants,
             notes=notes,
         )

@@ -231,7 +231,7 @@ def render(
     return RenderResult(
         final=layers["final"],
         base=splatted["color"],
-        **{name: layers.get(name) for name in ("specular", "diffuse", "reflection", "strength", "metalness")},
+        **{name: layers.get(name) for name in _LAYERS},
         normal=normal,
         depth=camera_depth,
         alpha=picture.alpha,
@@ -243,6 +243,8 @@ def render(
         blended_normal=blended,
     )
 
+
+_LAYERS = ("specular", "diffuse", "reflection", "strength", "roughness", "metalness")
 
 Split = tuple[Tensor, Tensor | None, Tensor | None]
 

@@ -3,11 +3,11 @@
 A Gaussian is a metal or a dielectric (``metalness`` 1 or 0, decided by ``training.metals`` or by masks, never learned).
 A metal has no diffuse reflection: its base color and its strength do not count. What it reflects is
 
-    specular = R(r, i) max(0, L(mirrored ray, roughness) + l)
+    specular = R(r, i) L
 
-with R of a conductor (``optics.conductor``) of reflectance r at normal incidence per color, the light of the learned
-environment blurred by the roughness (its mips), and l the light of the Gaussians' own, as for dielectrics. Blended are
-``metalness``, and reflectance and roughness times ``metalness``; a pixel that metals share with others adds both.
+with R of a conductor (``optics.conductor``) of reflectance r at normal incidence per color, and L the light that a
+dielectric would mirror there, too. Blended are ``metalness``, and reflectance times ``metalness``; a pixel that metals
+share with others adds both.
 
 ``convert`` makes Gaussians metals, or dielectrics again. What a dielectric's base color showed from a direction, a
 metal mirrors from the direction that belongs to it at the Gaussian's normal. Mirroring maps harmonics of a degree onto
@@ -31,14 +31,12 @@ from polarguide.gaussians.harmonics import sh_basis
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, spread_directions, unit
 from polarguide.optics.fresnel import LARGEST_REFLECTANCE
-from polarguide.shading.cubemap import box_mips, cubemap_lookup, mip_lookup
+from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.result import Layout, MetalPixels
 
 # Of which a metal's reflectance is trained between these.
 LEAST = 0.2
-# Mip levels from a mirror to a roughness of 1.
-BLUR = 4.0
-FIRST_REFLECTANCE, FIRST_ROUGHNESS = 0.7, 0.3
+FIRST_REFLECTANCE = 0.7
 # Pixels with less of a metal than this are shaded as dielectrics alone.
 MINIMUM_SHARE = 0.01
 
@@ -69,15 +67,10 @@ def reflectance_logits(values: Tensor) -> Tensor:
     return torch.logit(((values - LEAST) / (LARGEST_REFLECTANCE - LEAST)).clamp(0.02, 0.98))
 
 
-def metal_channels(metalness: Tensor, reflectances: Tensor, roughness: Tensor) -> Tensor:
-    """Blended channels of metals, [N, 5]: reflectance and roughness times metalness, and metalness between them."""
+def metal_channels(metalness: Tensor, reflectances: Tensor) -> Tensor:
+    """Blended channels of metals, [N, 4]: reflectance times metalness, and metalness."""
     m = metalness[:, None]
-    return torch.cat((m * reflectances, m, m * roughness[:, None]), dim=1)
-
-
-def metal_mips(light: Tensor) -> list[Tensor]:
-    """Levels of radiance from afar [6, R, R, 3] that metals see, from a mirror's to a roughness of 1."""
-    return box_mips(light)[: math.ceil(BLUR) + 1]
+    return torch.cat((m * reflectances, m), dim=1)
 
 
 def where_metal(features: Tensor, first: int) -> Tensor:
@@ -91,25 +84,18 @@ def metal_pixels(
     """Shade what shows metal: the reference implementation of what ``reflect_native`` does of metals.
 
     Args:
-        features: [P, C] blended. layout: of its channels: ``metal`` as of ``metal_channels``, and ``local`` if
-            Gaussians have light of their own.
+        features: [P, C] blended. layout: of its channels: ``metal`` as of ``metal_channels``.
         rays: [P, 3] unit, world. normal: [P, 3] blended, world.
-        light: [6, R, R, 3] radiance from afar.
+        light: [P, 3] that is mirrored.
     """
     pixels = where_metal(features, layout.first("metal"))
     # All channels at once: each part taken by itself would send back a picture of all of them.
-    values, rays, facing = features[pixels], rays[pixels], unit(normal[pixels], 1e-3)
-    metal = values[:, layout.channels("metal")]
+    metal, rays, facing = features[pixels], rays[pixels], unit(normal[pixels], 1e-3)
+    metal = metal[:, layout.channels("metal")]
     share = metal[:, 3]
-    along = dot(rays, facing)[:, None]
     inverse = 1 / share.clamp(min=MINIMUM_SHARE)
-    level = BLUR * metal[:, 4] * inverse
-    mirrored = mip_lookup(metal_mips(light), (rays - 2 * along * facing).contiguous(), level)
-    if "local" in layout:
-        mirrored = (mirrored + values[:, layout.channels("local")]).clamp(min=0)
-    reflectances = metal[:, :3] * inverse[:, None]
-    mean, slope = optics.conductor(-along, reflectances)
-    return MetalPixels(pixels, share.detach(), share[:, None] * mean * mirrored, slope)
+    mean, slope = optics.conductor(-dot(rays, facing)[:, None], metal[:, :3] * inverse[:, None])
+    return MetalPixels(pixels, share.detach(), share[:, None] * mean * light[pixels], slope)
 
 
 def with_metal(layers: Mapping[str, Any], metal: MetalPixels) -> dict[str, Any]:
@@ -179,8 +165,6 @@ def convert(gaussians: Gaussians, metal: Tensor, reflectances: Tensor) -> Tensor
     if bool(changed.any()):
         gaussians.overwrite("metalness", metal.float())
         gaussians.overwrite("reflectance_logits", reflectance_logits(reflectances), fresh)
-        rough = torch.logit(torch.full_like(gaussians["roughness_logits"], FIRST_ROUGHNESS))
-        gaussians.overwrite("roughness_logits", rough, fresh)
         for name, own in _local(gaussians):
             gaussians.overwrite(name, torch.zeros_like(own), changed)
     return fresh

@@ -17,8 +17,11 @@ from polarguide import _native
 from polarguide.core.native import applied
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
-from polarguide.shading.cubemap import cubemap_lookup, mips_backward
-from polarguide.shading.model import mirrored
+from polarguide.shading.cubemap import mips_backward
+from polarguide.shading.metal import MINIMUM_SHARE, where_metal
+from polarguide.shading.model import GBuffer, mirrored
+from polarguide.shading.result import MetalPixels
+from polarguide.shading.roughness import LEVELS
 
 
 class MetalArguments(NamedTuple):
@@ -26,101 +29,118 @@ class MetalArguments(NamedTuple):
 
     Attributes:
         pixels: [K] int64, those that show metal, ascending.
-        first: the channel where ``metal_channels`` begin. local: that of the Gaussians' own light; -1: there is none.
-        least_share: of metal. blur: mip levels from a mirror to a roughness of 1.
+        first: the channel where ``metal_channels`` begin.
+        least_share: of metal.
     """
 
     pixels: Tensor
     first: int
-    local: int
     least_share: float
+
+
+class RoughnessArguments(NamedTuple):
+    """Arguments of the native pass for rough surfaces.
+
+    Attributes:
+        channel: of the blended roughness.
+        blur: mip levels from a mirror to a roughness of 1.
+        alpha: [P] by which a pixel's blended roughness is divided; without a gradient.
+    """
+
+    channel: int
     blur: float
+    alpha: Tensor
+
+
+class ReflectArguments(NamedTuple):
+    """What ``reflect_native`` reads of a shading model and of its G-buffer.
+
+    Attributes:
+        fresnel: Fresnel's weight of radiance, in place of the lerp with the logistic function of raw texels.
+        local: whether channels 7 to 9 are light that is added to the environment's.
+        refractive_index: of Fresnel's weight.
+        added_index: the channel of what is added to it, without a gradient; -1: there is none.
+        roughness: where surfaces have one; None: all are mirrors.
+        metal: where there is some; it is added to ``final`` and ``specular``.
+        detached: also ``specular`` and ``diffuse`` once more, without a gradient on the normals but for that of metals.
+    """
+
+    fresnel: bool
+    local: bool
+    refractive_index: float
+    added_index: int = -1
+    roughness: RoughnessArguments | None = None
+    metal: MetalArguments | None = None
+    detached: bool = False
+
+    @property
+    def model(self) -> tuple[bool, bool, float, int]:
+        """The arguments of each native function."""
+        return self.fresnel, self.local, self.refractive_index, self.added_index
+
+    @property
+    def levels(self) -> tuple[int, float, Tensor | None]:
+        """Those about the level of a look-up."""
+        rough = self.roughness
+        return (-1, 0.0, None) if rough is None else (rough.channel, rough.blur, rough.alpha)
 
 
 class _Reflect(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        features: Tensor,
-        rays: Tensor,
-        texels: Tensor,
-        fresnel: bool,
-        local: bool,
-        ior: float,
-        index: int,
-        detached: bool,
-        metal: MetalArguments | None,
-        *levels: Tensor,
+        ctx: Any, features: Tensor, rays: Tensor, given: ReflectArguments, *textures: Tensor
     ) -> tuple[Tensor, ...]:
-        features, rays, texels = (t.detach().contiguous() for t in (features, rays, texels))
+        features, rays, *levels = (t.detach().contiguous() for t in (features, rays, *textures))
         learns = any(ctx.needs_input_grad)
-        directions, reflected_rays = (torch.empty_like(rays) if learns else None for _ in range(2))
+        looked_up = (torch.empty_like(rays), rays.new_empty(len(rays)), torch.empty_like(rays))
         layers = [torch.empty_like(rays) for _ in range(4)]
-        _native.reflect_forward(
-            features, rays, texels, fresnel, local, ior, index, directions, reflected_rays, *layers
-        )
-        ctx.model, ctx.metal = (fresnel, local, ior, index), metal
-        ctx.set_materialize_grads(False)
-        outputs: list[Tensor] = []
-        saved: list[Tensor] = []
+        kept = looked_up if learns else (None, None, None)
+        _native.reflect_forward(features, rays, levels, *given.model, *given.levels, *kept, *layers)
+        metal, outputs, light = given.metal, [], []
         if metal is not None:
-            inputs = features, rays, *metal
             count = len(metal.pixels)
-            mirrored, reflected, slope, light = (rays.new_empty(count, 3) for _ in range(4))
-            share, level = rays.new_empty(count), rays.new_empty(count)
-            mips = [t.detach().contiguous() for t in levels]
-            _native.metal_directions(*inputs, mirrored, level)
-            _native.mips_forward(mips, mirrored, level, light)
-            _native.metal_layers(*inputs, light, share, reflected, slope, *layers[:2])
-            saved = [metal.pixels, mirrored, level, light, *mips]
-            ctx.mark_non_differentiable(share)
-            outputs = [share, reflected, slope]
-        ctx.save_for_backward(features, rays, texels, directions, reflected_rays, *saved)
-        again = [layers[1].clone(), layers[2].clone()] if detached else []
+            outputs = [rays.new_empty(count), rays.new_empty(count, 3), rays.new_empty(count, 3)]
+            light = [layers[3]]
+            _native.metal_layers(features, rays, *metal, *light, *outputs, *layers[:2])
+            ctx.mark_non_differentiable(outputs[0])
+        ctx.given = given
+        ctx.set_materialize_grads(False)
+        if learns:
+            ctx.save_for_backward(features, rays, *looked_up, *light, *levels)
+        again = [layers[1].clone(), layers[2].clone()] if given.detached else []
         return (*layers, *again, *outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        features, rays, texels, directions, reflected_rays, *saved = ctx.saved_tensors
-        contiguous = [None if g is None else g.contiguous() for g in grads]
-        by_metal = contiguous[-2:]
-        to_layers = contiguous if ctx.metal is None else contiguous[:-3]
+        features, rays, directions, level, seen, *saved = ctx.saved_tensors
+        given, contiguous = ctx.given, [None if g is None else g.contiguous() for g in grads]
+        metal = given.metal
+        to_layers = contiguous if metal is None else contiguous[:-3]
         to_layers += [None] * (6 - len(to_layers))
-        to_features, to_seen = torch.empty_like(features), torch.empty_like(reflected_rays)
-        # What comes by the detached layers goes to the texels, and not by way of the directions to the normals.
-        needs_metal = to_layers[4] is not None or to_layers[5] is not None
-        to_look_up = torch.empty_like(reflected_rays) if needs_metal else None
-        inputs: list[Any] = [
-            features,
-            rays,
-            reflected_rays,
-            *ctx.model,
-            *to_layers,
-            to_seen,
-            to_look_up,
-            to_features,
-        ]
+        to_features, to_seen = torch.empty_like(features), torch.empty_like(seen)
+        if metal is not None:
+            light, *saved = saved
+            by_layers, by_metal = [*to_layers[:2], to_layers[4]], contiguous[-2:]
+            to_light = torch.zeros_like(rays) if to_layers[3] is None else to_layers[3].clone()
+            to_normal, to_metal = rays.new_empty(len(metal.pixels), 3), rays.new_empty(len(metal.pixels), 4)
+            inputs: list[Any] = [features, rays, *metal, light, *by_layers, *by_metal]
+            inputs += [to_light, to_normal, to_metal]
+            _native.metal_backward(*inputs)
+            to_layers[3] = to_light
+        # What comes by the detached layers goes to the light, and not by way of the directions to the normals.
+        to_look_up = None if to_layers[4] is None and to_layers[5] is None else torch.empty_like(seen)
+        inputs = [features, rays, seen, *given.model, *to_layers, to_seen, to_look_up, to_features]
         _native.reflect_backward_layers(*inputs)
-        to_texels, to_directions = torch.empty_like(texels), torch.empty_like(directions)
-        if to_look_up is None:
-            _native.cubemap_backward(texels, directions, to_seen, to_texels, to_directions)
-        else:
-            _native.cubemap_backward(texels, directions, to_look_up, to_texels, None)
-            _native.cubemap_backward(texels, directions, to_seen, None, to_directions)
-        _native.reflect_backward_directions(features, rays, to_directions, to_features)
-        to_levels: Sequence[Tensor | None] = [None] * len(ctx.needs_input_grad[9:])
-        if ctx.metal is not None:
-            _, mirrored, level, light, *levels = saved
-            to_light, by_layers = torch.empty_like(light), [*to_layers[:2], to_layers[4]]
-            inputs = [features, rays, *ctx.metal, light, *by_layers, *by_metal, to_light, to_features]
-            _native.metal_backward_layers(*inputs)
-            to_mirrored, to_level, to_levels = mips_backward(
-                levels, mirrored, level, to_light, any(ctx.needs_input_grad[9:])
-            )
-            inputs = [features, rays, *ctx.metal, to_mirrored, to_level, to_features]
-            _native.metal_backward_directions(*inputs)
-        return to_features, None, to_texels, None, None, None, None, None, None, *to_levels
+        if metal is not None:
+            to_features[:, 3:6].index_add_(0, metal.pixels, to_normal)
+            to_features[:, metal.first : metal.first + 4].index_add_(0, metal.pixels, to_metal)
+        to_directions, to_level, to_textures = mips_backward(
+            saved, directions, level, to_seen, any(ctx.needs_input_grad[3:]), to_look_up
+        )
+        inputs = [features, rays, *given.levels, to_directions, to_level, to_features]
+        _native.reflect_backward_directions(*inputs)
+        return to_features, None, None, *to_textures
 
 
 def world_rays_native(camera: Camera) -> Tensor:
@@ -132,43 +152,56 @@ def world_rays_native(camera: Camera) -> Tensor:
 
 
 def reflect_native(
-    features: Tensor,
-    rays: Tensor,
-    texels: Tensor,
-    *,
-    fresnel: bool,
-    local: bool,
-    refractive_index: float,
-    index: int = -1,
-    detached: bool = False,
-    metal: MetalArguments | None = None,
-    levels: Sequence[Tensor] = (),
+    features: Tensor, rays: Tensor, textures: Sequence[Tensor], given: ReflectArguments
 ) -> tuple[Tensor, ...]:
     """The layers of a picture from its G-buffer (Ye et al. 2024, Eq. 5, or Fresnel-weighted), with what metals reflect.
 
     Args:
         features: [P, D] blended base color, normal, strength and, with ``local``, light; others may follow.
-        rays: [P, 3] unit, world. texels: [6, R, R, 3] raw. All float32 on the CPU.
-        fresnel: Fresnel's weight and exponential light in place of the lerp and the logistic function.
-        local: whether channels 7 to 9 are light that is added to the environment's.
-        refractive_index: of Fresnel's weight. index: the channel of what is added to it, without a gradient; -1: there
-            is none.
-        detached: also ``specular`` and ``diffuse`` once more, without a gradient on the normals but for that of metals.
-        metal: where there is some; it is added to ``final`` and ``specular``. levels: of light that it mirrors.
+        rays: [P, 3] unit, world.
+        textures: levels of the light from afar, [6, R, R, 3] each: radiance with ``fresnel``, else one, raw. All
+            float32 on the CPU.
 
     Returns:
-        ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features, texels and
-        levels. With ``detached`` also the two detached layers. With ``metal`` also its share [K] (no gradient),
-        its reflected light [K, 3], and its degree of polarization over ``sin^2(zenith)`` [K, 3]. The bits are the same
-        for any number of threads.
+        ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features and textures.
+        With ``detached`` also the two detached layers. With ``metal`` also its share [K] (no gradient), its reflected
+        light [K, 3], and its degree of polarization over ``sin^2(zenith)`` [K, 3]. The bits are the same for any
+        number of threads.
 
     Raises:
         ValueError: if a shape is not as above.
     """
-    layers: tuple[Tensor, ...] = applied(
-        _Reflect, features, rays, texels, fresnel, local, refractive_index, index, detached, metal, *levels
-    )
+    layers: tuple[Tensor, ...] = applied(_Reflect, features, rays, given, *textures)
     return layers
+
+
+def reflect_arguments(
+    splatted: GBuffer, fresnel: bool, local: bool, refractive_index: float, detached: bool
+) -> ReflectArguments:
+    """Arguments of ``reflect_native`` for a G-buffer, by the channels that it has."""
+    layout, rough, metal = splatted.layout, None, None
+    if "roughness" in layout:
+        rough = RoughnessArguments(layout.first("roughness"), LEVELS, splatted.alpha.detach().flatten())
+    if "metal" in layout:
+        first = layout.first("metal")
+        metal = MetalArguments(where_metal(splatted.features.flatten(0, 1), first), first, MINIMUM_SHARE)
+    index = layout.first("index")
+    return ReflectArguments(fresnel, local, refractive_index, index, rough, metal, detached)
+
+
+def shade_native(
+    splatted: GBuffer, textures: Sequence[Tensor], camera: Camera, given: ReflectArguments
+) -> dict[str, Any]:
+    """The layers of ``reflect_native`` by name, [H, W, 3], those that are detached as ``detached specular`` and
+    ``detached diffuse``; and ``metal``, None where there is none.
+    """
+    shaded = reflect_native(splatted.features.flatten(0, 1), world_rays_native(camera), textures, given)
+    names = ["final", "specular", "diffuse", "reflection"]
+    names += ["detached specular", "detached diffuse"] if given.detached else []
+    shape = splatted.features.shape[:2]
+    layers = {name: layer.unflatten(0, shape) for name, layer in zip(names, shaded, strict=False)}
+    metal = None if given.metal is None else MetalPixels(given.metal.pixels, *shaded[len(names) :])
+    return {**layers, "metal": metal}
 
 
 class _Split(torch.autograd.Function):
@@ -227,8 +260,8 @@ def split_native(features: Tensor, alpha: Tensor, *, depth: bool) -> tuple[Tenso
 class Reflecting(Protocol):
     """The interface between deferred reflection and its shading model; see ``DeferredShading``."""
 
-    def radiance(self, texels: Tensor, /) -> Tensor:
-        """Linear radiance of raw texels."""
+    def far_light(self, texels: Tensor, directions: Tensor, level: Tensor | None, /) -> Tensor:
+        """Linear radiance [P, 3] from directions [P, 3], blurred by mip levels [P]; None: by none."""
 
     def contributions(
         self, base: Tensor, strength: Tensor, light: Tensor, cosine: Tensor, index: Tensor | None, /
@@ -245,6 +278,7 @@ def reflect_reference(
     shading: Reflecting,
     local: Tensor | None = None,
     index: Tensor | None = None,
+    level: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Deferred reflection per pixel: the reference implementation of ``reflect_native``, any dtype and device.
 
@@ -252,14 +286,16 @@ def reflect_reference(
         base: [H, W, 3]. normal: [H, W, 3] world, any length. strength: [H, W]. environment: [6, R, R, 3] raw texels.
         local: [H, W, 3] blended light of the Gaussians' own, added to the environment's.
         index: [H, W] refractive index; None: the run's.
+        level: [H, W] mip level of the environment; None: everything is a mirror.
 
     Returns:
         ``final``, ``specular``, ``diffuse`` and ``reflection``, each [H, W, 3].
     """
     rays = camera.world_rays(dtype=base.dtype, device=base.device)
     facing = unit(normal, 1e-3)
-    directions = mirrored(rays, facing)
-    light = shading.radiance(cubemap_lookup(environment, directions.reshape(-1, 3)).reshape(base.shape))
+    directions = mirrored(rays, facing).reshape(-1, 3).contiguous()
+    levels = None if level is None else level.flatten()
+    light = shading.far_light(environment, directions, levels).reshape(base.shape)
     if local is not None:
         light = (light + local).clamp(min=0)
     cosine = -dot(rays, facing)[..., None].clamp(-1, 0)

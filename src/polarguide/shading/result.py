@@ -58,6 +58,7 @@ LAYERS = (
     "specular",
     "diffuse",
     "strength",
+    "roughness",
     "metalness",
     "normal",
     "depth",
@@ -97,6 +98,7 @@ class RenderResult:
         base: blended base color.
         reflection: the environment seen along the mirrored ray; None where the shading has no such layer.
         strength: [H, W] reflection strength in [0, 1]; None where the shading has none.
+        roughness: [H, W] square root of GGX's alpha, as glTF has it; None where the shading has none. No gradient.
         metalness: [H, W] share of metals in [0, 1]; None where the shading knows none.
         normal: blended normal in world axes, not normalized; None where the stage does not splat it. Where the surface
             was asked for, that around the pixel's median depth, see ``raster.surface``.
@@ -127,6 +129,7 @@ class RenderResult:
     rotation_only_normal: Tensor | None = None
     metal: MetalPixels | None = None
     metalness: Tensor | None = None
+    roughness: Tensor | None = None
     index: Tensor | None = None
     blended_normal: Tensor | None = None
 

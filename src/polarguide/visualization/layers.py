@@ -47,6 +47,7 @@ def layer_picture(
         "normal": lambda v: figures.normal_to_rgb(v, camera),
         "depth": lambda v: figures.scalar_to_rgb(v, near, far),
         "strength": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
+        "roughness": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
         "metalness": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
         "alpha": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
     }

@@ -23,7 +23,7 @@ REFLECTING = ["final", "diffuse", "specular", "base", "strength", "normal"]
 LAYERS = {
     "plain": ["final", "normal"],
     "reflection": REFLECTING,
-    "local": REFLECTING,
+    "local": [*REFLECTING, "roughness"],
     "directional": ["final", "diffuse", "specular", "base", "normal"],
 }
 TEXELS = {"plain": 6, "reflection": 6, "local": 10, "directional": 4}

@@ -302,7 +302,8 @@ def test_the_screen_shows_what_pictures_gives(fresh: Opened) -> None:
     camera = ring()["v0"]
     numbers = {key: record[key] for key in ("width", "height", "fx", "fy", "cx", "cy")}
     seen = Camera(**numbers, rotation=camera.rotation, translation=camera.translation)
-    assert psnr(fresh.shot(), ours("polarguide-stokes", "final", seen)) > LEAST
+    shot = fresh.shot()[: size[1], : size[0]]  # the stage may end within a pixel
+    assert psnr(shot, ours("polarguide-stokes", "final", seen)) > LEAST
 
 
 def test_a_presented_page_shows_white_scale_and_credit_and_turns_about_its_axis(

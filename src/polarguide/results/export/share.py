@@ -41,12 +41,13 @@ SLOTS = {
     "color": (32, "3<f2"),
     "axis": (38, "3<i2"),
     "side": (44, "<u2"),
+    "roughness": (46, "<u2"),
     "features": (48, "4<i2"),
     "harmonics": (48, "45i1"),
     "own_color": (96, "3<f2"),
     "own_harmonics_scale": (102, "<f2"),
     "own_harmonics": (112, "45i1"),
-    "metal": (160, "4<f2"),
+    "metal": (160, "3<f2"),
 }
 """First byte and NumPy type of what a record can hold; a shading model gives ``share`` and what has a color.
 
@@ -56,12 +57,12 @@ A record is a few texels of 16 bytes, what a texture of the graphics card can ho
 ===== ==================================================================================================
 texel content
 ===== ==================================================================================================
-0     mean 3 x float32; opacity u16; ``share`` u16 (strength or roughness)
+0     mean 3 x float32; opacity u16; ``share`` u16 (strength, or the roughness of Ref-GS)
 1     rotation (w, x, y, z) 4 x i16; logarithms of the scales 3 x f16; scale of ``harmonics`` f16
-2     ``color`` of degree 0 (or albedo) 3 x f16; normal axis 3 x i16; side u16 (1: the axis points outward)
+2     ``color`` of degree 0 (or albedo) 3 x f16; normal axis 3 x i16; side u16 (1: outward); ``roughness`` u16
 3-5   ``harmonics`` of degrees 1 to 3, 45 signed bytes in steps of their scale; or ``features`` 4 x i16 in texel 3
 6-9   light of its own: ``own_color`` of degree 0 3 x f16, scale f16; then ``own_harmonics`` as above
-10    ``metal``: reflectance 3 x f16, roughness f16; 0 of what is not a metal
+10    ``metal``: reflectance 3 x f16; 0 of what is not a metal
 ===== ==================================================================================================
 
 The harmonics' scale is each Gaussian's own: the largest of its 45 values is 127 steps. A shading model says which of
@@ -182,8 +183,9 @@ SHADERS = {
     "light": "light.glsl",
     "shade": "shade.frag",
 }
-LAYERS = ("final", "diffuse", "specular", "base", "strength", "normal", "metalness")
+LAYERS = ("final", "diffuse", "specular", "base", "strength", "normal", "metalness", "roughness")
 """Layers that the page can show, in its order."""
+_SHOWN_WITH = {"metalness": {"metal"}, "roughness": {"roughness"}}
 BAKED = (
     "This page has no shaders for the reflections of this model. Each Gaussian shows its color toward the eye, with "
     "reflections baked into spherical harmonics of degree 3, which keep broad highlights and no mirror images."
@@ -226,7 +228,7 @@ def share_page(
         "texels": quantized.itemsize // TEXEL,
         "count": len(quantized),
         "layers": [
-            name for name in LAYERS if name in layers and (name != "metalness" or "metal" in shaded.values)
+            name for name in LAYERS if name in layers and shaded.values.keys() >= _SHOWN_WITH.get(name, set())
         ],
         "index": 1.5,
         "resolution": int(shaded.light[0].shape[1]) if shaded.light else 1,

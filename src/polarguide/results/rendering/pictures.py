@@ -32,6 +32,7 @@ _RADIANCE = "linear radiance, R G B; 1 is full scale of the photograph S0/2"
 UNITS = {
     **dict.fromkeys(("final", "base", "reflection", "specular", "diffuse"), _RADIANCE),
     "strength": "share of the reflection, 0 to 1",
+    "roughness": "square root of GGX's alpha, 0 to 1, as glTF has it; a mirror's is that of a texel of the light",
     "metalness": "share of metals, 0 to 1",
     "normal": "world axes of the scene, x y z; blended, so up to length 1, and 0 where nothing is",
     "depth": "distance along the camera's axis, in the scene's units",

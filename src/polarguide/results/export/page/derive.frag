@@ -2,7 +2,7 @@
 layout(location = 0) out vec4 color;  // base color or albedo; strength or roughness; of metals see splat.frag
 layout(location = 1) out vec4 normal;  // world axes, toward the eye; opacity
 #if defined(LOCAL) || defined(DIRECTIONAL)
-layout(location = 2) out vec4 further; // light of its own, or features
+layout(location = 2) out vec4 further; // light of its own, roughness; or features
 #endif
 uniform vec3 eye;
 uniform int count;
@@ -60,14 +60,14 @@ void main() {
 #endif
 #ifdef METAL
   uvec4 t10 = texel(gaussian, 10);
-  vec4 metal = vec4(unpackHalf2x16(t10.x), unpackHalf2x16(t10.y));
-  if (metal.r > 0.0) color = vec4(metal.rgb, -1.0 - metal.a);
+  vec3 metal = vec3(unpackHalf2x16(t10.x), unpackHalf2x16(t10.y).x);
+  if (metal.r > 0.0) color = vec4(metal, -1.0);
 #endif
 #ifdef LOCAL
   uvec4 t6 = texel(gaussian, 6);
   vec3 mirrored = ray - 2.0 * dot(ray, axis) * axis;
   vec3 own = vec3(unpackHalf2x16(t6.x), unpackHalf2x16(t6.y).x);
   own = 0.28209479177387814 * own + harmonics(gaussian, 7, unpackHalf2x16(t6.y).y, mirrored);
-  further = vec4(own, 0.0);
+  further = vec4(own, float(t2.w >> 16) / 65535.0);
 #endif
 }

@@ -1,5 +1,5 @@
 // In the order of the indices in shade.frag.
-const LAYERS = ["final", "diffuse", "specular", "base", "strength", "normal", "metalness"];
+const LAYERS = ["final", "diffuse", "specular", "base", "strength", "normal", "metalness", "roughness"];
 const byId = (id) => document.getElementById(id);
 
 class Page {

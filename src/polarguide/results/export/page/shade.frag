@@ -4,7 +4,7 @@ uniform mat3 rotation; // world to camera
 uniform mat3 turn;     // of the environment, world to learned axes
 uniform vec4 lens;
 uniform vec2 size;
-uniform int layer;     // 0 final, 1 diffuse, 2 specular, 3 base, 4 strength, 5 normal, 6 metalness
+uniform int layer;     // 0 final, 1 diffuse, 2 specular, 3 base, 4 strength, 5 normal, 6 metalness, 7 roughness
 uniform float split;   // left of this column stands the diffuse layer
 uniform float gain;    // on the specular layer
 uniform float exposure;
@@ -58,14 +58,15 @@ vec3 radiance(vec3 direction, float roughness, vec4 feature) {
 }
 #endif
 
-#ifdef METAL
-const float METAL_BLUR = 4.0, LEAST_METAL = 0.01; // of shading/metal.py
-uniform int mips; // of the radiance, behind the raw texels
+#ifdef FRESNEL
+const float LEVELS_OF_ROUGHNESS = 4.0; // of shading/deferred.py
+uniform float mirror; // GGX's alpha of a roughness of 0
 
 // Radiance from a direction, blurred by so many levels; as cubemap.py.
 vec3 blurred(vec3 direction, float level) {
-  level = clamp(level, 0.0, float(mips - 1));
-  int lower = min(int(level), mips - 2), first = 6 * (resolution + 2) * (resolution + 2), n = resolution;
+  if (levels == 1) return lookUp(0, resolution, 1, 0, direction).rgb;
+  level = clamp(level, 0.0, float(levels - 1));
+  int lower = min(int(level), levels - 2), first = 0, n = resolution;
   for (int k = 0; k < lower; ++k) {
     first += 6 * (n + 2) * (n + 2);
     n = max(n / 2, 1);
@@ -74,6 +75,10 @@ vec3 blurred(vec3 direction, float level) {
   vec3 coarse = lookUp(first + 6 * (n + 2) * (n + 2), max(n / 2, 1), 1, 0, direction).rgb;
   return mix(fine, coarse, level - float(lower));
 }
+#endif
+
+#ifdef METAL
+const float LEAST_METAL = 0.01; // of shading/metal.py
 
 // (Rs + Rp) / 2 of a conductor by its reflectance at normal incidence; as optics/conductor.py.
 vec3 conductor(float cosine, vec3 reflectance) {
@@ -96,7 +101,7 @@ void main() {
   vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
   vec3 ray = transpose(rotation) * normalize(vec3((pixel - lens.zw) / lens.xy, 1.0));
   vec3 diffuse = base.rgb, specular = vec3(0.0);
-  float strength = 0.0;
+  float strength = 0.0, rough = 0.0;
 #ifdef LIT
   vec3 facing = normal * inversesqrt(max(squared, 1e-6));
   vec3 direction = turn * (ray - 2.0 * dot(ray, facing) * facing);
@@ -107,11 +112,11 @@ void main() {
   if (base.a > 0.05)
     specular = min(last.z / base.a, 1.0) * radiance(direction, further.x, vec4(further.yz, last.xy));
 #else
-  vec3 raw = lookUp(0, resolution, 1, 0, direction).rgb;
 #ifdef FRESNEL
-  vec3 lit = exp(min(raw, MAXIMUM_LOG));
+  rough = min(further.z / max(base.a, 1e-6), 1.0);
+  vec3 lit = blurred(direction, LEVELS_OF_ROUGHNESS * rough);
 #else
-  vec3 lit = 1.0 / (1.0 + exp(-raw));
+  vec3 lit = 1.0 / (1.0 + exp(-lookUp(0, resolution, 1, 0, direction).rgb));
 #endif
 #ifdef LOCAL
   lit = max(lit + texelFetch(target3, at, 0).rgb, 0.0);
@@ -122,10 +127,7 @@ void main() {
   specular = strength * 0.5 * (s2 * s2 + p2 * p2) * lit;
 #ifdef METAL
   float metal = further.y;
-  if (metal > LEAST_METAL) {
-    vec3 seen = max(blurred(direction, METAL_BLUR * further.z / metal) + texelFetch(target3, at, 0).rgb, 0.0);
-    specular += metal * conductor(c, texelFetch(target4, at, 0).rgb / metal) * seen;
-  }
+  if (metal > LEAST_METAL) specular += metal * conductor(c, texelFetch(target4, at, 0).rgb / metal) * lit;
 #endif
 #else
   specular = strength * lit;
@@ -140,6 +142,12 @@ void main() {
 #ifdef METAL
   if (which == 6)
     seen = texelFetch(viridis, ivec2(int(clamp(further.y, 0.0, 1.0) * 255.0 + 0.5), 0), 0).rgb;
+#endif
+#ifdef FRESNEL
+  if (which == 7) { // as glTF has it
+    float root = sqrt(mirror * exp2(LEVELS_OF_ROUGHNESS * rough));
+    seen = texelFetch(viridis, ivec2(int(clamp(root, 0.0, 1.0) * 255.0 + 0.5), 0), 0).rgb;
+  }
 #endif
   if (which == 5) {
     float size_ = sqrt(squared);

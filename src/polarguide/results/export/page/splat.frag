@@ -27,14 +27,14 @@ void main() {
   float surface = dot(further, further) > 0.0 ? 1.0 : 0.0;
   target3 = vec4(alpha * vec3(further.zw, surface), alpha);
 #elif defined(METAL)
-  // A metal has no base color and no strength: its reflectance stands in place of the one, -1 - roughness of the other.
+  // A metal has no base color and no strength: its reflectance stands in place of the one, -1 of the other.
   bool metal = color.a < 0.0;
   if (metal) target0.rgb = vec3(0.0);
-  target2 = vec4(alpha * (metal ? vec3(0.0, 1.0, -1.0 - color.a) : vec3(color.a, 0.0, 0.0)), alpha);
+  target2 = vec4(alpha * (metal ? vec3(0.0, 1.0, further.a) : vec3(color.a, 0.0, further.a)), alpha);
   target3 = vec4(alpha * further.rgb, alpha);
   target4 = vec4(metal ? alpha * color.rgb : vec3(0.0), alpha);
 #elif defined(LOCAL)
-  target2 = vec4(alpha * color.a, 0.0, 0.0, alpha);
+  target2 = vec4(alpha * vec3(color.a, 0.0, further.a), alpha);
   target3 = vec4(alpha * further.rgb, alpha);
 #elif defined(LIT)
   target2 = vec4(alpha * color.a, 0.0, 0.0, alpha);
