@@ -13,6 +13,7 @@ import pytest
 import torch
 from camera_files import write_mosaics
 from faults import Fault
+from reduced_demo import VIEWS
 from safetensors.torch import load_file
 from trainings import different
 
@@ -70,9 +71,9 @@ def test_every_public_name_is_there() -> None:
         _ = polarguide.nothing
 
 
-def test_the_demo_scene_is_a_folder_like_any_other(demo_scene: Path) -> None:
+def test_the_demo_scene_is_a_folder_like_any_other() -> None:
     scene = polarguide.load_scene(polarguide.demo_scene(), views=["v000"])
-    assert scene.root == demo_scene
+    assert scene.root == polarguide.demo_scene()
     assert scene.view("v000").camera.width == 128
 
 
@@ -111,7 +112,7 @@ def test_training_is_silent_and_tells_the_reporter(
     assert len(steps) == 12
     assert listener.tracked["training"][0] == 12
     assert "PSNR" in listener.tracked["training"][1]
-    assert listener.tracked["reading demo"][0] == 50
+    assert listener.tracked["reading demo"][0] == len(VIEWS)
     record = run.evaluate()
     validate_metrics(record)
     assert record == run.metrics() == polarguide.open_run(tmp_path / "run").metrics()
