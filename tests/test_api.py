@@ -2,9 +2,9 @@
 
 import contextlib
 import json
+import runpy
 import shutil
 import signal
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -260,12 +260,15 @@ def test_a_film_and_pictures_from_python(trained: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
-def test_examples_run(example: Path, trained: Path, demo_scene: Path, tmp_path: Path) -> None:
+def test_examples_run(
+    example: Path, trained: Path, demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
     trains = "polarguide.train(" in example.read_text()
     given = [str(demo_scene), str(tmp_path / "out"), "8"] if trains else [str(trained), str(tmp_path / "out")]
-    done = subprocess.run([sys.executable, str(example), *given], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout
+    monkeypatch.setattr(sys, "argv", [str(example), *given])
+    runpy.run_path(str(example), run_name="__main__")
+    assert capsys.readouterr().out
 
 
 def test_measuring_is_silent_and_gives_the_outcome(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
