@@ -87,19 +87,10 @@ $(VENV)/.installed: $(SOURCES) | $(VENV)/pyvenv.cfg
 	$(PIP_INSTALL) .
 	@touch $@
 
-$(VENV)/.installed-synth: $(SOURCES) | $(VENV)/pyvenv.cfg
-	$(PIP_INSTALL) '.[synth]'
-	@touch $(VENV)/.installed $@
-
-$(VENV)/.installed-test: $(SOURCES) | $(VENV)/pyvenv.cfg
-	@echo "Building and installing polarguide and its test tools into $(VENV); the first time takes minutes."
-	$(PIP_INSTALL) '.[test]'
-	@touch $(VENV)/.installed $@
-
-$(VENV)/.installed-docs: $(SOURCES) | $(VENV)/pyvenv.cfg
-	@echo "Building and installing polarguide and Sphinx into $(VENV); the first time takes minutes."
-	$(PIP_INSTALL) '.[docs]'
-	@touch $(VENV)/.installed $@
+# What an extra adds, to the polarguide that is installed: building it anew for each would take minutes.
+$(VENV)/.installed-%: $(VENV)/.installed
+	$(PIP_INSTALL) 'polarguide[$*]'
+	@touch $@
 
 $(VENV)/pyvenv.cfg:
 	@$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 10) else \

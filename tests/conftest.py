@@ -16,6 +16,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch
+from reduced_demo import write_reduced_demo
 from tiny import make_busy_recipe, make_scene
 
 import polarguide
@@ -39,9 +40,15 @@ SHORT = ("--downscale", "4", "--steps", str(STEPS), "--threads", "1")
 
 
 @pytest.fixture(scope="session")
-def demo_scene() -> Path:
+def demo_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the scene that ships with the package, with 14 of its 50 views. Tests leave it as it is."""
+    return write_reduced_demo(tmp_path_factory.mktemp("reduced") / "demo")
+
+
+@pytest.fixture(scope="session")
+def whole_demo() -> Path:
     """The folder of the scene that ships with the package."""
-    return Path(polarguide.__file__).parent / "data" / "demo"
+    return polarguide.demo_scene()
 
 
 @pytest.fixture(scope="session")
@@ -72,6 +79,12 @@ def tiny_scene() -> Scene:
 @pytest.fixture
 def busy_recipe() -> Recipe:
     return make_busy_recipe()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files with slow tests first: at the end, one of them would keep one worker busy and leave the others idle."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

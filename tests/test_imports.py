@@ -74,6 +74,17 @@ def imported_rooms(node, parts, rooms):
     return [alias.name if alias.name in known else ROOT for alias in node.names]
 
 
+def imports(node, deferred=False, typing=False):
+    """Import statements below a node: each, whether a function has it, and whether it is for type checkers alone."""
+    deferred |= isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+    typing |= isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    for inner in ast.iter_child_nodes(node):
+        if isinstance(inner, (ast.Import, ast.ImportFrom)):
+            yield inner, deferred, typing
+        elif not isinstance(inner, ast.expr):  # expressions have no statements in them
+            yield from imports(inner, deferred, typing)
+
+
 def faults(source, rooms=ROOMS):
     """What breaks the order in the package at ``source``, one line each."""
     found = []
@@ -86,26 +97,14 @@ def faults(source, rooms=ROOMS):
             found.append(f"{where}: the room {room} has no place in the order")
             continue
         tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
-        functions = [
-            n for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
-        ]
-        deferred = {id(n) for function in functions for n in ast.walk(function)}
-        typing = {
-            id(n)
-            for test in ast.walk(tree)
-            if isinstance(test, ast.If) and ast.unparse(test.test) == "TYPE_CHECKING"
-            for n in ast.walk(test)
-        }
-        for node in ast.walk(tree):
-            if not isinstance(node, (ast.Import, ast.ImportFrom)):
-                continue
+        for node, deferred, typing in imports(tree):
             line = f"{where}:{node.lineno}"
             if any(alias.name == "*" for alias in node.names):
                 found.append(f"{line}: star import")
             targets = imported_rooms(node, parts, rooms)
-            if room == ROOT and id(node) in typing:
+            if room == ROOT and typing:
                 continue
-            if targets and id(node) in deferred:
+            if targets and deferred:
                 found.append(f"{line}: project import inside a function")
             for target in targets:
                 if target in (ROOT, room):
@@ -136,8 +135,10 @@ def clients_of_the_command_line(root):
     allowed = ("src/polarguide/cli/", "src/polarguide/__main__.py", "tests/cli/", "tests/robustness/")
     found = []
     for path in sorted(p for folder in FOLDERS for p in (root / folder).rglob("*.py")):
-        name = path.relative_to(root).as_posix()
-        tree = ast.parse(path.read_text(encoding="utf-8"), name)
+        name, text = path.relative_to(root).as_posix(), path.read_text(encoding="utf-8")
+        if "cli" not in text:  # most, and parsing them takes long
+            continue
+        tree = ast.parse(text, name)
         modules = {alias.name for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names}
         for node in (n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)):
             module = ("polarguide." if node.level else "") + (node.module or "")

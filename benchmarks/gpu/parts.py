@@ -172,7 +172,7 @@ def trained(job: Job, name: str) -> TrainingState:
 
 def stress(job: Job) -> dict[str, Any]:
     """A million Gaussians at 1224 x 1024."""
-    count, size = (20_000, (160, 128)) if job.tiny else (1_000_000, (1224, 1024))
+    count, size = (10_000, (96, 80)) if job.tiny else (1_000_000, (1224, 1024))
     state = trained(job, "spheres")
     gaussians = Gaussians(split_to(state, count), RECIPE.rates)
     state = TrainingState(0, gaussians, state.environment, DensityStatistics(count, 1, job.backend.device))
@@ -181,7 +181,7 @@ def stress(job: Job) -> dict[str, Any]:
 
 def parts_of(tiny: bool) -> dict[str, Callable[[Job], dict[str, Any]]]:
     """What there is to do, in order."""
-    short, paper = (40, 60) if tiny else (3000, 97_000)
+    short, paper = (10, 20) if tiny else (3000, 97_000)
 
     def train_short(name: str) -> Callable[[Job], dict[str, Any]]:
         return lambda job: train_on(job, name, short, job.out / f"train-{name}")

@@ -91,8 +91,8 @@ def test_a_capture_without_poses(unposed: Path, tmp_path: Path, capsys: pytest.C
     assert not re.search(r"url\(|@import|https?:", page)
 
 
-def test_a_capture_with_poses_and_points_alone(demo_scene: Path, tmp_path: Path) -> None:
-    record, _ = inspected(demo_scene, tmp_path / "out", "--normals", "points")
+def test_a_capture_with_poses_and_points_alone(whole_demo: Path, tmp_path: Path) -> None:
+    record, _ = inspected(whole_demo, tmp_path / "out", "--normals", "points")
     verdicts = {check["key"]: check["verdict"] for check in record["checks"]}
     assert verdicts["angle_order"] == "not verified"  # its few small views leave too few observations
     assert record["angles"]["sources"][0]["usable"] is False

@@ -264,7 +264,10 @@ def test_resuming_a_finished_run_changes_nothing(
     assert differing(tmp_path / "run", trained) == []
 
 
-def test_the_demo_trains_scores_and_renders_and_can_be_gone_on_with(tmp_path: Path) -> None:
+def test_the_demo_trains_scores_and_renders_and_can_be_gone_on_with(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(polarguide, "demo_scene", lambda: demo_scene)
     for _ in range(2):
         assert run(["demo", "--out", str(tmp_path / "run"), "--steps", "8", "--threads", "1"]) == 0
         validate_metrics(json.loads((tmp_path / "run" / "metrics.json").read_text()))

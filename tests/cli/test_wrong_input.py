@@ -211,7 +211,7 @@ def test_resume_with_another_scene(
     refused: Refused, tmp_path: Path, demo_scene: Path, trained: Path, short
 ) -> None:
     other = Path(shutil.copytree(demo_scene, tmp_path / "demo"))
-    shutil.copy(other / "polar" / "v003_000.png", other / "polar" / "v005_000.png")
+    shutil.copy(other / "polar" / "v003_000.png", other / "polar" / "v011_000.png")
     assert "(scene_digest)" in refused("train", other, "--out", trained, "--resume", *short)
 
 

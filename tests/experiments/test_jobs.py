@@ -1,6 +1,7 @@
 """Child processes: failures stay alone, Ctrl-C loses nothing, and the worker does what it is sent."""
 
 import contextlib
+import io
 import json
 import os
 import signal
@@ -18,6 +19,7 @@ from polarguide.core.options import ComputeOptions, SceneOptions
 from polarguide.core.progress import Advance, Reporter
 from polarguide.core.records import decode
 from polarguide.core.system import interrupt
+from polarguide.experiments import worker
 from polarguide.experiments.jobs import Job, last_row, run_jobs
 from polarguide.experiments.worker import COMMAND, Scoring, Training, encoded
 from polarguide.runs.folder import CHECKPOINT, LOG
@@ -275,12 +277,21 @@ def test_nothing_is_imported_from_the_current_folder(demo_scene: Path, tmp_path:
     ],
 )
 def test_a_wrong_task_is_refused_in_one_line(
-    demo_scene: Path, tmp_path: Path, change: dict[str, object], said: str
+    demo_scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    change: dict[str, object],
+    said: str,
 ) -> None:
     data = msgspec.to_builtins(training(demo_scene, tmp_path / "run")) | change
-    done = work(json.dumps(data).encode(), tmp_path)
-    assert done.returncode == 2
-    (line,) = done.stderr.decode().splitlines()
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(json.dumps(data).encode())))
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        assert worker.main() == 2
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    (line,) = capsys.readouterr().err.splitlines()
     assert said in line
     assert not (tmp_path / "run").exists()
 

@@ -67,9 +67,10 @@ def test_it_finds_a_ball_beside_the_middle_and_smaller_than_it_starts() -> None:
         weights=replace(RECIPE_GNERP.weights, aolp=0.0, guidance=0.0),
     )
     scene = textured_ball(views=34, width=64, height=48, radius=ball_radius())
-    made = trainer(scene, 600, recipe)
+    steps = 300
+    made = trainer(scene, steps, recipe)
     assert normal_error(FieldModel(made.state, recipe, CPU), scene) > 15
-    while made.state.step < 600:
+    while made.state.step < steps:
         made.step()
     assert normal_error(FieldModel(made.state, recipe, CPU), scene) < 10
 

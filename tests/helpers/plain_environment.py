@@ -1,16 +1,18 @@
 """What ``pip install .`` gives in a new environment, without downloading anything again.
 
 Files of the distributions that polarguide declares, and of those that these declare, are linked into an environment of
-their own: no extra, and nothing of what the tests use, can be imported there.
+their own: no extra, and nothing of what the tests use, can be imported there. The demo scene has few of its views.
 """
 
 import csv
+import shutil
 import venv
 from importlib import metadata
 from pathlib import Path
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from reduced_demo import write_reduced_demo
 
 import polarguide
 
@@ -62,8 +64,10 @@ def make_plain_environment(folder: Path) -> Path:
             if not link.exists():
                 link.parent.mkdir(parents=True, exist_ok=True)
                 link.symlink_to(str(distribution.locate_file(name)))
-    # The copy that the tests import.
-    (site / "polarguide").symlink_to(Path(polarguide.__file__).parent)
+    # The files that the tests import, compiled ones too. What the demo does takes as long as it has views.
+    package = Path(polarguide.__file__).parent
+    shutil.copytree(package, site / "polarguide", ignore=shutil.ignore_patterns("demo"))
+    write_reduced_demo(site / "polarguide" / "data" / "demo")
     program = folder / "bin" / "polarguide"
     program.write_text(
         f"#!{folder / 'bin' / 'python'}\nimport sys\nfrom polarguide.__main__ import main\nsys.exit(main())\n"

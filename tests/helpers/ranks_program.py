@@ -1,8 +1,10 @@
-"""Run by torchrun: trains the tiny scene and writes every rank's state to OUT/RANK.
+"""Run by torchrun: trains the tiny scene, once for each job of a JSON file, and writes every rank's state.
 
-Arguments: OUT, STEPS, VIEWS, and where to stop and a folder with a checkpoint to go on from ("" for none).
+A job is an object: ``out``, into which OUT/RANK is written, ``steps``, ``views`` a step, ``until`` which step, and
+``begun``, a folder with a checkpoint to go on from ("" for none). Processes start once for all, which takes seconds.
 """
 
+import json
 import sys
 from pathlib import Path
 
@@ -18,19 +20,19 @@ from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer
 
 torch.set_num_threads(1)
-out, steps, views, until = Path(sys.argv[1]), *(int(number) for number in sys.argv[2:5])
 dist.init_process_group("gloo")
 ranks = SeveralRanks()
 scene, recipe, backend = make_scene(), make_busy_recipe(), choose_backend("cpu")
-settings = resolve(TrainSettings(steps, 3, views_per_step=views), scene, recipe)
-state = load_checkpoint(Path(sys.argv[5]), recipe) if sys.argv[5] else None
-trainer = Trainer(scene, recipe, settings, backend, state, ranks)
-trainer.run(lambda _: None, until=until)
-trainer.exchange_statistics()
-folder = out / str(ranks.rank)
-folder.mkdir(parents=True)
-save_checkpoint(folder, trainer.state)
-ranks.barrier()
+for job in json.loads(Path(sys.argv[1]).read_text()):
+    settings = resolve(TrainSettings(job["steps"], 3, views_per_step=job["views"]), scene, recipe)
+    state = load_checkpoint(Path(job["begun"]), recipe) if job["begun"] else None
+    trainer = Trainer(scene, recipe, settings, backend, state, ranks)
+    trainer.run(lambda _: None, until=job["until"])
+    trainer.exchange_statistics()
+    folder = Path(job["out"], str(ranks.rank))
+    folder.mkdir(parents=True)
+    save_checkpoint(folder, trainer.state)
+    ranks.barrier()
 dist.destroy_process_group()
 # Threads of the group that outlive it may abort the interpreter as it ends.
 left = [path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")]

@@ -122,8 +122,8 @@ def test_no_filter_and_unknown_angles() -> None:
 
 
 @pytest.mark.slow
-def test_a_folder_of_single_shots(demo_scene: Path, tmp_path: Path) -> None:
-    scene = single_shots(demo_scene, tmp_path / "shots", wrong=(11,))
+def test_a_folder_of_single_shots(whole_demo: Path, tmp_path: Path) -> None:
+    scene = single_shots(whole_demo, tmp_path / "shots", wrong=(11,))
     polarguide.inspect(scene, tmp_path / "out", settings=InspectSettings(steps=600))
     record = json.loads((tmp_path / "out" / "inspection.json").read_text())
     verdicts = {check["key"]: check["verdict"] for check in record["checks"]}

@@ -103,8 +103,8 @@ def test_gaps_and_few_views_are_named(posed, monkeypatch) -> None:
     assert (check.verdict, check.views) == ("warning", ("v11",))
 
 
-def test_a_turned_camera_of_the_demo_stands_out(demo_scene) -> None:
-    capture = read_capture(demo_scene)
+def test_a_turned_camera_of_the_demo_stands_out(whole_demo) -> None:
+    capture = read_capture(whole_demo)
     errors = view_errors(epipolar_errors(capture))
     name = min(errors, key=lambda view: errors[view])
     angle = 0.04

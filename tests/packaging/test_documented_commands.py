@@ -1,9 +1,12 @@
 """Every command and every Python block that README and get-started show works after a plain ``pip install .``.
 
 They run as they are written, page by page, on small inputs, with options behind them that make them short. A command
-that this file does not know how to shorten, or an input that it cannot make, is a failure.
+that this file does not know how to shorten, or an input that it cannot make, is a failure. The first command and the
+first Python block are processes of their own, as a user starts them; the others run in forks of a process of the same
+environment that has imported the package.
 """
 
+import json
 import os
 import re
 import shlex
@@ -41,6 +44,7 @@ EXCLUDED = {
     "make docs": "CI runs it",
     "pip install .": "leaves the environment in which all others run here",
 }
+SERVER = Path(__file__).with_name("served_commands.py")
 STEPS = 120  # after so many the relief has a surface, of which a mesh can be made
 SHORT = {
     "demo": ["--steps", "12"],
@@ -48,7 +52,7 @@ SHORT = {
     "prepare": [],
     "inspect": ["--steps", "50"],
     "inspect --fix": [],  # its decision takes a trained model
-    "train": ["--steps", str(STEPS)],
+    "train": ["--steps", str(STEPS), "--downscale", "2"],
     "eval": [],
     "view": [],
     "render": [],
@@ -57,9 +61,12 @@ SHORT = {
     "export": ["--resolution", "32"],
     "synth": [],
     "priors": [],
+    "priors --run": ["--downscale", "2"],  # as the run was trained
     "measure": [],
 }
 """What is added to each verb, or to a verb with an option: it may do less, and has to do it in the same way."""
+SHORT_PYTHON = {r"steps=\d+": f"steps={STEPS}", r'load_scene\("SCENE"\)': 'load_scene("SCENE", downscale=2)'}
+"""As ``SHORT``, for blocks of Python."""
 WITHOUT_EXTRA = ("synth",)
 """Verbs that may say in one line what they lack."""
 PATIENCE = 900.0
@@ -155,6 +162,13 @@ class Reader:
         self.typed = set(EXCLUDED)
         self.environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
         self.environment["PATH"] = f"{programs}{os.pathsep}{self.environment['PATH']}"
+        self.started: set[str] = set()
+        self.server: subprocess.Popen[str] | None = None
+
+    def end(self) -> None:
+        """End the process from which commands are forked."""
+        if self.server is not None:
+            self.server.communicate(timeout=PATIENCE)
 
     def command(self, text: str) -> None:
         """Run a command line of the shell. What it needs is made; what was there before under such names comes back."""
@@ -167,7 +181,8 @@ class Reader:
         before = self.set_aside([*made, *outputs])
         for name, make in made.items():
             make(self.folder / name)
-        whole = [program, verb, *words, *SHORT.get(kind, SHORT[verb])]
+        short = next((SHORT[f"{verb} {word}"] for word in words if f"{verb} {word}" in SHORT), SHORT[verb])
+        whole = [program, verb, *words, *short]
         if verb == "view":
             self.visit(whole)
         elif verb in WITHOUT_EXTRA:
@@ -181,25 +196,53 @@ class Reader:
     def python(self, code: str) -> None:
         """Run a block of code, with few steps."""
         before = self.set_aside(["runs/mine"] if "pg.train(" in code else [])
-        self.run(["python", "-W", "error", "-c", re.sub(r"steps=\d+", f"steps={STEPS}", code)])
+        for long, short in SHORT_PYTHON.items():
+            code = re.sub(long, short, code)
+        self.run(["python", "-W", "error", "-c", code])
         self.restore(before)
 
-    def run(self, words: list[str], status: int = 0) -> subprocess.CompletedProcess[str]:
+    def run(self, words: list[str], status: int = 0) -> str:
+        """Run a program; returns what it printed."""
+        first = words[0] not in self.started
+        self.started.add(words[0])
+        found, text = self.run_started(words) if first else self.run_forked(words)
+        assert found == status, f"{shlex.join(words)}\n{text}"
+        return text
+
+    def run_started(self, words: list[str]) -> tuple[int, str]:
+        """In a process of its own; its exit status, and what it printed."""
         done = subprocess.run(
             [self.programs / words[0], *words[1:]],
             cwd=self.folder,
             env=self.environment,
             text=True,
-            capture_output=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
             stdin=subprocess.DEVNULL,
             timeout=PATIENCE,
         )
-        assert done.returncode == status, f"{shlex.join(words)}\n{done.stdout}{done.stderr}"
-        return done
+        return done.returncode, done.stdout
+
+    def run_forked(self, words: list[str]) -> tuple[int, str]:
+        """In a fork of a process that has imported the package; as ``run_started``."""
+        if self.server is None:
+            self.server = subprocess.Popen(
+                [self.programs / "python", SERVER],
+                cwd=self.folder,
+                env=self.environment,
+                text=True,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+            )
+        asked = {"code": words[-1]} if words[0] == "python" else {"words": words}
+        self.server.stdin.write(json.dumps({"folder": str(self.folder), **asked}) + "\n")
+        self.server.stdin.flush()
+        answer = json.loads(self.server.stdout.readline())
+        return answer["status"], answer["text"]
 
     def turned_away(self, words: list[str], outputs: list[str]) -> None:
         """Run a command whose extra is not installed: one line says how to add it, and nothing is written."""
-        (line,) = self.run(words, status=2).stderr.splitlines()
+        (line,) = self.run(words, status=2).splitlines()
         assert re.search(r"pip install \S*\[" + words[1] + r"\]", line), line
         assert not any((self.folder / name).exists() for name in outputs)
 
@@ -252,8 +295,10 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def reader(programs: Path, tmp_path_factory: pytest.TempPathFactory) -> Reader:
-    return Reader(programs, tmp_path_factory.mktemp("reader"))
+def reader(programs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reader]:
+    made = Reader(programs, tmp_path_factory.mktemp("reader"))
+    yield made
+    made.end()
 
 
 def test_the_environment_has_what_is_declared_and_no_more(programs: Path) -> None:

@@ -30,6 +30,12 @@ IMPORTED = (
 
 
 def warm_up() -> None:
+    """Import all, and let recipes begin with fewer Gaussians."""
+    import_all()
+    _shrink(importlib.import_module("polarguide.recipes.registry"))
+
+
+def import_all() -> None:
     """Import what the verbs import, and compute what they keep; starts no thread, which a fork would lose."""
     for name in IMPORTED:
         importlib.import_module(name)
@@ -40,7 +46,6 @@ def warm_up() -> None:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
             app.run([verb, "--help"])
     importlib.import_module("polarguide.results.evaluation.sources").code_digest()
-    _shrink(importlib.import_module("polarguide.recipes.registry"))
     tasks = Path("/proc/self/task")
     threads = [(task / "comm").read_text().strip() for task in tasks.iterdir()] if tasks.exists() else []
     assert len(threads) <= 1, (

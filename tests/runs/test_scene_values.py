@@ -205,9 +205,9 @@ def test_the_run_records_which_views_were_held_out(demo_scene: Path, tmp_path: P
     Fault("test_views").raised_by(polarguide.train, scene, tmp_path / "directions", **again)
 
 
-def test_opening_a_run_does_not_judge_a_split_that_is_not_its_own(demo_scene: Path, tmp_path: Path) -> None:
+def test_opening_a_run_does_not_judge_a_split_that_is_not_its_own(whole_demo: Path, tmp_path: Path) -> None:
     scene = tmp_path / "scene"
-    shutil.copytree(demo_scene, scene, ignore=shutil.ignore_patterns("split.json"))
+    shutil.copytree(whole_demo, scene, ignore=shutil.ignore_patterns("split.json"))
     run = polarguide.train(scene, tmp_path / "run", settings=TrainSettings(steps=2), reading=READING)
     first = run.scene.views[0].name  # held out by its place among the names
     far = dataclasses.replace(run.scene.views[0].camera, translation=torch.tensor([50.0, 0.0, 0.0]).double())

@@ -111,7 +111,7 @@ def test_a_scene_with_poses_keeps_its_pictures_and_gets_maps_on_demand(tmp_path:
 
 def test_what_is_written_is_of_the_views_of_the_scene_that_is_given(demo_scene: Path, tmp_path: Path) -> None:
     """Not of the files in its folder: a view may have another mask, other pictures, or another frame of its angles."""
-    scene = polarguide.load_scene(demo_scene, downscale=4, views=["v000", "v008"])
+    scene = polarguide.load_scene(demo_scene, downscale=4, views=["v000", "v011"])
     view = scene.view("v000")
     mask = torch.zeros_like(view.invalid)
     mask[:, 10:] = True
@@ -124,7 +124,7 @@ def test_what_is_written_is_of_the_views_of_the_scene_that_is_given(demo_scene: 
     }
     maps = {}
     for name, other in changed.items():
-        given = replace(scene, views=(other, scene.view("v008")))
+        given = replace(scene, views=(other, scene.view("v011")))
         polarguide.priors(given, tmp_path / name, views="v000", formats=["npy"])
         maps[name] = {
             key: np.load(tmp_path / name / "v000" / f"{key}.npy") for key in ("S0", "DoLP", "reason")

@@ -1,5 +1,6 @@
 """Several processes train what one process with as many views a step trains."""
 
+import json
 import os
 import signal
 import subprocess
@@ -9,7 +10,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
+from tiny import make_busy_recipe
 from torch import Tensor
 from trainings import different, make_trainer, run, trained
 
@@ -23,44 +25,68 @@ from polarguide.training.recipe import Recipe
 
 PROGRAM = Path(__file__).parents[1] / "helpers" / "ranks_program.py"
 PATIENCE = 300.0
+LONG = 120
+FEW = 4
+"""The density control comes after the last: its decisions are compared by the row counts."""
+RESUMED, UNTIL = 30, 21
 
 
-def shared(
-    out: Path, *, ranks: int, steps: int, views: int, until: int | None = None, begun: Path | None = None
-) -> list[dict[str, Tensor]]:
-    """The state of every rank at the end, or before the step ``until``, from the beginning or a checkpoint on."""
-    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", str(ranks), "--standalone"]
-    command += [str(PROGRAM), str(out), str(steps), str(views), str(until or steps), str(begun or "")]
+@pytest.fixture(scope="module")
+def shared(tiny_scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[str, Tensor]]]:
+    """The states of two ranks at the end of each training, by its name; both start once for all trainings."""
+    folder = tmp_path_factory.mktemp("ranks")
+    begun = make_trainer(tiny_scene, make_busy_recipe(), RESUMED, views_per_step=2)
+    run(begun, UNTIL)
+    save_checkpoint(folder, begun.state)
+    trainings = {
+        "whole": (LONG, 2, LONG, ""),
+        "two views each": (FEW, 4, FEW, ""),
+        "one without a view": (FEW, 1, FEW, ""),
+        "stopped": (RESUMED, 2, UNTIL, ""),
+        "gone on with": (RESUMED, 2, RESUMED, str(folder)),
+    }
+    fields = ("steps", "views", "until", "begun")
+    jobs = [
+        {"out": str(folder / name)} | dict(zip(fields, values, strict=True))
+        for name, values in trainings.items()
+    ]
+    (folder / "jobs.json").write_text(json.dumps(jobs))
+    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--standalone"]
+    command += [str(PROGRAM), str(folder / "jobs.json")]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False
     )
     assert done.returncode == 0, done.stderr
-    return [load_file(out / str(rank) / CHECKPOINT) for rank in range(ranks)]
+    return {
+        name: [load_file(folder / name / str(rank) / CHECKPOINT) for rank in range(2)] for name in trainings
+    }
 
 
 @pytest.mark.slow
 def test_two_ranks_of_one_view_are_one_process_of_two_bit_by_bit(
-    tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path
+    tiny_scene: Scene, busy_recipe: Recipe, shared: dict[str, list[dict[str, Tensor]]]
 ) -> None:
-    steps = 300
-    alone = make_trainer(tiny_scene, busy_recipe, steps, views_per_step=2)
+    alone = make_trainer(tiny_scene, busy_recipe, LONG, views_per_step=2)
     assert len({report.gaussians for report in run(alone)}) > 3, "the density control did nothing"
-    first, second = shared(tmp_path, ranks=2, steps=steps, views=2)
+    first, second = shared["whole"]
     assert different(first, second) == []
     assert different(first, alone.state.tensors()) == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("ranks", "views"), [(2, 4), (2, 1)])
+@pytest.mark.parametrize(("training", "views"), [("two views each", 4), ("one without a view", 1)])
 def test_other_shares_agree_up_to_summation_order(
-    tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path, ranks: int, views: int
+    tiny_scene: Scene,
+    busy_recipe: Recipe,
+    shared: dict[str, list[dict[str, Tensor]]],
+    training: str,
+    views: int,
 ) -> None:
-    """Two views each; and a rank without a view. The ranks decide the same, to the bit."""
-    steps = 4  # the density control comes after the last: its decisions are compared by the row counts
-    expected = trained(tiny_scene, busy_recipe, steps, views_per_step=views)
-    first, *others = shared(tmp_path, ranks=ranks, steps=steps, views=views)
-    assert all(different(first, other) == [] for other in others)
+    """The ranks decide the same, to the bit."""
+    expected = trained(tiny_scene, busy_recipe, FEW, views_per_step=views)
+    first, other = shared[training]
+    assert different(first, other) == []
     assert {n: t.shape for n, t in first.items()} == {n: t.shape for n, t in expected.items()}
     for name in ("gaussians.means", "gaussians.sh_dc", "gaussians.log_scales", "gaussians.opacity_logits"):
         # Adam's first steps have the size of the rate, whatever the gradient: where one rounds to the other side of
@@ -82,27 +108,21 @@ def test_several_views_a_step_are_resumed_bit_by_bit(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("before", "after"), [(2, 1), (1, 2)])
 def test_another_number_of_ranks_goes_on_bit_by_bit(
-    tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path, before: int, after: int
+    tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path, shared: dict[str, list[dict[str, Tensor]]]
 ) -> None:
     """Stopped between two rounds of the density control, when every rank has seen other views than the others."""
-    steps, until, views = 30, 21, 2
-    whole = make_trainer(tiny_scene, busy_recipe, steps, views_per_step=views)
-    assert len({report.gaussians for report in run(whole)[until:]}) > 1, (
+    whole = make_trainer(tiny_scene, busy_recipe, RESUMED, views_per_step=2)
+    assert len({report.gaussians for report in run(whole)[UNTIL:]}) > 1, (
         "the density control did nothing after"
     )
-    if before > 1:
-        first = shared(tmp_path, ranks=before, steps=steps, views=views, until=until)
-        assert int(first[0]["scalars"][0]) == until
-        state = load_checkpoint(tmp_path / "0", busy_recipe)
-        ends = [trained(tiny_scene, busy_recipe, steps, state=state, views_per_step=views)]
-    else:
-        begun = make_trainer(tiny_scene, busy_recipe, steps, views_per_step=views)
-        run(begun, until)
-        save_checkpoint(tmp_path, begun.state)
-        ends = shared(tmp_path / "end", ranks=after, steps=steps, views=views, begun=tmp_path)
-    assert [different(end, whole.state.tensors()) for end in ends] == [[]] * after
+    stopped = shared["stopped"][0]
+    assert int(stopped["scalars"][0]) == UNTIL
+    save_file(stopped, tmp_path / CHECKPOINT)
+    state = load_checkpoint(tmp_path, busy_recipe)
+    alone = trained(tiny_scene, busy_recipe, RESUMED, state=state, views_per_step=2)
+    ends = [alone, *shared["gone on with"]]
+    assert [different(end, whole.state.tensors()) for end in ends] == [[]] * 3
 
 
 @pytest.mark.parametrize("world", [1, 2, 3, 5])

@@ -7,7 +7,7 @@ import hashlib
 import inspect
 import subprocess
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[2]
@@ -43,21 +43,21 @@ def model_digest(kind: type) -> str:
 def _digest(folder: Path, files: Sequence[Path]) -> str:
     whole = hashlib.sha256()
     for path in sorted(files):
-        content = hashlib.sha256(_code_of(path)).hexdigest()
+        data = path.read_bytes()
+        content = _code_hash(data) if path.suffix == ".py" else hashlib.sha256(data).hexdigest()
         whole.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
     return whole.hexdigest()[:DIGITS]
 
 
-def _code_of(path: Path) -> bytes:
-    """The syntax tree of a Python file without docstrings; other files as they are."""
-    if path.suffix != ".py":
-        return path.read_bytes()
-    tree = ast.parse(path.read_bytes())
+@cache
+def _code_hash(source: bytes) -> str:
+    """Of the syntax tree without docstrings; kept, since all files take seconds, and two digests share most of them."""
+    tree = ast.parse(source)
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     for node in ast.walk(tree):
         if isinstance(node, documented) and ast.get_docstring(node, clean=False) is not None:
             del node.body[0]
-    return ast.dump(tree).encode()
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
 
 
 def commit(package: Path = PACKAGE) -> str | None:
