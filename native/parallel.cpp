@@ -15,6 +15,12 @@
 #endif
 #include <unistd.h>
 
+#if defined(__linux__) && defined(__GLIBCXX__)
+// libstdc++ 12 has this function in two versions; the older one, which does the same, is on older systems, too.
+__asm__(".symver _ZNSt18condition_variable4waitERSt11unique_lockISt5mutexE, "
+        "_ZNSt18condition_variable4waitERSt11unique_lockISt5mutexE@GLIBCXX_3.4.11");
+#endif
+
 namespace polarguide {
 namespace {
 
