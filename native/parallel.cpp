@@ -8,12 +8,18 @@
 #include <stdexcept>
 #include <system_error>
 #include <thread>
+#include <utility>
 #include <vector>
 
 #if defined(__linux__)
 #include <sched.h>
 #endif
+#if defined(_WIN32)
+#include <process.h>
+#define getpid _getpid
+#else
 #include <unistd.h>
+#endif
 
 #if defined(__linux__) && defined(__GLIBCXX__)
 // libstdc++ 12 has this function in two versions; the older one, which does the same, is on older systems, too.
@@ -75,7 +81,7 @@ class Pool {
         { // Whatever was thrown: `context` must outlive all workers.
             std::unique_lock<std::mutex> lock(mutex_);
             done_.wait(lock, [this] { return pending_ == 0; });
-            error.swap(error_);
+            std::swap(error, error_);
         }
         if (error) std::rethrow_exception(error);
     }

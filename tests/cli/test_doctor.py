@@ -99,7 +99,9 @@ def test_the_text_names_what_is_missing_and_the_command(
     assert _native.simd() in text
 
 
-def test_without_metadata_it_says_so(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_metadata_it_says_so(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """As from a checkout that is not installed: nothing can be said of packages."""
     monkeypatch.setattr(metadata, "requires", lambda _: None)
     report = doctor(capsys, 0)

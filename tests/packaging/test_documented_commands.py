@@ -58,6 +58,7 @@ SHORT = {
     "synth": [],
     "priors": [],
     "measure": [],
+    "doctor": [],
 }
 """What is added to each verb, or to a verb with an option: it may do less, and has to do it in the same way."""
 WITHOUT_EXTRA = ("synth",)
