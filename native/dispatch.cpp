@@ -3,10 +3,32 @@
 #include <cstdlib>
 #include <cstring>
 #include <initializer_list>
+#if defined(_WIN32)
+#include <intrin.h>
+#endif
 
 namespace polarguide {
 namespace {
 
+#if defined(_WIN32) && defined(POLARGUIDE_X86)
+// Clang's __builtin_cpu_supports needs a library that Microsoft's linker does not find. Bits of CPUID's leaves 1 and 7.
+__attribute__((target("xsave"))) bool available(Isa isa) {
+    if (isa == Isa::baseline) return true;
+    int one[4], seven[4];
+    __cpuid(one, 1);
+    __cpuidex(seven, 7, 0);
+    const unsigned c = unsigned(one[2]), b = unsigned(seven[1]);
+    auto all = [](unsigned value, std::initializer_list<int> bits) {
+        for (int bit : bits)
+            if (!(value >> bit & 1)) return false;
+        return true;
+    };
+    if (!all(c, {12, 27, 28})) return false; // FMA, OSXSAVE, AVX
+    const unsigned saved = unsigned(_xgetbv(0)); // the registers that the system keeps for a process
+    if (isa == Isa::avx2) return all(saved, {1, 2}) && all(b, {3, 5, 8}); // BMI1, AVX2, BMI2
+    return all(saved, {1, 2, 5, 6, 7}) && all(b, {16, 17, 28, 30, 31}); // AVX-512 F, DQ, CD, BW, VL
+}
+#else
 bool available(Isa isa) {
     if (isa == Isa::baseline) return true;
 #if defined(POLARGUIDE_X86)
@@ -19,6 +41,7 @@ bool available(Isa isa) {
     return false;
 #endif
 }
+#endif
 
 Isa best() {
     if (available(Isa::avx512)) return Isa::avx512;

@@ -8,12 +8,24 @@
 #include <stdexcept>
 #include <system_error>
 #include <thread>
+#include <utility>
 #include <vector>
 
 #if defined(__linux__)
 #include <sched.h>
 #endif
+#if defined(_WIN32)
+#include <process.h>
+#define getpid _getpid
+#else
 #include <unistd.h>
+#endif
+
+#if defined(__linux__) && defined(__GLIBCXX__)
+// libstdc++ 12 has this function in two versions; the older one, which does the same, is on older systems, too.
+__asm__(".symver _ZNSt18condition_variable4waitERSt11unique_lockISt5mutexE, "
+        "_ZNSt18condition_variable4waitERSt11unique_lockISt5mutexE@GLIBCXX_3.4.11");
+#endif
 
 namespace polarguide {
 namespace {
@@ -69,7 +81,7 @@ class Pool {
         { // Whatever was thrown: `context` must outlive all workers.
             std::unique_lock<std::mutex> lock(mutex_);
             done_.wait(lock, [this] { return pending_ == 0; });
-            error.swap(error_);
+            std::swap(error, error_);
         }
         if (error) std::rethrow_exception(error);
     }

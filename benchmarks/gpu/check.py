@@ -158,6 +158,10 @@ def build_native(environment: dict[str, str], out: Path) -> None:
         )
     unpacked = built / "unpacked"
     shutil.unpack_archive(str(next(built.glob("polarguide-*.whl"))), unpacked, "zip")
+    for stale in (ROOT / "src" / "polarguide").glob(
+        "_native*.so"
+    ):  # of one version of Python: would be loaded first
+        stale.unlink()
     for library in (unpacked / "polarguide").glob("_native*.so"):
         shutil.copy2(library, ROOT / "src" / "polarguide")
 

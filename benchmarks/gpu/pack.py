@@ -31,6 +31,7 @@ WHEELS = (
     "plyfile",
     "msgspec",
     "nanobind",
+    "nanobind-backend",
     "scikit-build-core",
     "pathspec",
     "pytest",

@@ -226,6 +226,14 @@ def test_help_loads_nothing_heavy() -> None:
     assert loaded == [f"loaded by {line}" for line in lines]
 
 
+def test_the_list_of_verbs_loads_none_of_them() -> None:
+    """Nor NumPy: the list is what a shell's user waits for."""
+    verbs = tuple(f"polarguide.cli.{module}" for module in VERBS.values())
+    command = [sys.executable, "-c", f"HEAVY = {(*HEAVY, 'numpy', *verbs)}{LOADED}", "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "loaded by --help"
+
+
 def test_help_names_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         run(["--help"])

@@ -63,6 +63,7 @@ SHORT = {
     "priors": [],
     "priors --run": ["--downscale", "2"],  # as the run was trained
     "measure": [],
+    "doctor": [],
 }
 """What is added to each verb, or to a verb with an option: it may do less, and has to do it in the same way."""
 SHORT_PYTHON = {r"steps=\d+": f"steps={STEPS}", r'load_scene\("SCENE"\)': 'load_scene("SCENE", downscale=2)'}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import dataclasses
 import difflib
 import importlib
+import importlib.util
 import io
 import os
 import sys
@@ -16,7 +18,7 @@ from typing import Any, get_args, get_type_hints
 
 import tyro
 
-from polarguide import __version__
+import polarguide
 from polarguide.cli.console import print_error, warnings_printed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import gibibytes
@@ -42,6 +44,7 @@ VERBS = {
     "synth": "synth",
     "bench": "bench",
     "tables": "tables",
+    "doctor": "doctor",
 }
 """The module of each verb, whose function has the module's name. None of them imports torch before it is called."""
 DESCRIPTION = (
@@ -56,6 +59,25 @@ def function_of(verb: str) -> Callable[..., Any]:
     function: Callable[..., Any] = getattr(module, VERBS[verb])
     # Options that several verbs share are the fields of dataclasses, and are called as these are.
     return tyro.conf.configure(tyro.conf.OmitArgPrefixes)(function)
+
+
+def summary_of(verb: str) -> Callable[[], None]:
+    """A function without options that has the first paragraph of a verb's docstring.
+
+    The list of all verbs shows nothing else: their modules are read, and not loaded.
+    """
+    spec = importlib.util.find_spec(f"polarguide.cli.{VERBS[verb]}")
+    source = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
+    documented = [
+        node
+        for node in ast.parse(source).body
+        if isinstance(node, ast.FunctionDef) and node.name == VERBS[verb]
+    ]
+
+    def listed() -> None: ...
+
+    listed.__doc__ = (ast.get_docstring(documented[0]) or "").partition("\n\n")[0]
+    return listed
 
 
 def options_of(function: Callable[..., Any]) -> dict[str, Any]:
@@ -155,7 +177,7 @@ _MORE_ROOM = "Check this shell's limits (ulimit -a) and what else runs; --thread
 def _call(verb: str | None, arguments: Sequence[str]) -> int:
     """Call a verb; returns the exit status that it gives, 0 where it gives none."""
     if list(arguments) == ["--version"]:
-        print(f"polarguide {__version__}", flush=True)
+        print(f"polarguide {polarguide.__version__}", flush=True)
         return 0
     if verb is not None:
         _require_place()
@@ -171,7 +193,7 @@ def _call(verb: str | None, arguments: Sequence[str]) -> int:
             found="none of them",
             remedy=_near(arguments[0]) or "polarguide --help says what they do.",
         )
-    verbs = {name: function_of(name) for name in VERBS}
+    verbs = {name: summary_of(name) for name in VERBS}
     tyro.extras.subcommand_cli_from_dict(
         verbs, prog="polarguide", description=DESCRIPTION, args=arguments, sort_subcommands=False
     )

@@ -11,9 +11,8 @@ import shlex
 import shutil
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 
 class PolarguideError(Exception):
@@ -54,7 +53,7 @@ def install_extra(extra: str) -> str:
     Where there is no source folder, as after the installation of a wheel, the packages of the extra are named.
     """
     source = _source_folder()
-    packages = [text for text, of in _requirements() if of == extra]
+    packages = [requirement.text for requirement in requirements() if requirement.extra == extra]
     if source is None and packages:
         return _pip(*packages)
     return _pip(f"{'.' if source in (None, Path.cwd()) else source}[{extra}]")
@@ -64,9 +63,7 @@ def install_package(module: str) -> str:
     """The command that adds the package of a module, in a version that polarguide works with."""
     module = module.partition(".")[0]
     package = _plain(DISTRIBUTIONS.get(module, module))
-    specified = (
-        text for text, _ in _requirements() if (name := _NAME.match(text)) and _plain(name[0]) == package
-    )
+    specified = (requirement.text for requirement in requirements() if _plain(requirement.name) == package)
     return _pip(next(specified, package))
 
 
@@ -93,7 +90,9 @@ def _source_folder() -> Path | None:
         url = json.loads(record or "{}").get("url", "")
     except (metadata.PackageNotFoundError, ValueError):
         return None
-    folder = Path(url2pathname(urlsplit(url).path))
+    # It loads the web's protocols, and most processes refuse nothing.
+    path = importlib.import_module("urllib.request").url2pathname(urlsplit(url).path)
+    folder = Path(path)
     return folder if url.startswith("file:") and _holds_project(folder) else None
 
 
@@ -102,19 +101,34 @@ def _holds_project(folder: Path) -> bool:
     return (folder / "src" / "polarguide").is_dir() and (folder / "pyproject.toml").is_file()
 
 
-def _requirements() -> list[tuple[str, str]]:
-    """Requirements of the installed metadata: (such as ``viser==1.1.*``, the extra or empty); [] without metadata."""
+class Requirement(NamedTuple):
+    """A distribution that polarguide's installed metadata asks for.
+
+    Attributes:
+        name: of the distribution. text: with its versions, such as ``viser==1.1.*``. extra: which one brings it; empty:
+            it comes with polarguide. conditional: only on some systems or versions of Python.
+    """
+
+    name: str
+    text: str
+    extra: str
+    conditional: bool
+
+
+def requirements() -> list[Requirement]:
+    """What the installed metadata asks for; [] where polarguide runs without being installed."""
     metadata = importlib.import_module("importlib.metadata")
     try:
         lines = metadata.requires("polarguide") or []
     except metadata.PackageNotFoundError:
         return []
-    requirements = []
+    listed = []
     for line in lines:
-        text, _, condition = line.partition(";")
-        extra = _EXTRA.search(condition)
-        requirements.append((text.strip(), extra[1] if extra else ""))
-    return requirements
+        text, _, condition = (part.strip() for part in line.partition(";"))
+        extra, name = _EXTRA.search(condition), _NAME.match(text)
+        conditional = bool(_EXTRA.sub("", condition).strip(" ()"))
+        listed.append(Requirement(name[0] if name else text, text, extra[1] if extra else "", conditional))
+    return listed
 
 
 def require_package(module: str, what: str) -> None:

@@ -1,0 +1,183 @@
+"""``polarguide doctor``."""
+
+from __future__ import annotations
+
+import importlib
+import json as json_text
+import os
+import platform
+import shutil
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+import polarguide
+from polarguide.cli.console import console, say, warn
+from polarguide.core.errors import install_extra, install_package, requirements
+from polarguide.core.system import free_memory
+
+EXTRAS = {
+    "cuda": "train and render on an NVIDIA GPU",
+    "lpips": "the metric lpips",
+    "heic": "HEIC photographs",
+    "synth": "synth and bench: scenes with ground truth",
+}
+"""The extras that users need, and what for; docs and test are for those who change polarguide."""
+GIB = float(1 << 30)
+
+
+def doctor(*, json: bool = False) -> int:
+    """Print what is installed, what computes here, and what is missing, with the command that installs it.
+
+    Ends with exit status 1 where something that every command needs is missing or cannot be loaded. The output belongs
+    into a report of a problem; it names folders of this machine, and nothing of your captures.
+
+    Args:
+        json: Print one JSON object instead of text.
+    """
+    report = diagnosis()
+    if json:
+        print(json_text.dumps(report, indent=2))
+    else:
+        _print(report)
+    return 1 if report["problems"] else 0
+
+
+def diagnosis() -> dict[str, Any]:
+    """The state of this installation, as plain values that JSON can hold.
+
+    Returns:
+        ``polarguide``, ``python``, ``packages`` (versions by name, None: not installed), ``kernels`` and ``torch``
+        (with ``error`` in place of the values where they cannot be loaded), ``extras``, ``machine``, and two lists of
+        lines: ``problems`` stop commands, ``notes`` do not.
+    """
+    packages = {
+        each.name: _version(each.name)
+        for each in requirements()
+        if not each.extra and not (each.conditional and _version(each.name) is None)
+    }
+    problems = [f"{name} is not installed: {install_package(name)}" for name, v in packages.items() if not v]
+    torch, kernels = _torch(), _kernels()
+    for name, state in (("torch", torch), ("polarguide's kernels", kernels)):
+        if "error" in state:
+            problems.append(f"{name} cannot be loaded: {state['error']}")
+    offered = {each.extra for each in requirements()}
+    extras = {name: _extra(name, use) for name, use in EXTRAS.items() if name in offered}
+    return {
+        "polarguide": {"version": polarguide.__version__, "folder": str(Path(polarguide.__file__).parent)},
+        "python": {"version": platform.python_version(), "executable": sys.executable},
+        "packages": packages,
+        "kernels": kernels,
+        "torch": torch,
+        "extras": extras,
+        "machine": _machine(),
+        "problems": problems,
+        "notes": _notes(torch, extras),
+    }
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _kernels() -> dict[str, Any]:
+    """The instruction set and the threads of our kernels."""
+    try:
+        native = importlib.import_module("polarguide._native")
+    except Exception as error:  # loaders and their operating systems raise all kinds
+        return {"error": _line(error)}
+    return {"instruction_set": native.simd(), "threads": native.thread_count(), "file": native.__file__}
+
+
+def _torch() -> dict[str, Any]:
+    """PyTorch's threads, the CUDA that it was built for, and the GPUs that it can use."""
+    try:
+        torch = importlib.import_module("torch")
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        properties = [torch.cuda.get_device_properties(number) for number in range(count)]
+    except Exception as error:  # loaders and their operating systems raise all kinds
+        return {"error": _line(error)}
+    gpus = [{"name": each.name, "memory_gib": round(each.total_memory / GIB, 1)} for each in properties]
+    return {
+        "version": torch.__version__,
+        "threads": torch.get_num_threads(),
+        "cuda": torch.version.cuda,
+        "gpus": gpus,
+    }
+
+
+def _line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:200]
+
+
+def _extra(name: str, use: str) -> dict[str, Any]:
+    """What of an extra is installed, what is missing, and the command for it (None: nothing is missing)."""
+    wanted = [each for each in requirements() if each.extra == name]
+    missing = [each.name for each in wanted if _version(each.name) is None]
+    return {
+        "use": use,
+        "installed": {each.name: _version(each.name) for each in wanted if each.name not in missing},
+        "missing": missing,
+        "command": install_extra(name) if missing else None,
+    }
+
+
+def _machine() -> dict[str, Any]:
+    """The system, its processors, and what is free of memory and of the disk of the current folder, in GiB."""
+    free = free_memory()
+    return {
+        "system": platform.platform(),
+        "processor": platform.machine(),
+        "cores": os.cpu_count(),
+        "free_memory_gib": None if free is None else round(free / GIB, 1),
+        "free_disk_gib": round(shutil.disk_usage(Path.cwd()).free / GIB, 1),
+    }
+
+
+def _notes(torch: dict[str, Any], extras: dict[str, Any]) -> list[str]:
+    """What could be better, and stops nothing."""
+    if not extras:
+        return ["polarguide is not installed here, so that its packages cannot be checked: pip install ."]
+    if torch.get("gpus") and extras["cuda"]["missing"]:
+        return [f"There is a GPU, but trainings run on the CPU without gsplat: {extras['cuda']['command']}"]
+    if not torch.get("gpus") and shutil.which("nvidia-smi") is not None:
+        built = torch.get("cuda") or "no CUDA"
+        return [f"There is an NVIDIA driver, but PyTorch (built for {built}) can use no GPU."]
+    return []
+
+
+def _print(report: dict[str, Any]) -> None:
+    kernels, torch, machine = report["kernels"], report["torch"], report["machine"]
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_row("polarguide", f"{report['polarguide']['version']}  {report['polarguide']['folder']}")
+    table.add_row("Python", f"{report['python']['version']}  {report['python']['executable']}")
+    table.add_row("system", f"{machine['system']}, {machine['cores']} cores")
+    memory = machine["free_memory_gib"]
+    table.add_row("free memory", "unknown" if memory is None else f"{memory} GiB")
+    table.add_row("free disk", f"{machine['free_disk_gib']} GiB in this folder")
+    if "error" not in kernels:
+        table.add_row("kernels", f"{kernels['instruction_set']}, threads: {kernels['threads']}")
+    if "error" not in torch:
+        gpus = ", ".join(f"{each['name']} ({each['memory_gib']} GiB)" for each in torch["gpus"]) or "none"
+        table.add_row("PyTorch", f"{torch['version']}, threads: {torch['threads']}")
+        table.add_row("GPU", gpus)
+    others = [f"{name} {version}" for name, version in report["packages"].items() if version]
+    table.add_row("packages", ", ".join(others))
+    for name, extra in report["extras"].items():
+        state = extra["command"] or ", ".join(f"{each} {v}" for each, v in extra["installed"].items())
+        table.add_row(
+            f"extra {name}", f"{'missing' if extra['missing'] else 'installed'} ({extra['use']}): {state}"
+        )
+    console.print(table, markup=False, soft_wrap=False)
+    for note in report["notes"]:
+        say(note)
+    for problem in report["problems"]:
+        warn(problem)
+    if not report["problems"]:
+        say("nothing is missing that every command needs")
