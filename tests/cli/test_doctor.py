@@ -21,6 +21,7 @@ METADATA = [
     "gsplat>=1.5.3; extra == 'cuda'",
     "numpy; extra == 'lpips'",
     "no-such-package==1.*; python_version >= '3' and extra == 'synth'",
+    "pillow-heif>=0.18; extra == 'heic'",
     "furo; extra == 'docs'",
 ]
 

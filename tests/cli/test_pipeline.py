@@ -113,6 +113,7 @@ def test_render_writes_every_layer_of_every_test_view(trained: Path, tmp_path: P
         "specular",
         "diffuse",
         "strength",
+        "roughness",
         "metalness",
         "normal",
         "depth",
@@ -204,7 +205,7 @@ def test_a_recipe_without_reflection_goes_through_all_verbs(
     assert json.loads((out / "metrics.json").read_text())["specular_psnr"] is None
     assert run(["render", str(out), "--views", "v000"]) == 0
     assert (
-        "this recipe has no layer diffuse, metalness, reflection, specular, strength"
+        "this recipe has no layer diffuse, metalness, reflection, roughness, specular, strength"
         in capsys.readouterr().out
     )
     assert not (out / "render" / "v000_specular.png").exists()

@@ -182,7 +182,7 @@ COLMAP: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "an unknown model": ("cameras.bin", patched(12, "<i", 99), "refuses"),
     "a nan pose": ("images.bin", patched(12, "<d", float("nan")), "an image whose pose is not finite"),
     "an infinite place": ("images.bin", patched(44, "<d", float("inf")), "an image whose pose is not finite"),
-    "a zero quaternion": ("images.bin", patched(12, "<d", 0.0), "expected a pose and a lens of numbers up to"),
+    "a zero quaternion": ("images.bin", patched(12, "<d", 0.0), "a quaternion of length 1, found one of length 0"),
     "a negative focal length": ("cameras.bin", patched(32, "<dd", -80, -80), "positive focal"),
     "no cameras": ("cameras.bin", lambda path: path.unlink(), "expected a COLMAP model .*neither there"),
     "no images": ("images.bin", lambda path: path.unlink(), "images.bin: expected this file of the COLMAP model"),

@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, Sense, checked, read_calibration
 from polarguide.capture.sensor.analyzer_file import is_analyzer_file
-from polarguide.capture.sensor.raw_file import Packing
+from polarguide.capture.sensor.pattern import Packing
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options, option_name
 from polarguide.core.text import decimal

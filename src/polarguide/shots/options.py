@@ -10,7 +10,7 @@ import tyro
 from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, checked
-from polarguide.capture.sensor.raw_file import Packing
+from polarguide.capture.sensor.pattern import Packing
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options, option_name
 from polarguide.preparation.settings import PrepareSettings

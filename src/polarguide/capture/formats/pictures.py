@@ -136,7 +136,8 @@ _SMALL_AREA = 1e-3
 def _require_two_levels(path: Path, gray: NDArray[Any]) -> None:
     """Refuse labels of several objects, of which the lower half would be taken for background.
 
-    They have areas of one gray below half of the maximum, while soft edges change from pixel to pixel.
+    They have areas of more than two grays, one of them below half of the maximum. Soft edges change from pixel to
+    pixel.
 
     Raises:
         PolarguideError: the picture is one.
@@ -145,7 +146,7 @@ def _require_two_levels(path: Path, gray: NDArray[Any]) -> None:
     flat = cv2.erode(levels, around) == cv2.dilate(levels, around)
     largest = float(levels.max())
     labels = flat & (levels > _BLACK * largest) & (2 * levels < largest)
-    if labels.mean() > _SMALL_AREA:
+    if labels.mean() > _SMALL_AREA and _grays(levels[flat]) > 2:
         named = ", ".join(f"{level:g}" for level in np.unique(levels[labels])[:4])
         raise PolarguideError(
             path,
@@ -153,6 +154,12 @@ def _require_two_levels(path: Path, gray: NDArray[Any]) -> None:
             found=f"areas of {named} beside a maximum of {largest:g}, as labels of several objects have",
             remedy="Save it as a gray picture, white where the mask is.",
         )
+
+
+def _grays(levels: NDArray[np.float32]) -> int:
+    """How many grays more than a small share of some pixels have."""
+    counts = np.unique(levels, return_counts=True)[1]
+    return int((counts > _SMALL_AREA * levels.size).sum())
 
 
 def _require_one_mask(path: Path, pixels: NDArray[Any], mask: NDArray[np.bool_]) -> None:

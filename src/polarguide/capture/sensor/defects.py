@@ -67,7 +67,10 @@ def _noise(rise: NDArray[np.float32], middle: NDArray[np.float32]) -> NDArray[np
     """Standard deviation of the noise of each sample, by brightness."""
     step = max(1, rise.size >> 20)
     level, deviation = middle.ravel()[::step], np.abs(rise).ravel()[::step]
-    edges = np.unique(np.quantile(level, np.linspace(0, 1, _BINS + 1)))
+    edges = np.quantile(level, np.linspace(0, 1, _BINS + 1)).astype(np.float32)
+    # One brightness of many samples, such as black, is a bin of its own: it says nothing of the noise of others.
+    common = edges[1:][np.diff(edges) == 0]
+    edges = np.unique(np.concatenate((edges, np.nextafter(common, np.float32(np.inf)))))
     number = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, max(0, len(edges) - 2))
     medians = [float(np.median(deviation[number == k])) for k in range(max(1, len(edges) - 1))]
     place = np.clip(np.searchsorted(edges, middle, side="right") - 1, 0, len(medians) - 1)

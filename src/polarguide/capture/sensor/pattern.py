@@ -19,6 +19,9 @@ SENSORS = {"IMX250MYR": True, "IMX264MYR": True, "IMX250MZR": False}
 SENSOR_SIZE = (2464, 2056)
 """Width and height of all of them, in pixels; cameras give 2448 x 2048."""
 
+Packing = Literal["8", "16", "16be", "10p", "10packed", "10mipi", "12p", "12packed", "12mipi"]
+"""How ``.raw`` files hold values, see ``sensor.raw_file.PACKINGS``."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pattern:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.formats.arrays import array_kind, read_array
 from polarguide.capture.formats.pictures import decode_stored, read_picture
+from polarguide.capture.sensor.pattern import Packing
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
 
-Packing = Literal["8", "16", "16be", "10p", "10packed", "10mipi", "12p", "12packed", "12mipi"]
 PACKINGS: dict[Packing, tuple[int, int, int]] = {
     "8": (1, 1, 8), "16": (2, 1, 16), "16be": (2, 1, 16),
     "10p": (5, 4, 10), "10packed": (3, 2, 10), "10mipi": (5, 4, 10),

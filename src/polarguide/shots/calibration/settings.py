@@ -12,8 +12,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from polarguide.capture.calibration import Sense
-from polarguide.capture.sensor.pattern import sensor_pattern
-from polarguide.capture.sensor.raw_file import Packing
+from polarguide.capture.sensor.pattern import Packing, sensor_pattern
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options
 from polarguide.core.text import decimal
