@@ -43,7 +43,7 @@ EXCLUDED = {
     "make test": "runs this test",
     "make docs": "CI runs it",
     "make wheel": "takes minutes; what it builds is the module that test_wheel reads",
-    "pip install dist/polarguide-0.2.0-*.whl": "what make wheel does itself",
+    "pip install 'dist/polarguide-0.2.0-*.whl'": "what make wheel does itself",
     "pip install .": "leaves the environment in which all others run here",
 }
 SERVER = Path(__file__).with_name("served_commands.py")
