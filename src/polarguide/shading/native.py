@@ -92,14 +92,17 @@ class _Reflect(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         features, rays, *levels = (t.detach().contiguous() for t in (features, rays, *textures))
         learns = any(ctx.needs_input_grad)
-        looked_up = (torch.empty_like(rays), rays.new_empty(len(rays)), torch.empty_like(rays))
+        count = len(rays)
+        looked_up = (
+            [rays.new_empty(count, 3), rays.new_empty(count), rays.new_empty(count, 3)] if learns else []
+        )
         layers = [torch.empty_like(rays) for _ in range(4)]
-        kept = looked_up if learns else (None, None, None)
+        kept = looked_up or [None, None, None]
         _native.reflect_forward(features, rays, levels, *given.model, *given.levels, *kept, *layers)
         metal, outputs, light = given.metal, [], []
         if metal is not None:
-            count = len(metal.pixels)
-            outputs = [rays.new_empty(count), rays.new_empty(count, 3), rays.new_empty(count, 3)]
+            shown = len(metal.pixels)
+            outputs = [rays.new_empty(shown), rays.new_empty(shown, 3), rays.new_empty(shown, 3)]
             light = [layers[3]]
             _native.metal_layers(features, rays, *metal, *light, *outputs, *layers[:2])
             ctx.mark_non_differentiable(outputs[0])

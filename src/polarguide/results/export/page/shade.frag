@@ -59,7 +59,7 @@ vec3 radiance(vec3 direction, float roughness, vec4 feature) {
 #endif
 
 #ifdef FRESNEL
-const float LEVELS_OF_ROUGHNESS = 4.0; // of shading/deferred.py
+const float LEVELS_OF_ROUGHNESS = 4.0; // of shading/roughness.py
 uniform float mirror; // GGX's alpha of a roughness of 0
 
 // Radiance from a direction, blurred by so many levels; as cubemap.py.
