@@ -1,6 +1,6 @@
 """Refractive indices of single Gaussians in the deferred shading model: what they change, and what they leave."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 import shaded_gaussians
@@ -164,10 +164,12 @@ def test_colors_attributes_and_the_page() -> None:
     assert float(page.values["share"].max()) <= 1
 
 
-def test_runs_recorded_before_there_were_indices_have_none() -> None:
-    recorded = {name: value for name, value in SHADING.data().items() if name != "indices"}
-    assert SHADING.as_recorded(recorded) == WITHOUT
-    assert SHADING.as_recorded(SHADING.data()) == SHADING
+@pytest.mark.parametrize("part", ["rough", "metal", "indices"])
+def test_runs_recorded_before_there_was_a_part_are_without(part: str) -> None:
+    whole = DeferredShading("fresnel", local=True, rough=True, metal=True, indices=True)
+    recorded = {name: value for name, value in whole.data().items() if name != part}
+    assert whole.as_recorded(recorded) == replace(whole, **{part: False})
+    assert whole.as_recorded(whole.data()) == whole
 
 
 @pytest.fixture(scope="module")

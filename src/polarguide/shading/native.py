@@ -93,12 +93,11 @@ class _Reflect(torch.autograd.Function):
         features, rays, *levels = (t.detach().contiguous() for t in (features, rays, *textures))
         learns = any(ctx.needs_input_grad)
         count = len(rays)
-        looked_up = (
-            [rays.new_empty(count, 3), rays.new_empty(count), rays.new_empty(count, 3)] if learns else []
-        )
+        sizes = ((count, 3), (count,), (count, 3)) if learns else ()
+        looked_up = [rays.new_empty(*size) for size in sizes]
         layers = [torch.empty_like(rays) for _ in range(4)]
-        kept = looked_up or [None, None, None]
-        _native.reflect_forward(features, rays, levels, *given.model, *given.levels, *kept, *layers)
+        inputs: list[Any] = [features, rays, levels, *given.model, *given.levels]
+        _native.reflect_forward(*inputs, *(looked_up or (None, None, None)), *layers)
         metal, outputs, light = given.metal, [], []
         if metal is not None:
             shown = len(metal.pixels)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
+from polarguide.capture.filter.exif import INVERSE, apply_orientation, orientation_calibration
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.geometry.polarizer import malus
 from polarguide.optics.color import srgb_encode_array
@@ -88,7 +88,6 @@ STEP = 15
 QUALITY = 95
 _TIME = Fraction(1, 60)
 _TURNS = (1, 1, 1, 6, 8, 3)
-_BACK = {1: 1, 3: 3, 6: 8, 8: 6}
 
 
 @dataclass(frozen=True)
@@ -153,7 +152,7 @@ def filter_jpeg(
     """
     light = behind_filter(stokes, rays, shot.angle) * 2.0**shot.stops
     encoded = srgb_encode_array(np.clip(noisy(light, noise, random, sensor), 0.0, 1.0))
-    stored = apply_orientation(np.rint(255 * encoded).astype(np.uint8), _BACK[shot.orientation])
+    stored = apply_orientation(np.rint(255 * encoded).astype(np.uint8), INVERSE[shot.orientation])
     options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
     _, data = cv2.imencode(".jpg", np.ascontiguousarray(stored[..., ::-1]), options)
     time = _TIME * Fraction(2.0**shot.stops) if shot.noted else None
