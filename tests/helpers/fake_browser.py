@@ -130,6 +130,7 @@ class FakeCamera:
         self.position, self.look_at = np.array([0.0, 0.0, -5.0]), np.zeros(3)
         self.up_direction, self.fov = np.array([0.0, -1.0, 0.0]), 0.8
         self.image_width, self.image_height = 128, 96
+        self.update_timestamp = 0.0
         self.callbacks: list[Callable[[Any], None]] = []
 
     @property
@@ -153,6 +154,11 @@ class FakeCamera:
         self.report()
 
     def report(self) -> None:
+        self.update_timestamp += 1.0
+        self.call_back()
+
+    def call_back(self) -> None:
+        """What viser does in a thread, some time after a report has arrived."""
         for callback in self.callbacks:
             callback(self)
 

@@ -93,6 +93,7 @@ class ViewPose:
 
     Attributes:
         view: the view. wxyz, position: the pose that was sent to the browser. since: the time when it was sent.
+        written: viser's time stamp of the camera as we wrote it.
         reached: whether the browser has reported this pose; until then it may report earlier poses.
     """
 
@@ -100,6 +101,7 @@ class ViewPose:
     wxyz: np.ndarray
     position: np.ndarray
     since: float
+    written: float
     reached: bool = False
 
     def is_kept(self, camera: Any, now: float, distance: float) -> bool:
@@ -111,7 +113,8 @@ class ViewPose:
         turned = 1 - abs(float(np.dot(self.wxyz, camera.wxyz)))
         moved = float(np.linalg.norm(self.position - camera.position)) / distance
         here = turned < TURNED and moved < MOVED
-        self.reached |= here
+        # The callback of an earlier report may run after the pose was written, and then reads what we wrote.
+        self.reached |= here and camera.update_timestamp != self.written
         return here or (not self.reached and now - self.since < ARRIVAL)
 
 
@@ -127,7 +130,8 @@ def move_to_view(client: Any, view: View, scene_frame: SceneFrame, now: float) -
         camera.position = center.numpy()
         camera.look_at = (center + distance * ahead).numpy()
     # Not what viser has stored by now: a message of the browser may have replaced it.
-    return ViewPose(view, np.array(quaternion(target.rotation.T)), center.numpy(), now)
+    pose = np.array(quaternion(target.rotation.T)), center.numpy()
+    return ViewPose(view, *pose, since=now, written=camera.update_timestamp)
 
 
 FRAMES_PER_SECOND = 30

@@ -129,6 +129,7 @@ class Session:
         self._painter = Painter(scene_frame)
         self.pacing = FramePacing()
         self._view_pose: ViewPose | None = None
+        self._last_pose: ViewPose | None = None  # of the view that was asked for last, left or not
         self._screenshot, self._asked = False, dict[str, float]()
         self._playing: tuple[float, list[Camera]] | None = None
         first = next(iter(photographs.values())).view.camera
@@ -225,12 +226,14 @@ class Session:
         with self._lock:
             now = time.monotonic()
             self.pacing.mark_changed(now)
-            if self._view_pose is not None and not self._view_pose.is_kept(
-                camera, now, self._scene_frame.distance
-            ):
-                self._view_pose = None
-                self.panel.view.value = FREE_VIEW
-                self._presenting.turn_upright()
+            pose = self._last_pose
+            if pose is None or not pose.is_kept(camera, now, self._scene_frame.distance):
+                pose = None
+            if pose is not self._view_pose:
+                self._view_pose = pose
+                self.panel.view.value = FREE_VIEW if pose is None else pose.view.name
+                if pose is None:
+                    self._presenting.turn_upright()
         self._wake()
 
     def go(self, name: str) -> None:
@@ -238,7 +241,8 @@ class Session:
         with self._lock:
             self._playing = None
             view = self._photographs[name].view
-            self._view_pose = move_to_view(self._client, view, self._scene_frame, time.monotonic())
+            pose = move_to_view(self._client, view, self._scene_frame, time.monotonic())
+            self._view_pose = self._last_pose = pose
             self.pacing.mark_changed(time.monotonic())
         self.panel.view.value = name
         self._wake()
@@ -282,7 +286,8 @@ class Session:
         path = self._keyframes.path(float(self.panel.seconds.value))
         if len(path) > 1:
             with self._lock:
-                self._view_pose, self._playing = None, (time.monotonic(), path)
+                self._view_pose = self._last_pose = None
+                self._playing = time.monotonic(), path
             self.panel.view.value = FREE_VIEW
             self._wake()
 
