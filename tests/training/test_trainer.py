@@ -1,7 +1,7 @@
 """Every recipe trains; going on from a checkpoint gives the same bits as never having stopped."""
 
-import dataclasses
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,8 +11,10 @@ from tiny import make_busy_recipe
 from trainings import different, make_trainer, run, trained
 
 from polarguide.capture import Scene
+from polarguide.geometry.camera import Camera
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
+from polarguide.runs.model import GaussianModel
 from polarguide.shading.directional import DirectionalShading
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import StepReport
@@ -71,6 +73,26 @@ def test_the_busy_recipe_is_busy_on_both_sides_of_the_stop(
     assert huge[STOP + 8]
 
 
+def test_a_finished_training_draws_larger_pictures_with_its_own_blur(
+    whole: tuple[Trainer, list[StepReport]],
+) -> None:
+    trainer = whole[0]
+    model = GaussianModel(trainer.state, trainer.shading, trainer.backend)
+    plain = GaussianModel(replace(trainer.state, footprints=None), trainer.shading, trainer.backend)
+    camera = trainer.scene.train_views[0].camera
+    larger = camera.scaled(4, 4 * camera.width, 4 * camera.height)
+
+    def apart(view: Camera) -> float:
+        return float((model.render(view).final - plain.render(view).final).abs().mean())
+
+    assert apart(larger) > 20 * apart(camera)
+    depth = model.render(larger, depth=True).depth
+    assert depth is not None
+    assert (
+        float((model.alpha_in_front(larger, depth) - plain.alpha_in_front(larger, depth)).abs().max()) > 0.01
+    )
+
+
 @pytest.mark.parametrize("stop", [1, 6, 7, 16, 24, STOP, 40, 59])
 def test_any_step_can_be_resumed_from(
     tiny_scene: Scene,
@@ -82,6 +104,7 @@ def test_any_step_can_be_resumed_from(
     """Also just before and just after stage changes, refreshes, rounds of densification and propagations."""
     begun = make_trainer(tiny_scene, busy_recipe, STEPS)
     first = run(begun, until=stop)
+    assert begun.state.footprints is None  # of a finished training alone
     save_checkpoint(tmp_path, begun.state)
     state = load_checkpoint(tmp_path, busy_recipe)
     assert different(state.tensors(), begun.state.tensors()) == []
@@ -94,9 +117,9 @@ def test_a_directional_light_is_resumed_bit_by_bit(
 ) -> None:
     """Parameters of the model follow the density control, and the grid and the MLP keep their moments."""
     stop = 14  # between two rounds of the density control that add Gaussians
-    recipe = dataclasses.replace(
+    recipe = replace(
         RECIPES["ref-gs"],
-        densification=dataclasses.replace(busy_recipe.densification, every=4, pixels_each=1.0),
+        densification=replace(busy_recipe.densification, every=4, pixels_each=1.0),
         initialization=busy_recipe.initialization,
         shading=DirectionalShading(width=64, environment_spread=0.5, environment_resolution=8),
     )
@@ -118,8 +141,8 @@ def test_a_directional_light_is_resumed_bit_by_bit(
 def test_what_a_stage_gives_no_rate_rests_in_it(tiny_scene: Scene) -> None:
     recipe = RECIPES["3dgs"]
     first, last = recipe.stages
-    resting = dataclasses.replace(last, rate_factors={"quaternions": 0.0, "means": 0.0})
-    trainer = make_trainer(tiny_scene, dataclasses.replace(recipe, stages=(first, resting)), STEPS)
+    resting = replace(last, rate_factors={"quaternions": 0.0, "means": 0.0})
+    trainer = make_trainer(tiny_scene, replace(recipe, stages=(first, resting)), STEPS)
     run(trainer, until=STEPS // 2)
     before = trainer.state.gaussians.snapshot()
     run(trainer, until=STEPS // 2 + 3)
@@ -153,12 +176,10 @@ def test_every_epoch_visits_every_training_view_once(tiny_scene: Scene) -> None:
 
 def test_test_views_are_never_trained_on(tiny_scene: Scene) -> None:
     blackened = tuple(
-        dataclasses.replace(view, pictures=torch.zeros_like(view.codes))
-        if view.name in tiny_scene.test_names
-        else view
+        replace(view, pictures=torch.zeros_like(view.codes)) if view.name in tiny_scene.test_names else view
         for view in tiny_scene.views
     )
-    scenes = (tiny_scene, dataclasses.replace(tiny_scene, views=blackened))
+    scenes = (tiny_scene, replace(tiny_scene, views=blackened))
     assert different(*(trained(scene, RECIPES["polarguide"], 20) for scene in scenes)) == []
 
 
@@ -187,11 +208,9 @@ def test_behind_the_subject_the_consistency_moves_nothing(
     states = []
     for behind in ((1e-6, 2e-6), (1e6, 2e6)):
         stages = tuple(
-            dataclasses.replace(
-                stage, weights=dataclasses.replace(stage.weights, consistency=consistency), behind=behind
-            )
+            replace(stage, weights=replace(stage.weights, consistency=consistency), behind=behind)
             for stage in RECIPES["3dgs-dr"].stages
         )
-        states.append(trained(tiny_scene, dataclasses.replace(RECIPES["3dgs-dr"], stages=stages), 10))
+        states.append(trained(tiny_scene, replace(RECIPES["3dgs-dr"], stages=stages), 10))
     changed = different(*states)
     assert ("gaussians.means" in changed) == ("gaussians.opacity_logits" in changed) == moved

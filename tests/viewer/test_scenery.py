@@ -17,6 +17,7 @@ from polarguide.fields.trainer import FieldTrainer
 from polarguide.geometry.camera import quaternion
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.trajectory import read_path
+from polarguide.raster.magnification import footprints
 from polarguide.runs.defaults import resolve
 from polarguide.runs.train import train
 from polarguide.shading.result import LAYERS
@@ -151,6 +152,16 @@ def test_colors_of_depths_stay_while_the_camera_moves():
 
 SCENE = textured_ball(views=6, width=40, height=32, tests=1, radius=1.2)
 AROUND = scene_frame([view.camera for view in SCENE.views])
+
+
+def test_gaussians_are_drawn_with_the_blur_of_their_training() -> None:
+    camera = ring()["v0"]
+    plain = shown()
+    sizes = footprints(plain.gaussians["means"].detach(), [camera.downscaled(3)])
+    smooth = replace(plain, footprints=sizes)
+    for kept in (None, lambda means: means[:, 0] > 0):
+        pictures = [seen.render(camera, depth=False, kept=kept).alpha for seen in (plain, smooth)]
+        assert float((pictures[1] - pictures[0]).max()) > 0.05
 
 
 @pytest.fixture(scope="module")

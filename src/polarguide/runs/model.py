@@ -17,6 +17,7 @@ from polarguide.gaussians.ply import refit_sh_to_display, write_ply
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import srgb_encode
 from polarguide.raster import Backend
+from polarguide.raster.magnification import as_trained
 from polarguide.raster.surface import alpha_in_front
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.model import Light, Parameters, ShadingModel
@@ -122,6 +123,7 @@ class GaussianModel:
             RenderRequest(normals=normals, depth=depth, at_median_depth=surface),
             shading=self.shading,
             light=self.light,
+            footprints=self.state.footprints,
         )
 
     @torch.no_grad()
@@ -134,7 +136,10 @@ class GaussianModel:
     @torch.no_grad()
     def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
         """Share of each pixel's alpha that lies nearer than a depth [H, W], see ``raster.surface``."""
-        return alpha_in_front(splats(self.state.gaussians), camera, depth, self.backend.rasterize)
+        drawn, footprints = splats(self.state.gaussians), self.state.footprints
+        if footprints is not None:
+            drawn = as_trained(drawn, camera, footprints)
+        return alpha_in_front(drawn, camera, depth, self.backend.rasterize)
 
 
 @torch.no_grad()

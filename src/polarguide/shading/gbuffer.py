@@ -20,6 +20,7 @@ from polarguide.core.native import applied, fits
 from polarguide.gaussians.geometry import GRAZING, shortest_axis_normals
 from polarguide.geometry.camera import Camera
 from polarguide.raster.interface import Rasterize, ScreenStatistic, Splats
+from polarguide.raster.magnification import as_trained
 from polarguide.raster.surface import surface_picture
 from polarguide.shading.model import PLAIN, GBuffer, Light, Parameters, ShadingModel
 from polarguide.shading.native import split_native
@@ -196,6 +197,7 @@ def render(
     *,
     shading: ShadingModel = PLAIN,
     light: Light = NO_LIGHT,
+    footprints: Tensor | None = None,
 ) -> RenderResult:
     """Render one view.
 
@@ -204,11 +206,15 @@ def render(
             to the side from which they are seen, not to the camera.
         request: what the result holds.
         shading: what is splatted, and how it makes the picture. light: its learned light, by name.
+        footprints: [N] of the training, with which larger pictures are as smooth as it was, see
+            ``raster.magnification``; None: drawn as they are, which is how training draws.
     """
     normals, depth = request.normals or shading.needs_normals, request.depth
     gaussian_splats, layout = splatting(
         gaussians, camera, shading, sh_degree=request.sh_degree, normals=normals, depth=depth
     )
+    if footprints is not None:
+        gaussian_splats = as_trained(gaussian_splats, camera, footprints)
     rotated = NORMAL_CHANNELS if request.normal_rotation_only and normals else ()
     picture = rasterize(gaussian_splats, camera, statistic=request.statistic, still=rotated)
     features, normal, camera_depth = split(picture.features, picture.alpha, layout)

@@ -54,6 +54,11 @@ def refuse_foreign(tensors: Mapping[str, Tensor], recipe: Recipe) -> None:
     if "angles" in tensors:
         _check_angles(tensors["angles"])
         names.add("angles")
+    if "footprints" in tensors:
+        values = _shaped(tensors, "footprints", (count,))
+        if float(values.min()) < 0 or float(values.max()) > LARGEST["means"]:
+            raise ValueError(f"footprints from {float(values.min()):g} to {float(values.max()):g}")
+        names.add("footprints")
     strangers = sorted(tensors.keys() - names)
     if strangers:
         raise ValueError(f"{strangers[0][:80]}, which is not known")

@@ -63,6 +63,8 @@ class TrainingState:
         opacity_frozen_until: first step at which opacities train again (after a normal propagation).
         angles: [F, P, ``ANGLE_COLUMNS``] float64, F fits of the polarizers of P pictures, see ``angles.polarizers``;
             None: nothing yet.
+        footprints: [N] of a finished training, see ``raster.magnification``; None before its end, and of trainings of
+            earlier versions.
     """
 
     step: int
@@ -72,6 +74,7 @@ class TrainingState:
     frozen: dict[str, Tensor] | None = None
     opacity_frozen_until: int = 0
     angles: Tensor | None = None
+    footprints: Tensor | None = None
 
     @property
     def light(self) -> dict[str, Tensor]:
@@ -89,6 +92,8 @@ class TrainingState:
             out.update({f"frozen.{name}": t for name, t in self.frozen.items()})
         if self.angles is not None:
             out["angles"] = self.angles
+        if self.footprints is not None:
+            out["footprints"] = self.footprints
         out["scalars"] = torch.tensor([self.step, self.opacity_frozen_until], dtype=torch.int64)
         return out
 
@@ -103,7 +108,16 @@ class TrainingState:
         # The first checkpoints had a third.
         step, frozen_until = (int(x) for x in tensors["scalars"][:2])
         angles = tensors["angles"].cpu() if "angles" in tensors else None
-        return cls(step, gaussians, environment, statistics, frozen or None, frozen_until, angles)
+        return cls(
+            step,
+            gaussians,
+            environment,
+            statistics,
+            frozen or None,
+            frozen_until,
+            angles,
+            tensors.get("footprints"),
+        )
 
 
 def seeded(*numbers: int) -> torch.Generator:

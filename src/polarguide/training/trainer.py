@@ -18,6 +18,7 @@ from polarguide.capture.exposures import Exposure
 from polarguide.core.system import UNBOUNDED, MemoryBound
 from polarguide.gaussians.initialize import orbit
 from polarguide.raster import Backend, ScreenStatistic
+from polarguide.raster.magnification import footprints
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN
 from polarguide.shading.result import COLOR_CHANNELS, RenderResult
@@ -122,6 +123,9 @@ class Trainer:
         state.step += 1
         if stage.densify:
             self._density.after_step(state, last=not self._densifies_next())
+        if state.step == self.settings.steps:
+            cameras = (view.camera for view in self._views)
+            state.footprints = footprints(state.gaussians["means"].detach(), cameras)
         self.whole = True
         return report
 

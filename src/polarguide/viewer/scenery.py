@@ -63,6 +63,7 @@ class GaussianScenery:
         gaussians: the Gaussians. light: learned, by name.
         shading: as it is now. rasterize: of the backend. sh_degree: of the base color.
         status: a line about it.
+        footprints: [N] of a finished training, see ``raster.magnification``.
     """
 
     gaussians: Gaussians
@@ -71,6 +72,7 @@ class GaussianScenery:
     rasterize: Rasterize
     sh_degree: int
     status: str
+    footprints: Tensor | None = None
 
     @torch.no_grad()
     def render(
@@ -91,9 +93,11 @@ class GaussianScenery:
             turn: rotation [3, 3] of the light from afar, where it is radiance; None: as learned.
         """
         gaussians: Parameters = self.gaussians
+        footprints = self.footprints
         if kept is not None:
             inside = kept(self.gaussians["means"].detach())
             gaussians = {name: self.gaussians[name].detach()[inside] for name in self.gaussians.names}
+            footprints = None if footprints is None else footprints[inside]
         return render(
             gaussians,
             camera,
@@ -101,6 +105,7 @@ class GaussianScenery:
             RenderRequest(self.sh_degree, depth=depth, at_median_depth=surface),
             shading=self.shading,
             light=self.light if turn is None else self._turned(turn),
+            footprints=footprints,
         ).to("cpu")
 
     def _turned(self, turn: Tensor) -> Light:
@@ -149,7 +154,13 @@ def run_scenery(run: OpenedRun) -> Scenery:
         return FieldScenery(model, f"{status}; shown at a quarter of the size")
     model = run.gaussian_model("view")
     return GaussianScenery(
-        model.state.gaussians, model.light, model.shading, model.backend.rasterize, 3, status
+        model.state.gaussians,
+        model.light,
+        model.shading,
+        model.backend.rasterize,
+        3,
+        status,
+        model.state.footprints,
     )
 
 

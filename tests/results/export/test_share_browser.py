@@ -15,13 +15,18 @@ import pytest
 import torch
 from browsers import PATIENCE, chromium
 from random_runs import KINDS, random_state, ring
+from torch import Tensor
 
 from polarguide.capture.presentation import Presentation
 from polarguide.core.files import write_text
 from polarguide.geometry.camera import Camera
 from polarguide.raster.cpu import rasterize_cpu
+from polarguide.raster.magnification import footprints
 from polarguide.results.export.share import share_page
 from polarguide.shading.gbuffer import render
+from polarguide.shading.model import ShadingModel
+from polarguide.shading.result import RenderResult
+from polarguide.training.state import TrainingState
 from polarguide.visualization.layers import layer_picture
 
 pytestmark = pytest.mark.slow
@@ -84,22 +89,43 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / max(np.mean((a.astype(float) - b) ** 2), 1e-9)))
 
 
+def trained_at_half_size(state: TrainingState, *, metal: bool = False) -> Tensor | None:
+    """Footprints with which Gaussians of the ring's pictures are drawn wider; none for metals."""
+    cameras = [camera.downscaled(2) for camera in ring().values()]
+    return None if metal else footprints(state.gaussians["means"].detach(), cameras)
+
+
 def written(recipe: str, folder: Path, *, metal: bool = False) -> Path:
     state, shading = random_state(recipe, metal=metal)
     path = folder / f"{recipe}.html"
     write_text(
         path,
         share_page(
-            state.gaussians, state.light, shading, ring(), first="v0", title="<b>title</b>", caption="&"
+            state.gaussians,
+            state.light,
+            shading,
+            ring(),
+            first="v0",
+            title="<b>title</b>",
+            caption="&",
+            footprints=trained_at_half_size(state, metal=metal),
         ),
     )
     return path
 
 
+def drawn(
+    state: TrainingState, shading: ShadingModel, camera: Camera, footprints: Tensor | None
+) -> RenderResult:
+    return render(
+        state.gaussians, camera, rasterize_cpu, shading=shading, light=state.light, footprints=footprints
+    )
+
+
 @torch.no_grad()
 def ours(recipe: str, layer: str, camera: Camera, *, metal: bool = False) -> np.ndarray:
     state, shading = random_state(recipe, metal=metal)
-    result = render(state.gaussians, camera, rasterize_cpu, shading=shading, light=state.light)
+    result = drawn(state, shading, camera, trained_at_half_size(state, metal=metal))
     picture = layer_picture(result, layer, camera)
     assert picture is not None
     return picture
@@ -316,13 +342,20 @@ def test_a_presented_page_shows_white_scale_and_credit_and_turns_about_its_axis(
     )
     path = tmp_path / "page.html"
     text = share_page(
-        state.gaussians, state.light, shading, ring(), first="v0", title="t", presentation=presentation
+        state.gaussians,
+        state.light,
+        shading,
+        ring(),
+        first="v0",
+        title="t",
+        presentation=presentation,
+        footprints=trained_at_half_size(state),
     )
     write_text(path, text)
     opened = Opened(browser, path)
     camera = ring()["v0"]
     with torch.no_grad():
-        result = render(state.gaussians, camera, rasterize_cpu, shading=shading, light=state.light)
+        result = drawn(state, shading, camera, trained_at_half_size(state))
     expected = layer_picture(result, "final", camera, gains=torch.tensor(gains))
     assert psnr(opened.pictures("v0", ["final"])[0], expected) > LEAST
     plain = ours("polarguide-stokes", "normal", camera)

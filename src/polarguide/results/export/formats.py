@@ -143,6 +143,7 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
         ],
         notes=[f"Warning: {warning}" for warning in health.warnings] if health is not None else [],
         presentation=presented.presentation,
+        footprints=presented.footprints,
     )
     make_folder(path.parent)
     write_text(path, page)
@@ -161,6 +162,7 @@ class _Presented:
         model = run.model
         gaussians = model.state.gaussians if isinstance(model, GaussianModel) else None
         self.gaussians: Parameters | None = gaussians
+        self.footprints = model.state.footprints if isinstance(model, GaussianModel) else None
         self.kept: Tensor | None = None
         if gaussians is not None and (crop := self.presentation.crop) is not None:
             self.kept = crop.inside(gaussians["means"].detach(), run.camera_frame)
@@ -172,6 +174,7 @@ class _Presented:
                     remedy="Move it: polarguide present RUN --crop, or in polarguide view.",
                 )
             self.gaussians = {name: gaussians[name].detach()[self.kept] for name in gaussians.names}
+            self.footprints = None if self.footprints is None else self.footprints[self.kept]
         around = run.frame if self.presentation.up_axis is not None else None
         self.placement = Placement.of(self.presentation, around)
         scene = run.configuration.scene_digest[:12]

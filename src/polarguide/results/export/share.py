@@ -30,6 +30,8 @@ from polarguide.visualization.pages import page, page_part
 PACKAGE = "polarguide.results.export"
 
 TEXEL = 16
+LOWEST_LOGARITHM = -80.0
+"""That of no footprint: its square is 0 in float32."""
 HARMONICS = ("harmonics", "own_harmonics")
 SLOTS = {
     "mean": (0, "3<f4"),
@@ -59,23 +61,28 @@ texel content
 ===== ==================================================================================================
 0     mean 3 x float32; opacity u16; ``share`` u16 (strength, or the roughness of Ref-GS)
 1     rotation (w, x, y, z) 4 x i16; logarithms of the scales 3 x f16; scale of ``harmonics`` f16
-2     ``color`` of degree 0 (or albedo) 3 x f16; normal axis 3 x i16; side u16 (1: outward); ``roughness`` u16
+2     ``color`` of degree 0 (or albedo) 3 x f16; normal axis 3 x i16; ``side`` u16; ``roughness`` u16
 3-5   ``harmonics`` of degrees 1 to 3, 45 signed bytes in steps of their scale; or ``features`` 4 x i16 in texel 3
 6-9   light of its own: ``own_color`` of degree 0 3 x f16, scale f16; then ``own_harmonics`` as above
 10    ``metal``: reflectance 3 x f16; 0 of what is not a metal
 ===== ==================================================================================================
 
-The harmonics' scale is each Gaussian's own: the largest of its 45 values is 127 steps. A shading model says which of
-these values its records have; they are as long as the last of them needs.
+``side`` is the logarithm of the footprint (``raster.magnification``) as a half float, whose last bit is 1 where the
+normal axis points outward, and 0 where the camera alone decides. The harmonics' scale is each Gaussian's own: the
+largest of its 45 values is 127 steps. A shading model says which of these values its records have; they are as long as
+the last of them needs.
 """
 
 
 @torch.no_grad()
-def records(gaussians: Parameters, values: Mapping[str, Tensor]) -> NDArray[Any]:
+def records(
+    gaussians: Parameters, values: Mapping[str, Tensor], footprints: Tensor | None = None
+) -> NDArray[Any]:
     """Quantize Gaussians; those too faint to be drawn at all are left out.
 
     Args:
         gaussians: the Gaussians. values: the shading model's, [N, ...] by the names of ``SLOTS``.
+        footprints: [N] of the training, see ``raster.magnification``; None: not known.
 
     Returns:
         [K] records of whole texels, with named fields; in the order of a curve that fills space, so that neighbors
@@ -97,7 +104,7 @@ def records(gaussians: Parameters, values: Mapping[str, Tensor]) -> NDArray[Any]
     data = np.zeros(
         len(indices), record_type([*fields, "side", *harmonics, *(f"{name}_scale" for name in harmonics)])
     )
-    data["side"] = side.numpy()
+    data["side"] = _sides(side, None if footprints is None else footprints[indices])
     for name, value in fields.items():
         data[name] = _quantized(value, data.dtype[name].base)
     for name, (steps, scale) in harmonics.items():
@@ -143,6 +150,14 @@ def _axes(gaussians: Parameters, kept: Tensor) -> tuple[Tensor, Tensor]:
         return axes, torch.zeros(len(kept))
     along = (axes * outward[kept]).sum(dim=1)
     return torch.where(along < 0, -1.0, 1.0)[:, None] * axes, (along != 0).float()
+
+
+def _sides(side: Tensor, footprints: Tensor | None) -> NDArray[np.uint16]:
+    """Footprints [K] and sides [K] as records hold them; none is the footprint 0, of which the logarithm is low."""
+    lowest = torch.full_like(side, LOWEST_LOGARITHM)
+    logarithms = lowest if footprints is None else footprints.log().clamp(min=LOWEST_LOGARITHM)
+    bits = logarithms.numpy().astype("<f2").view("<u2")
+    return (bits & np.uint16(0xFFFE)) | side.numpy().astype("<u2")
 
 
 def curve_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -204,6 +219,7 @@ def share_page(
     metrics: Sequence[tuple[str, str]] = (),
     notes: Sequence[str] = (),
     presentation: Presentation = NOTHING,
+    footprints: Tensor | None = None,
 ) -> str:
     """The page.
 
@@ -214,6 +230,7 @@ def share_page(
         title, caption: any text; it is escaped.
         metrics: labels and values, any text. notes: paragraphs before them, any text.
         presentation: white balance, up axis, scale and credit.
+        footprints: [N] of the training, see ``raster.magnification``; None: not known.
 
     Returns:
         HTML that asks for nothing from outside; its own policy forbids it to.
@@ -222,7 +239,7 @@ def share_page(
     layers: Sequence[str] = shading.layers
     if shaded is None:
         shaded, layers = baked_page(gaussians, light, shading), PLAIN_LAYERS
-    quantized = records(gaussians, shaded.values)
+    quantized = records(gaussians, shaded.values, footprints)
     scene: dict[str, Any] = {
         "kind": shaded.kind,
         "texels": quantized.itemsize // TEXEL,

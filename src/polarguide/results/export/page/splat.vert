@@ -25,7 +25,7 @@ void main() {
   further = vec4(0.0);
 #endif
   place = vec2(0.0);
-  uvec4 t0 = texel(index, 0), t1 = texel(index, 1);
+  uvec4 t0 = texel(index, 0), t1 = texel(index, 1), t2 = texel(index, 2);
   float opacity = unpackUnorm2x16(t0.w).x;
   vec3 local = rotation * (meanOf(t0) - eye);
   if (local.z <= NEAR || opacity < 1.0 / 255.0) return;
@@ -37,6 +37,9 @@ void main() {
       2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
       2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
   vec3 scales = exp(vec3(unpackHalf2x16(t1.z), unpackHalf2x16(t1.w).x));
+  // Larger than the training's: its pixels' blur.
+  float trained = exp(unpackHalf2x16(t2.w & 0xFFFEu).x), own = local.z / sqrt(lens.x * lens.y);
+  scales = sqrt(scales * scales + BLUR * max(trained * trained - own * own, 0.0));
   mat3 half_ = rotation * turned;
   half_ = mat3(half_[0] * scales.x, half_[1] * scales.y, half_[2] * scales.z);
 
