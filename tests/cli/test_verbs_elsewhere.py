@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from faults import Fault
-from other_device import BACKEND, OtherDevice
+from other_device import BACKEND, OtherDevice, unfused_adam
 
 from polarguide.api import Run, open_run
 from polarguide.capture import load_scene
@@ -92,8 +92,7 @@ def test_pictures_by_other_light_and_along_a_path(elsewhere: Path, tmp_path: Pat
 def test_the_inspection_trains_there_and_compares_here(
     demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    adam = torch.optim.Adam
-    monkeypatch.setattr(torch.optim, "Adam", lambda groups, eps, fused: adam(groups, eps=eps, foreach=True))
+    monkeypatch.setattr("polarguide.gaussians.adam.adam", unfused_adam)
     scene = load_scene(demo_scene, downscale=8)
 
     def stop(report: object) -> None:

@@ -147,3 +147,28 @@ def rasterize(
 
 
 BACKEND = Backend(THERE, rasterize)
+
+
+def unfused_adam(
+    tensors: list[Tensor],
+    gradients: list[Tensor],
+    exp_avgs: list[Tensor],
+    exp_avg_sqs: list[Tensor],
+    _: list[Tensor],
+    steps: list[Tensor],
+    *,
+    beta1: float,
+    beta2: float,
+    lr: float,
+    eps: float,
+    **others: Any,
+) -> None:
+    """In place of torch's fused kernel of Adam, which knows its devices by name."""
+    for tensor, gradient, first, second, step in zip(
+        tensors, gradients, exp_avgs, exp_avg_sqs, steps, strict=True
+    ):
+        step.add_(1)
+        first.mul_(beta1).add_(gradient, alpha=1 - beta1)
+        second.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+        root = (second / (1 - beta2**step)).sqrt() + eps
+        tensor.sub_(lr * first / (1 - beta1**step) / root)

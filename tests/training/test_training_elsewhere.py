@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from other_device import BACKEND, THERE, OtherDevice
+from other_device import BACKEND, THERE, OtherDevice, unfused_adam
 from safetensors.torch import load_file
 from torch import Tensor
 from trainings import CPU, different, make_trainer, run
@@ -23,9 +23,7 @@ STEPS, HALF = 20, 9
 
 @pytest.fixture(autouse=True)
 def plain_adam(monkeypatch: pytest.MonkeyPatch) -> None:
-    """torch's fused Adam knows its devices by name; where the moments lie is the same without it."""
-    adam = torch.optim.Adam
-    monkeypatch.setattr(torch.optim, "Adam", lambda groups, eps, fused: adam(groups, eps=eps, foreach=True))
+    monkeypatch.setattr("polarguide.gaussians.adam.adam", unfused_adam)
 
 
 def checkpoint(folder: Path, trainer: Trainer) -> dict[str, Tensor]:

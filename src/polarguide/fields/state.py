@@ -10,11 +10,11 @@ from torch import Tensor
 
 from polarguide.fields.field import Field, GridField, NetworkField, Region
 from polarguide.fields.recipe import NeuralRecipe
+from polarguide.gaussians.adam import MOMENTS, Adam
 from polarguide.geometry.camera import Camera
 from polarguide.training.state import seeded
 
 KINDS: dict[str, type[Field]] = {"grids": GridField, "networks": NetworkField}
-MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 # Of Adam. Nodes that few rays see move as far as others, and are not thrown by the one ray that finds them after a
 # thousand steps, as a longer memory of the squares would have it.
 BETAS, EPSILON = (0.9, 0.99), 1e-15
@@ -30,7 +30,7 @@ class FieldState:
 
     step: int
     field: Field
-    optimizer: torch.optim.Adam
+    optimizer: Adam
 
     @classmethod
     def first(
@@ -45,8 +45,8 @@ class FieldState:
     ) -> FieldState:
         """A field with its first values in a region."""
         field = KINDS[recipe.shape.kind](region, recipe.shape, seeded(seed, 8)).to(device)
-        groups = [{"params": [values], "name": name} for name, values in field.named_parameters()]
-        return cls(step, field, torch.optim.Adam(groups, lr=0.0, betas=BETAS, eps=EPSILON, fused=True))
+        rates = {name: 0.0 for name, _ in field.named_parameters()}
+        return cls(step, field, Adam(rates, betas=BETAS, epsilon=EPSILON))
 
     def tensors(self) -> dict[str, Tensor]:
         """All tensors by name, for a checkpoint."""
@@ -54,8 +54,8 @@ class FieldState:
         out = {f"field.{name}": values.detach() for name, values in self.field.state_dict().items()}
         out["region"] = torch.tensor([*region.center, region.unit, region.radius], dtype=torch.float64)
         out["scalars"] = torch.tensor([self.step], dtype=torch.int64)
-        for name, values in self.field.named_parameters():
-            for key, moment in self.optimizer.state.get(values, {}).items():
+        for name, moments in self.optimizer.moments.items():
+            for key, moment in moments.items():
                 out[f"adam.{name}.{key}"] = moment
         return out
 
@@ -78,7 +78,7 @@ class FieldState:
             names = {key: f"adam.{name}.{key}" for key in MOMENTS}
             names_known |= set(names.values())
             if not tensors.keys().isdisjoint(names.values()):
-                state.optimizer.state[values] = {
+                state.optimizer.moments[name] = {
                     key: _like(values if key != "step" else torch.zeros(()), _given(tensors, full), full)
                     for key, full in names.items()
                 }

@@ -140,9 +140,8 @@ class FieldTrainer:
         color = losses.color_loss(marched.color, target.picture[pixels], target.dolp[pixels])
         loss = self._loss(color, marched, view.camera, rays, pixels, target, share)
         self._set_rates(share)
-        state.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        state.optimizer.step()
+        state.optimizer.step(dict(field.named_parameters()))
         with torch.no_grad():
             # Fog is where grids would begin; a surface never gets thicker than it was at first.
             field.log_sharpness.clamp_(min=field.first_log_sharpness)
@@ -233,8 +232,8 @@ class FieldTrainer:
         late = max(0.0, (share - rates.warmup) / (1 - rates.warmup))
         falling = rates.last + (1 - rates.last) * 0.5 * (1 + math.cos(math.pi * late))
         rising = min(1.0, (share * self.settings.steps + 1) / (rates.warmup * self.settings.steps + 1))
-        for group in self.state.optimizer.param_groups:
-            name: str = group["name"]
+        optimizer = self.state.optimizer
+        for name in optimizer.rates:
             level = name.rpartition(".")[2]
             if name.startswith("shape_grids."):
                 own = rates.distances * (shape.resolutions[0] / shape.resolutions[int(level)]) ** rates.finer
@@ -242,7 +241,7 @@ class FieldTrainer:
                 own = rates.features
             else:
                 own = rates.sharpness if name == "log_sharpness" else rates.networks
-            group["lr"] = own * rising * falling
+            optimizer.rates[name] = own * rising * falling
 
 
 def _ramp(share: float, begin: float, end: float) -> float:

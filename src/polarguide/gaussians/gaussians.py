@@ -1,4 +1,4 @@
-"""The Gaussians in training: tensors with one entry per Gaussian, and an Adam optimizer whose moments follow them.
+"""The Gaussians in training: tensors with one entry per Gaussian, and the moments of Adam, which follow them.
 
 Gaussians are removed, appended and overwritten only through the methods here, so a tensor and its moments cannot get
 out of step.
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from polarguide.core.errors import PolarguideError
+from polarguide.gaussians.adam import MOMENTS, Adam
 
 # What every recipe trains, with the shape of one Gaussian's values. A shading model adds parameters of its own.
 CORE_SHAPES = {
@@ -31,7 +32,7 @@ Own = TypeVar("Own", bound="Trained")
 
 
 class Trained:
-    """Named tensors with an Adam optimizer (Kingma and Ba 2015, epsilon 1e-15 as in 3DGS).
+    """Named tensors with ``Adam``, whose epsilon is 1e-15 as in 3DGS.
 
     Args:
         tensors: by name.
@@ -45,39 +46,42 @@ class Trained:
         self._tensors = {
             name: t.detach().clone().contiguous().requires_grad_() for name, t in tensors.items()
         }
-        groups = [
-            {"params": [self._tensors[name]], "lr": rate, "name": name}
-            for name, rate in rates.items()
-            if name in self._tensors
-        ]
-        self._optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        own = {name: rate for name, rate in rates.items() if name in self._tensors}
+        self._adam = Adam(own, epsilon=1e-15)
 
     def trained(self) -> list[Tensor]:
         """The tensors that are trained, in the order of their rates."""
-        return [group["params"][0] for group in self._optimizer.param_groups]
+        return [self._tensors[name] for name in self._adam.rates]
+
+    @property
+    def rates(self) -> dict[str, float]:
+        """Learning rate by name of the tensors that are trained."""
+        return dict(self._adam.rates)
+
+    @property
+    def betas(self) -> tuple[float, float]:
+        """Decay of Adam's moments."""
+        return self._adam.betas
 
     def set_betas(self, betas: tuple[float, float]) -> None:
-        """Set the decay of Adam's moments; torch's default otherwise."""
-        for group in self._optimizer.param_groups:
-            group["betas"] = betas
+        """Set the decay of Adam's moments; 0.9 and 0.999 otherwise."""
+        self._adam.betas = betas
 
     def set_rate(self, name: str, rate: float) -> None:
-        """Set the learning rate of one tensor."""
-        for group in self._optimizer.param_groups:
-            if group["name"] == name:
-                group["lr"] = rate
+        """Set the learning rate of one tensor, if it is trained."""
+        if name in self._adam.rates:
+            self._adam.rates[name] = rate
 
     def step(self) -> None:
         """One Adam step on every tensor that has a gradient; then the gradients are dropped."""
-        self._optimizer.step()
-        self._optimizer.zero_grad(set_to_none=True)
+        self._adam.step(self._tensors)
 
     def state(self) -> dict[str, Tensor]:
         """Everything needed to go on: ``KIND.NAME``, and the moments ``exp_avg``, ``exp_avg_sq`` and ``step``."""
         out = {f"{self.kind}.{name}": t.detach().contiguous() for name, t in self._tensors.items()}
-        for group in self._optimizer.param_groups:
-            for key, value in self._optimizer.state.get(group["params"][0], {}).items():
-                out[self._moments(group["name"]) + key] = value.detach().contiguous()
+        for name, moments in self._adam.moments.items():
+            for key, value in moments.items():
+                out[self._moments(name) + key] = value.detach().contiguous()
         return out
 
     @classmethod
@@ -85,11 +89,11 @@ class Trained:
         """The inverse of ``state``."""
         named = {tuple(key.split(".")): value for key, value in state.items()}
         loaded = cls({k[1]: value for k, value in named.items() if k[0] == cls.kind and len(k) == 2}, rates)
-        for group in loaded._optimizer.param_groups:
-            keys = {key: cls._moments(group["name"]) + key for key in ("step", "exp_avg", "exp_avg_sq")}
+        for name in loaded._adam.rates:
+            keys = {key: cls._moments(name) + key for key in MOMENTS}
             moments = {key: state[full].clone() for key, full in keys.items() if full in state}
             if moments:
-                loaded._optimizer.state[group["params"][0]] = moments
+                loaded._adam.moments[name] = moments
         return loaded
 
     @staticmethod
@@ -150,12 +154,14 @@ class Gaussians(Trained):
             rows: [N] bool, those whose values are replaced and whose moments are zeroed; all, if not given.
         """
         tensor = self._tensors[name]
-        state = self._optimizer.state.get(tensor, {})
         chosen = slice(None) if rows is None else rows
         tensor[chosen] = values[chosen]
-        for key in ("exp_avg", "exp_avg_sq"):
-            if key in state:
-                state[key][chosen] = 0
+
+        def zeroed(moment: Tensor) -> Tensor:
+            moment[chosen] = 0
+            return moment
+
+        self._adam.change(name, zeroed)
 
     def keep(self, index: Tensor) -> None:
         """Keep only the Gaussians that ``index`` (a mask or indices) selects."""
@@ -169,14 +175,7 @@ class Gaussians(Trained):
 
     def _replace(self, tensors: Mapping[str, Tensor], follow: Callable[[Tensor], Tensor]) -> None:
         """Put other values in the tensors' place; ``follow`` makes the same edit on a moment."""
-        groups = {group["name"]: group for group in self._optimizer.param_groups}
         for name, values in tensors.items():
-            old, new = self._tensors[name], values.contiguous().requires_grad_()
-            self._tensors[name] = new
-            state = self._optimizer.state.pop(old, None)
-            if name in groups:
-                groups[name]["params"][0] = new
-            if state:
-                moments = {key: follow(state[key]).contiguous() for key in ("exp_avg", "exp_avg_sq")}
-                self._optimizer.state[new] = {**state, **moments}
+            self._tensors[name] = values.contiguous().requires_grad_()
+            self._adam.change(name, follow)
         self._check()

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from polarguide.gaussians.adam import MOMENTS
 from polarguide.training.recipe import Recipe
 from polarguide.training.state import ANGLE_COLUMNS
 
@@ -18,7 +19,6 @@ LARGEST = {"means": 1e12, "log_scales": 1e4}
 LARGEST_VALUE = 1e8
 LARGEST_LOG_SCALE = 60.0
 MOST_SLOTS = 4096
-MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
 def refuse_foreign(tensors: Mapping[str, Tensor], recipe: Recipe) -> None:
