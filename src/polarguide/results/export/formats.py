@@ -15,13 +15,15 @@ from polarguide.capture.layout import refuse_scene
 from polarguide.capture.presentation import balanced
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import holds_files, make_folder, require_inside, temporary_folder, write_text
-from polarguide.core.options import ExportFormat, PathLike, check_choice, check_finite
+from polarguide.core.options import ExportFormat, ModelOptions, PathLike, check_choice, check_finite
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.fields.model import FieldModel
 from polarguide.geometry.camera import Camera
 from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
 from polarguide.results.evaluation.table import shown_metrics
-from polarguide.results.export.mesh import surface_points, write_mesh, write_points
+from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
+from polarguide.results.export.model.build import BASE_COLORS, textured_model
+from polarguide.results.export.model.gltf import write_glb
 from polarguide.results.export.placement import (
     Origin,
     Placement,
@@ -32,7 +34,7 @@ from polarguide.results.export.placement import (
 )
 from polarguide.results.export.share import share_page
 from polarguide.results.export.splats import write_sog, write_spz
-from polarguide.results.rendering.mesh import RESOLUTION, ColoredMesh, implicit_mesh, scene_mesh
+from polarguide.results.rendering.mesh import RESOLUTION, implicit_mesh, scene_mesh
 from polarguide.results.rendering.relight import needs_radiance, panorama, write_exr
 from polarguide.runs.model import GaussianModel, write_run_ply
 from polarguide.runs.opened import OpenedRun
@@ -55,6 +57,7 @@ def export(
     *,
     resolution: int = RESOLUTION,
     spz_version: int = 3,
+    model: ModelOptions = ModelOptions(),
     reporter: Reporter = SILENT,
 ) -> list[Path]:
     """Write a run as the files of other programs, as it is presented: cropped, in meters, upright (see ``Placement``).
@@ -62,12 +65,13 @@ def export(
     Args:
         run: the run; its scene is read for all but ply, spz and sog.
         format: ply, spz and sog are ordinary splats, with reflections baked as far as harmonics carry them; mesh (GLB
-            and PLY) is fused from rendered depth, with diffuse colors and learned normals; points are opaque Gaussians
-            with normals; environment is the learned light as a panorama (EXR and PNG); cameras are a COLMAP model and
-            transforms.json.
+            and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb is a textured model;
+            points are opaque Gaussians with normals; environment is the learned light as a panorama (EXR and PNG);
+            cameras are a COLMAP model and transforms.json.
         out: folder to write; ``export`` in the run's folder by default.
         resolution: voxels of the mesh along its longest side, 16 to 1024.
         spz_version: of the SPZ file, 3 or 4; readers are split between them.
+        model: options of the textured model.
         reporter: receives progress.
 
     Returns:
@@ -85,6 +89,7 @@ def export(
         "spz": lambda: [_spz(run, presented, folder / "splats.spz", spz_version)],
         "sog": lambda: [_sog(run, presented, folder / "splats.sog")],
         "mesh": lambda: _mesh(run, presented, folder, resolution, reporter),
+        "glb": lambda: [_model(run, presented, folder, resolution, model, reporter)],
         "points": lambda: _points(run, presented, folder),
         "environment": lambda: _environment(run, presented, folder),
         "cameras": lambda: _cameras(run, presented, folder),
@@ -237,7 +242,7 @@ def _mesh(
     if isinstance(run.model, FieldModel):
         mesh = implicit_mesh(run.cameras, run.model, resolution=resolution)
     else:
-        mesh = _fused(run, presented, resolution)
+        mesh = scene_mesh(run.cameras, _surface_view(run, presented, "format mesh"), resolution=resolution)
     if (crop := presented.presentation.crop) is not None:
         inside = crop.inside(torch.from_numpy(mesh.surface.vertices), run.camera_frame).numpy()
         mesh = mesh.within(inside)
@@ -248,13 +253,33 @@ def _mesh(
     return paths
 
 
-def _fused(run: OpenedRun, presented: _Presented, resolution: int) -> ColoredMesh:
-    """The mesh of Gaussians."""
-    model = run.gaussian_model("format mesh")
+def _model(
+    run: OpenedRun,
+    presented: _Presented,
+    folder: Path,
+    resolution: int,
+    options: ModelOptions,
+    reporter: Reporter,
+) -> Path:
+    path = folder / ("model-unlit.glb" if options.unlit else "model.glb")
+    view = _surface_view(run, presented, "format glb")
+    place, presentation = presented.placement, presented.presentation
+    with temporary_folder(path.with_suffix(".parts")) as parts:
+        textured = textured_model(run, view, presentation, place, options, resolution, parts, reporter)
+    asset = asset_record(place, presented.origin)
+    asset["extras"]["base_color"] = BASE_COLORS[options.resolved_base_color]
+    write_glb(path, textured, asset, jpeg=options.jpeg)
+    return path
+
+
+def _surface_view(run: OpenedRun, presented: _Presented, what: str) -> Callable[[Camera], RenderResult]:
+    """Renders a view of the Gaussians within the crop box, with the surface at the median depth."""
+    model = run.gaussian_model(what)
     gaussians = presented.gaussians
     assert gaussians is not None
 
-    def seen(camera: Camera) -> RenderResult:
+    @torch.no_grad()
+    def surface_view(camera: Camera) -> RenderResult:
         return render(
             gaussians,
             camera,
@@ -264,8 +289,7 @@ def _fused(run: OpenedRun, presented: _Presented, resolution: int) -> ColoredMes
             light=model.light,
         )
 
-    with torch.no_grad():
-        return scene_mesh(run.cameras, seen, resolution=resolution)
+    return surface_view
 
 
 def _points(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
