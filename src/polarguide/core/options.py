@@ -20,17 +20,17 @@ Transfer = Literal["linear", "srgb"]
 Split = Literal["directions", "every-8th"]
 Exposures = Literal["captured", "four", "three", "two", "one", "unknown", "mixed", "sparse", "none"]
 EXPOSURES: tuple[Exposures, ...] = get_args(Exposures)
-ExportFormat = Literal["ply", "spz", "sog", "mesh", "glb", "points", "environment", "cameras"]
+ExportFormat = Literal["ply", "spz", "sog", "mesh", "glb", "obj", "points", "environment", "cameras"]
 BaseColor = Literal["delit", "diffuse", "photographs", "picture"]
 PictureFormat = Literal["png", "exr", "npy"]
 EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
     "spz": ("gaussforge",),
     "mesh": ("skimage", "trimesh"),
-    "glb": ("skimage", "xatlas", "fast_simplification"),
+    **dict.fromkeys(("glb", "obj"), ("skimage", "xatlas", "fast_simplification")),
     "environment": ("OpenEXR",),
 }
 """The packages that formats need: looked for before a run is loaded."""
-EXPORT_EXTRAS = {"glb": "model"}
+EXPORT_EXTRAS = {"glb": "model", "obj": "model"}
 """The extra that brings those of a format; others come with polarguide."""
 PathLike = str | os.PathLike[str]
 INDEX = 1.5
@@ -128,7 +128,7 @@ class SceneOptions:
 
 @dataclass(frozen=True)
 class ModelOptions:
-    """A textured model (format glb).
+    """A textured model (formats glb and obj).
 
     Attributes:
         triangles: Triangles to simplify the surface to, about.

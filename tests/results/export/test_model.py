@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -25,6 +26,7 @@ from polarguide.results.export.model import build
 from polarguide.results.export.model.build import require_room, textured_model
 from polarguide.results.export.model.gltf import Textured, color_pixels, write_glb
 from polarguide.results.export.model.irradiance import Surroundings, irradiance
+from polarguide.results.export.model.obj import write_obj
 from polarguide.results.export.model.texels import texels_of
 from polarguide.results.export.model.topology import cleaned, topology
 from polarguide.results.export.model.unwrap import Unwrapped, unwrap
@@ -95,6 +97,7 @@ def test_texels_interpolate_and_textures_are_filled_to_their_end() -> None:
     picture = texels.texture(expected)
     np.testing.assert_allclose(picture[0, 0], [16.5 / 64] * 2, atol=1e-6)
     np.testing.assert_allclose(picture[40, 63], [47.5 / 64, 40.5 / 64], atol=1e-6)
+    Fault(where="texture", found="none").raised_by(texels_of, replace(square, uv=0.001 * uv), 64)
 
 
 def test_charts_keep_their_distance(tmp_path: Path) -> None:
@@ -258,6 +261,22 @@ def test_the_texture_holds_the_color_that_went_in(
 def encode(linear: np.ndarray) -> np.ndarray:
     """sRGB's curve, above its straight part."""
     return np.asarray(1.055 * np.clip(linear, 0.01, 1) ** (1 / 2.4) - 0.055)
+
+
+def test_an_obj_holds_the_same(tmp_path: Path) -> None:
+    model = model_of(tmp_path / "parts", base_color="diffuse")
+    paths = write_obj(tmp_path, model, ["a comment"], jpeg=False)
+    assert sorted(path.name for path in paths) == sorted(p.name for p in tmp_path.iterdir() if p.is_file())
+    mesh = trimesh.load(tmp_path / "model.obj", process=False)
+    np.testing.assert_allclose(mesh.vertices[mesh.faces], model.vertices[model.faces], atol=1e-5)
+    corner = np.stack([model.uv[:, 0], 1 - model.uv[:, 1]], axis=1)[model.faces]
+    np.testing.assert_allclose(mesh.visual.uv[mesh.faces], corner, atol=1e-5)
+    np.testing.assert_array_equal(np.array(mesh.visual.material.image), model.base_color)
+    assert model.surface is not None
+    for channel, name in ((1, "roughness"), (2, "metalness")):
+        assert f"map_P{name[0]} model-{name}.png" in (tmp_path / "model.mtl").read_text()
+        pixels = cv2.imread(str(tmp_path / f"model-{name}.png"))
+        np.testing.assert_array_equal(pixels[..., 0], model.surface[..., channel])
 
 
 def test_a_crop_box_takes_part_of_it_and_the_rest_still_shades(tmp_path: Path) -> None:

@@ -93,17 +93,9 @@ def textured_model(
         require_package("embreex", WHAT, extra="model")
     with reporter.track("fusing the surface"):
         mesh, voxel = _subject(run, surface_view, presentation.crop, options, resolution)
-    counts = topology(mesh.surface.faces)
-    reporter.say(
-        f"{len(mesh.surface.vertices):,} vertices, {len(mesh.surface.faces):,} triangles, {counts.pieces} pieces; "
-        f"{counts.boundary_edges:,} boundary edges, {counts.non_manifold_edges} non-manifold edges"
-    )
+    reporter.say(_counted(mesh.surface))
     unwrapped = unwrap(mesh.surface.vertices, mesh.surface.faces, options.texture, folder, reporter)
     texels = texels_of(unwrapped, options.texture)
-    if not len(texels.index):
-        raise PolarguideError(
-            "--texture", expected="texels for the triangles", found="none", remedy="Give a larger one."
-        )
     vertices, normals = (values[unwrapped.source] for values in (mesh.surface.vertices, mesh.surface.normals))
     facing = texels.interpolated(unwrapped.faces, normals)
     facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-9)
@@ -113,11 +105,12 @@ def textured_model(
         f"{unwrapped.charts:,} charts, {len(texels.index) / options.texture**2:.0%} of the texture used; "
         f"{1 - baked.seen.mean():.1%} of the surface is in no view and has the nearest color"
     )
+    color = baked.color
     if kind == "delit":
-        light = _irradiance(run, mesh, presentation.crop, reporter)
-        color = delit(baked.color, texels.interpolated(unwrapped.faces, light[unwrapped.source]), _index(run))
+        light = _irradiance(run, mesh, presentation.crop, reporter)[unwrapped.source]
+        color = delit(color, texels.interpolated(unwrapped.faces, light), _index(run))
     else:
-        color = balanced(torch.from_numpy(baked.color), presentation.gains).numpy()
+        color = balanced(torch.from_numpy(color), presentation.gains).numpy()
     axes = run.frame.panorama_axes().numpy()
     textures = _textures(run, baked, texels, options.albedo_scale * color, lit=not options.unlit)
     return Textured(
@@ -127,6 +120,15 @@ def textured_model(
         _drawn(unwrapped),
         *textures,
         _index(run),
+    )
+
+
+def _counted(surface: Surface) -> str:
+    """The counts of a mesh, for people."""
+    counts = topology(surface.faces)
+    return (
+        f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, {counts.pieces} pieces; "
+        f"{counts.boundary_edges:,} boundary edges, {counts.non_manifold_edges} non-manifold edges"
     )
 
 

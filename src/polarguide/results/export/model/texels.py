@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from polarguide.core.errors import PolarguideError
 from polarguide.results.export.model.unwrap import Unwrapped
 
 _CANDIDATES = 1 << 21
@@ -48,7 +49,11 @@ class Texels:
 
 
 def texels_of(mesh: Unwrapped, size: int) -> Texels:
-    """Rasterize the triangles of a mesh in its texture of ``size`` x ``size`` texels."""
+    """Rasterize the triangles of a mesh in its texture of ``size`` x ``size`` texels.
+
+    Raises:
+        PolarguideError: no texel lies on a triangle.
+    """
     corners = mesh.uv[mesh.faces] * size - 0.5  # the center of texel k is at k
     low = np.clip(np.ceil(corners.min(axis=1)), 0, size).astype(np.int64)
     high = np.clip(np.floor(corners.max(axis=1)), -1, size - 1).astype(np.int64)
@@ -63,6 +68,10 @@ def texels_of(mesh: Unwrapped, size: int) -> Texels:
         begin = end
     column, row, face, weights = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     index, first = np.unique(row * size + column, return_index=True)  # on a common edge: one of the two
+    if not len(index):
+        raise PolarguideError(
+            "texture", expected="texels on the triangles", found="none", remedy="Give a larger --texture."
+        )
     return Texels(size, index, face[first], weights[first])
 
 
