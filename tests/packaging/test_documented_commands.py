@@ -61,7 +61,6 @@ SHORT = {
     "present": [],
     "share": [],
     "export": ["--resolution", "32"],
-    "export glb": ["--resolution", "32", "--triangles", "2000", "--texture", "256"],
     "synth": [],
     "priors": [],
     "priors --run": ["--downscale", "2"],  # as the run was trained

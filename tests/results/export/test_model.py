@@ -18,6 +18,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from torch import Tensor
 
 from polarguide.capture.presentation import Crop, Presentation
+from polarguide.core.errors import install_extra, require_package
 from polarguide.core.options import ModelOptions
 from polarguide.core.progress import SILENT
 from polarguide.geometry.camera import Camera
@@ -293,6 +294,10 @@ def test_faults_are_named_before_work_begins(tmp_path: Path, monkeypatch: pytest
     Fault(where="triangles", expected="100 or more").raised_by(ModelOptions, triangles=5)
     Fault(where="texture", expected="16384").raised_by(ModelOptions, texture=99_999)
     Fault(where="albedo_scale").raised_by(ModelOptions, albedo_scale=float("nan"))
+    extra = {"what": "--format glb", "extra": "model"}
+    Fault(where="--format glb", expected="no_such", remedy=install_extra("model")).raised_by(
+        require_package, "no_such", **extra
+    )
     monkeypatch.setattr(build, "free_memory", lambda: 10**9)
     Fault(where="--texture", found="8192 x 8192").raised_by(require_room, 8192)
     require_room(512)

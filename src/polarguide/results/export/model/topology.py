@@ -128,7 +128,9 @@ def _closed(vertices: Places, faces: Faces) -> tuple[Places, Faces]:
     )  # where two holes touch, a fan could give an edge a third face
     following = dict(edges.tolist())
     limit = SMALL_HOLE * float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    added, new_faces, done = [], [], set()
+    added: list[Places] = []
+    new_faces: list[tuple[int, int, int]] = []
+    done: set[int] = set()
     for start in following:
         loop, at = [], start
         while at in following and at not in done and at not in ambiguous:
