@@ -46,7 +46,7 @@ BASE_COLORS: dict[BaseColor, str] = {
 SURROUNDINGS_RESOLUTION = 128
 """Voxels along the longest side of what lies outside the crop box: it only shades, and shadows are soft."""
 BYTES_PER_TEXEL = 160
-"""Most that a texel takes while textures are baked and filled, measured."""
+"""Most that a texel takes while textures are baked and filled: the sum of the arrays that are held together."""
 
 
 def require_room(texture: int) -> None:
