@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
-from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
 from polarguide.api import open_run
 from polarguide.geometry.camera import Camera
@@ -33,11 +33,16 @@ def looked_up(mesh: trimesh.Trimesh, camera: Camera, axes: np.ndarray) -> np.nda
     places, ray, face = mesh.ray.intersects_location(starts, rays, multiple_hits=False)
     shares = trimesh.triangles.points_to_barycentric(mesh.triangles[face], places)
     uv = (mesh.visual.uv[mesh.faces[face]] * shares[..., None]).sum(axis=1)
-    image = np.array(mesh.visual.material.baseColorTexture)[..., :3] / 255
+    image = srgb_decode_array(np.array(mesh.visual.material.baseColorTexture)[..., :3] / 255)
     size = image.shape[0]
-    row, column = ((1 - uv[:, 1]) * size).astype(int) % size, (uv[:, 0] * size).astype(int) % size
+    places_in_texture = (
+        np.stack([(1 - uv[:, 1]) * size, uv[:, 0] * size]) - 0.5
+    )  # trimesh counts v from below
     colors = np.full((len(rays), 3), np.nan)
-    colors[ray] = srgb_decode_array(image[row, column])
+    for channel in range(3):
+        colors[ray, channel] = map_coordinates(
+            image[..., channel], places_in_texture, order=1, mode="nearest"
+        )
     return colors.reshape(camera.height, camera.width, 3)
 
 

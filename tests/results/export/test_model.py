@@ -1,6 +1,7 @@
 """Textured models: clean topology, charts, textures with their padding, delighting, and the file as others read it."""
 
 import json
+import math
 import struct
 import subprocess
 from dataclasses import replace
@@ -23,6 +24,7 @@ from polarguide.core.options import ModelOptions
 from polarguide.core.progress import SILENT
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import scene_frame
+from polarguide.optics.color import srgb_decode_array
 from polarguide.results.export.model import build
 from polarguide.results.export.model.build import require_room, textured_model
 from polarguide.results.export.model.gltf import Textured, color_pixels, write_glb
@@ -201,22 +203,25 @@ def ball_view(camera: Camera) -> RenderResult:
     return replace(result, roughness=0.3 * alpha)
 
 
-def ball_run() -> Any:
-    """What exports read of a run, of the sphere."""
+def ball_run(light: float = 1.0) -> Any:
+    """What exports read of a run, of the sphere; ``light`` is the radiance that it has learned."""
     shading = DeferredShading(blend="fresnel", environment_resolution=4).bind(1.5)
     model = SimpleNamespace(shading=shading, state=SimpleNamespace(gaussians={}))
     frame = scene_frame(list(CAMERAS.values()))
     views = [SimpleNamespace(camera=camera) for camera in CAMERAS.values()]
+    texels = torch.full((6, 4, 4, 3), math.log(light))
     return SimpleNamespace(
-        model=model, gaussian_model=lambda _: model, light={"texels": torch.zeros(6, 4, 4, 3)}, cameras=CAMERAS,
+        model=model, gaussian_model=lambda _: model, light={"texels": texels}, cameras=CAMERAS,
         camera_frame=frame, frame=frame, result=ball_view, scene=SimpleNamespace(train_views=views),
     )  # fmt: skip
 
 
-def model_of(folder: Path, presentation: Presentation = IN_SCENE, **options: Any) -> Textured:
+def model_of(
+    folder: Path, presentation: Presentation = IN_SCENE, light: float = 1.0, **options: Any
+) -> Textured:
     folder.mkdir(exist_ok=True)
     chosen = ModelOptions(triangles=3000, texture=512, **options)
-    return textured_model(ball_run(), ball_view, presentation, IN_PLACE, chosen, 64, folder, SILENT)
+    return textured_model(ball_run(light), ball_view, presentation, IN_PLACE, chosen, 64, folder, SILENT)
 
 
 @pytest.mark.parametrize(
@@ -262,6 +267,16 @@ def test_the_texture_holds_the_color_that_went_in(
 def encode(linear: np.ndarray) -> np.ndarray:
     """sRGB's curve, above its straight part."""
     return np.asarray(1.055 * np.clip(linear, 0.01, 1) ** (1 / 2.4) - 0.055)
+
+
+def test_nothing_is_whiter_than_surfaces_are(tmp_path: Path) -> None:
+    """Learned light that is too dark makes base color too bright: it is taken back by one factor."""
+    right, bright = (model_of(tmp_path, light=light).base_color for light in (1.0, 0.3))
+    linear = [srgb_decode_array(pixels / 255) for pixels in (right, bright)]
+    assert np.quantile(linear[1].max(axis=-1), 0.9) == pytest.approx(0.88, abs=0.03)  # without: 1
+    middle = (right > 60) & (bright < 250)
+    ratio = (linear[1] / linear[0].clip(0.01))[middle]
+    assert np.quantile(ratio, 0.95) < 1.05 * np.quantile(ratio, 0.05)
 
 
 def test_an_obj_holds_the_same(tmp_path: Path) -> None:

@@ -48,7 +48,8 @@ class Baked:
     Attributes:
         color: [M, 3] linear. roughness: [M] as glTF has it. metalness: [M]. strength: [M] of the reflection.
         reflectance: [M, 3] of metals at normal incidence. index: [M] refractive index.
-        seen: [M] bool; texels that no view shows have the values of the nearest that one does.
+        seen: [M] bool, whether a view shows the texel. nearest: [U] for each of the others the nearest texel in space
+            that one does, whose values it has.
     """
 
     color: NDArray[np.float32]
@@ -58,6 +59,13 @@ class Baked:
     reflectance: NDArray[np.float32]
     index: NDArray[np.float32]
     seen: NDArray[np.bool_]
+    nearest: NDArray[np.int64]
+
+    def filled(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Values [M, C] with those of unseen texels replaced."""
+        values = values.copy()
+        values[~self.seen] = values[self.nearest]
+        return values
 
 
 CHANNELS = {"color": 3, "roughness": 1, "metalness": 1, "strength": 1, "reflectance": 3, "index": 1}
@@ -99,13 +107,15 @@ def bake(
                 weights[part].index_add_(0, rows, weight)
             progress(count)
     seen = (weights > SEEN).numpy()
-    values = (total / weights.clamp(min=1e-6)[:, None]).numpy()
-    _fill_unseen(values, places, seen)
+    nearest = _nearest_seen(places, seen)
+    total /= weights.clamp(min=1e-6)[:, None]
+    values = total.numpy()
+    values[~seen] = values[nearest]
     parts = np.split(values, np.cumsum([*CHANNELS.values()])[:-1], axis=1)
     named = {
         name: part if CHANNELS[name] == 3 else part[:, 0] for name, part in zip(CHANNELS, parts, strict=True)
     }
-    return Baked(**named, seen=seen)
+    return Baked(**named, seen=seen, nearest=nearest)
 
 
 def _layers(model: GaussianModel, result: RenderResult, view: View, color: ColorSource) -> dict[str, Tensor]:
@@ -175,11 +185,10 @@ def _visible(
     return rows[seen], cosine[seen].square(), places[seen]
 
 
-def _fill_unseen(values: NDArray[np.float32], places: NDArray[np.float32], seen: NDArray[np.bool_]) -> None:
-    """Give texels that no view shows the values of the nearest seen one in space, in place."""
-    known = seen.nonzero()[0]
-    if not len(known) or seen.all():
-        return
+def _nearest_seen(places: NDArray[np.float32], seen: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """For each texel that no view shows the nearest that one does, about; itself where none is."""
+    known, unseen = seen.nonzero()[0], (~seen).nonzero()[0]
+    if not len(known) or not len(unseen):
+        return unseen
     known = known[:: -(-len(known) // _FILLED_FROM)]
-    nearest = cKDTree(places[known]).query(places[~seen])[1]
-    values[~seen] = values[known[nearest]]
+    return np.asarray(known[cKDTree(places[known]).query(places[unseen])[1]])

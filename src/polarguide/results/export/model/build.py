@@ -43,6 +43,10 @@ BASE_COLORS: dict[BaseColor, str] = {
     "picture": "mean of the rendered pictures, highlights and shading baked in",
 }
 """The words about base color in exported files."""
+WHITEST = 0.9
+"""Reflectance of the whitest surfaces, such as white paint and porcelain, which hardly anything exceeds."""
+BRIGHT_SHARE = 0.01
+"""Of the surface may be brighter: highlights that are left, and noise."""
 SURROUNDINGS_RESOLUTION = 128
 """Voxels along the longest side of what lies outside the crop box: it only shades, and shadows are soft."""
 BYTES_PER_TEXEL = 160
@@ -109,6 +113,7 @@ def textured_model(
     if kind == "delit":
         light = _irradiance(run, mesh, presentation.crop, reporter)[unwrapped.source]
         color = delit(color, texels.interpolated(unwrapped.faces, light), _index(run))
+        color = _within_white(baked.filled(color), baked, reporter)
     else:
         color = balanced(torch.from_numpy(color), presentation.gains).numpy()
     axes = run.frame.panorama_axes().numpy()
@@ -121,6 +126,18 @@ def textured_model(
         *textures,
         _index(run),
     )
+
+
+def _within_white(color: NDArray[np.float32], baked: Baked, reporter: Reporter) -> NDArray[np.float32]:
+    """Delit color [M, 3], darkened where it is brighter than surfaces can be: it is known up to a factor only, and the
+    file ends at 1."""
+    dielectric = color[baked.seen & (baked.metalness < 0.5)]
+    brightest = float(np.quantile(dielectric.max(axis=1), 1 - BRIGHT_SHARE)) if len(dielectric) else 0.0
+    if brightest <= WHITEST:
+        return color
+    factor = WHITEST / brightest
+    reporter.say(f"base color times {factor:.2f}, so that no surface reflects more than {WHITEST:.0%}")
+    return color * np.float32(factor)
 
 
 def _counted(surface: Surface) -> str:
