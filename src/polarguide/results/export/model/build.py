@@ -46,7 +46,7 @@ BASE_COLORS: dict[BaseColor, str] = {
 WHITEST = 0.9
 """Reflectance of the whitest surfaces, such as white paint and porcelain, which hardly anything exceeds."""
 BRIGHT_SHARE = 0.01
-"""Of the surface may be brighter: highlights that are left, and noise."""
+"""Of the surface may be brighter before all of it is darkened: highlights that are left, and noise."""
 SURROUNDINGS_RESOLUTION = 128
 """Voxels along the longest side of what lies outside the crop box: it only shades, and shadows are soft."""
 BYTES_PER_TEXEL = 160
@@ -129,15 +129,17 @@ def textured_model(
 
 
 def _within_white(color: NDArray[np.float32], baked: Baked, reporter: Reporter) -> NDArray[np.float32]:
-    """Delit color [M, 3], darkened where it is brighter than surfaces can be: it is known up to a factor only, and the
-    file ends at 1."""
+    """Delit color [M, 3] that is nowhere whiter than surfaces can be: it is known up to one factor only, and what few
+    texels have beyond is light that the environment does not hold. Hues stay."""
     dielectric = color[baked.seen & (baked.metalness < 0.5)]
     brightest = float(np.quantile(dielectric.max(axis=1), 1 - BRIGHT_SHARE)) if len(dielectric) else 0.0
-    if brightest <= WHITEST:
-        return color
-    factor = WHITEST / brightest
-    reporter.say(f"base color times {factor:.2f}, so that no surface reflects more than {WHITEST:.0%}")
-    return color * np.float32(factor)
+    if brightest > WHITEST:
+        factor = WHITEST / brightest
+        reporter.say(f"base color times {factor:.2f}, so that surfaces reflect {WHITEST:.0%} at most")
+        color = color * np.float32(factor)
+    return color * np.minimum(1, WHITEST / np.maximum(color.max(axis=1, keepdims=True), 1e-6)).astype(
+        np.float32
+    )
 
 
 def _counted(surface: Surface) -> str:
