@@ -60,13 +60,12 @@ def unwrap(
     np.savez(task, vertices=vertices.astype(np.float32), faces=faces.astype(np.uint32), texture=texture)
     with reporter.track(f"unwrapping {len(faces):,} triangles (xatlas)"):
         command = [sys.executable, "-c", _ENTRY, str(task), str(answer)]
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-        try:
-            _, errors = process.communicate()
-        except BaseException:
-            process.kill()
-            process.wait()
-            raise
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+            try:
+                _, errors = process.communicate()
+            except BaseException:
+                process.kill()
+                raise
     if process.returncode or not answer.is_file():
         lines = errors.decode(errors="replace").strip().splitlines()
         raise PolarguideError(
