@@ -81,7 +81,7 @@ def test_points_have_unit_normals_and_colors(
 def test_environment(trained: Path, tmp_path: Path) -> None:
     pytest.importorskip("OpenEXR")
     exported(trained, tmp_path, "environment")
-    assert {p.name for p in tmp_path.iterdir()} == {"environment.exr", "environment.png"}
+    assert {p.name for p in tmp_path.iterdir()} == {"environment.exr", "environment.hdr", "environment.png"}
     flags = ["--views", "v000", "--layers", "final,specular", "--out", str(tmp_path / "a")]
     assert (
         run(["render", str(trained), "--environment", str(tmp_path / "environment.exr"), *flags, *ONE]) == 0

@@ -24,7 +24,7 @@ from polarguide.geometry.vectors import unit_array as unit
 from polarguide.synth.build import BuiltScene, _mesh, _user_mesh, build_scene
 from polarguide.synth.colmap import place_cameras
 from polarguide.synth.film import LobeRadiance, render_lobes
-from polarguide.synth.ground_truth import ground_truth_maps
+from polarguide.synth.ground_truth import base_colors, ground_truth_maps, intersect
 from polarguide.synth.schema import parse_scene
 from polarguide.synth.sensor import Sensor, mosaic, noisy
 from polarguide.synth.settings import PRESETS, Variant, find_scene
@@ -170,6 +170,88 @@ def test_pixel_truth_agrees_with_the_geometry(
     )
     size = np.linalg.norm(places[where.numpy()], axis=-1)
     np.testing.assert_allclose(size, 1, atol=4e-3)  # half precision
+
+
+SURFACES = {
+    **BALL,
+    "name": "surfaces",
+    "things": [
+        {
+            "name": "tiles",
+            "shape": {"type": "ball", "radius": 0.7},
+            "material": {"color": {"type": "mottled", "a": [0.6, 0.1, 0.1], "b": [0.1, 0.4, 0.6], "pixels": 32},
+                         "roughness": 0.1, "index": 1.7},
+        },
+        {
+            "name": "gold",
+            "position": [0.9, 0.9, 0],
+            "shape": {"type": "box", "size": [0.9, 0.9, 1.5]},
+            "material": {"type": "metal", "roughness": 0.2, "eta": [0.2, 0.4, 1.4], "k": [3.0, 2.4, 1.9]},
+        },
+        {
+            "name": "chalk",
+            "position": [-0.66, -0.88, 0],
+            "shape": {"type": "solid", "parts": [
+                {"kind": "ellipsoid", "at": [0, 0, 0], "size": [0.4, 0.4, 0.6], "color": [0.8, 0.7, 0.1]}]},
+            "material": {"type": "matte", "color": "own"},
+        },
+    ],
+}  # fmt: skip
+
+
+def test_material_truth_is_what_mitsuba_renders_with(
+    variant: Variant, camera: Camera, tmp_path: Path
+) -> None:
+    """Of the dielectrics, Mitsuba's own diffuse lobe, less its two passages through the coat at normal incidence."""
+    if not variant.fast:
+        pytest.skip("a sampled spectrum has no exact colors")
+    built = build_scene(parse_scene(SURFACES, "surfaces", folder=tmp_path), tmp_path, variant)
+    rays = camera.world_rays().numpy().astype(np.float64).reshape(-1, 3)
+    origins = np.broadcast_to(camera.center.numpy(), rays.shape)
+    hits = intersect(built, origins, rays)
+    colors = base_colors(built, hits)
+    here = {thing.name: hits.thing == number for number, thing in enumerate(built.spec.things, 1)}
+    mi = pytest.importorskip("mitsuba")
+    corners = [mi.Vector3f(np.ascontiguousarray(v.T, np.float32)) for v in (origins, rays)]
+    only_diffuse = mi.BSDFContext()
+    only_diffuse.type_mask = int(mi.BSDFFlags.Diffuse)
+    up = mi.Vector3f(0, 0, 1)
+    for channel, scene in enumerate(built.scenes):
+        surface = scene.ray_intersect(mi.Ray3f(mi.Point3f(corners[0]), corners[1]))
+        surface.wi = up
+        lobe = np.array(surface.bsdf().eval(only_diffuse, surface, up, surface.is_valid())[0, 0]).ravel()
+        for name, passage in (("tiles", 4 * 1.7 / 2.7**2), ("chalk", 1.0)):
+            assert here[name].sum() > 8
+            expected = lobe[here[name]] * math.pi / passage**2
+            np.testing.assert_allclose(colors[here[name], channel], expected, atol=1e-5)
+    assert colors[here["tiles"]].std() > 0.05
+    np.testing.assert_allclose(
+        colors[here["gold"]], [[0.9234, 0.7927, 0.4023]] * here["gold"].sum(), atol=1e-3
+    )
+    maps = {
+        name: values.reshape(-1, *values.shape[2:])
+        for name, values in ground_truth_maps(built, camera).items()
+    }
+    for name, (roughness, metalness, index) in {
+        "tiles": (0.1, 0, 1.7),
+        "gold": (0.2, 1, 0),
+        "chalk": (1, 0, 0),
+    }.items():
+        of_material = np.stack([maps[key][here[name]] for key in ("roughness", "metalness", "index")], -1)
+        np.testing.assert_allclose(of_material, [[roughness, metalness, index]] * here[name].sum(), atol=1e-3)
+    np.testing.assert_allclose(
+        np.median(maps["albedo"][here["gold"]], axis=0), [0.9234, 0.7927, 0.4023], atol=1e-3
+    )
+
+
+def test_base_color_is_the_mean_of_each_pixel(ball: BuiltScene, camera: Camera) -> None:
+    """Of what shows an object: also where the ball ends within the pixel, and nowhere else."""
+    albedo = ground_truth_maps(ball, camera)["albedo"].astype(float)
+    drawn = albedo.any(axis=-1)
+    np.testing.assert_allclose(albedo[drawn], [[0.6, 0.3, 0.15]] * drawn.sum(), atol=1e-3)
+    centers = ground_truth_maps(ball, camera)["objid"] > 0
+    assert drawn[centers].all()
+    assert centers.sum() < drawn.sum() < centers.sum() + 60  # of 320 pixels, those at the outline
 
 
 def test_lobes_add_up_to_mitsubas_own_path_tracer(

@@ -131,8 +131,8 @@ def requirements() -> list[Requirement]:
     return listed
 
 
-def require_package(module: str, what: str) -> None:
-    """Check that a package is there, without loading it: before work begins, not after.
+def require_package(module: str, what: str, *, extra: str = "") -> None:
+    """Check that a package is there, without loading it: before work begins, not after. See ``optional_import``.
 
     Raises:
         PolarguideError: it is not installed.
@@ -142,7 +142,7 @@ def require_package(module: str, what: str) -> None:
     except (ImportError, ValueError):  # a package whose own metadata is broken
         there = False
     if not there:
-        raise _missing(module, what)
+        raise _missing(module, what, extra)
 
 
 def optional_import(module: str, what: str, *, extra: str = "") -> Any:

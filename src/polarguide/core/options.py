@@ -20,14 +20,18 @@ Transfer = Literal["linear", "srgb"]
 Split = Literal["directions", "every-8th"]
 Exposures = Literal["captured", "four", "three", "two", "one", "unknown", "mixed", "sparse", "none"]
 EXPOSURES: tuple[Exposures, ...] = get_args(Exposures)
-ExportFormat = Literal["ply", "spz", "sog", "mesh", "points", "environment", "cameras"]
+ExportFormat = Literal["ply", "spz", "sog", "mesh", "glb", "obj", "points", "environment", "cameras"]
+BaseColor = Literal["delit", "diffuse", "photographs", "picture"]
 PictureFormat = Literal["png", "exr", "npy"]
 EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
     "spz": ("gaussforge",),
     "mesh": ("skimage", "trimesh"),
+    **dict.fromkeys(("glb", "obj"), ("skimage", "xatlas", "fast_simplification")),
     "environment": ("OpenEXR",),
 }
 """The packages that formats need: looked for before a run is loaded."""
+EXPORT_EXTRAS = {"glb": "model", "obj": "model"}
+"""The extra that brings those of a format; others come with polarguide."""
 PathLike = str | os.PathLike[str]
 INDEX = 1.5
 """Refractive index of glass, plastic and glaze, for scenes that name none."""
@@ -120,6 +124,41 @@ class SceneOptions:
         check_count("downscale", self.downscale)
         if self.memory is not None:
             check_finite("memory", self.memory, LEAST_MEMORY, 1e6)
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """A textured model (formats glb and obj).
+
+    Attributes:
+        triangles: Triangles to simplify the surface to, about.
+        texture: Texels along the texture's side.
+        jpeg: Textures as JPEG, a third of the size, in place of PNG.
+        base_color: delit: the diffuse layer without its shading; diffuse: the layer as it is; photographs; picture: the
+            rendered picture with its highlights. By default delit, and with unlit picture.
+        albedo_scale: Factor on the base color. The learned light has no absolute scale, so that one factor of a delit
+            base color is not known: give what makes a gray card right.
+        unlit: For viewers without light: the color is shown as it is.
+    """
+
+    triangles: int = 50_000
+    texture: int = 2048
+    jpeg: bool = False
+    base_color: BaseColor | None = None
+    albedo_scale: float = 1.0
+    unlit: bool = False
+
+    def __post_init__(self) -> None:
+        check_count("triangles", self.triangles, 100, 10_000_000)
+        check_count("texture", self.texture, 64, 16_384)
+        check_finite("albedo_scale", self.albedo_scale, 1e-3, 1e3)
+        if self.base_color is not None:
+            check_choice("base_color", self.base_color, get_args(BaseColor))
+
+    @property
+    def resolved_base_color(self) -> BaseColor:
+        """The base color, where none was chosen the one that goes with the light."""
+        return self.base_color or ("picture" if self.unlit else "delit")
 
 
 @dataclass(frozen=True)

@@ -126,12 +126,14 @@ class BuiltScene:
         scenes: Mitsuba's scenes, one or three (see ``film.render_lobes``).
         shapes: Mitsuba's shape of every object in the first scene, in the order of the data.
         panorama: the environment, [H, W, 3].
+        textures: of every object, [H, W, 3] with rows from the top down, or None where it has one color.
     """
 
     spec: SceneSpec
     scenes: list[Any]
     shapes: list[Any]
     panorama: Array
+    textures: list[Array | None]
 
 
 def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
@@ -163,7 +165,7 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
         scenes.append(scene)
         if not first:
             first = [content[f"thing{number}"] for number in range(len(spec.things))]
-    return BuiltScene(spec, scenes, first, panorama)
+    return BuiltScene(spec, scenes, first, panorama, pictures)
 
 
 def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:

@@ -189,7 +189,8 @@ CONVENTION = {
     "each ray (docs/explanation/conventions.md)",
     "camera": "OpenCV axes, world to camera x_cam = R x_world + t, pixel centers at 0.5",
     "truth": "gt/<view>.npz: stokes, specular and diffuse as S0 of the lobes of the first surface, exposed like "
-    "the pictures, whose sum is S0 on surfaces; normal (world), depth (camera z), mask, objid at pixel centers",
+    "the pictures, whose sum is S0 on surfaces; normal (world), depth (camera z), mask, objid, roughness (GGX alpha), "
+    "metalness, index at pixel centers; albedo (linear, of metals their reflectance) as the mean of each pixel",
     "environment": "environment.hdr: rows from +z down, columns clockwise seen from above, from +x; scene units",
 }
 

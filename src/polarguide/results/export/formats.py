@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -15,13 +16,16 @@ from polarguide.capture.layout import refuse_scene
 from polarguide.capture.presentation import balanced
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import holds_files, make_folder, require_inside, temporary_folder, write_text
-from polarguide.core.options import ExportFormat, PathLike, check_choice, check_finite
+from polarguide.core.options import ExportFormat, ModelOptions, PathLike, check_choice, check_finite
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.fields.model import FieldModel
 from polarguide.geometry.camera import Camera
 from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
 from polarguide.results.evaluation.table import shown_metrics
-from polarguide.results.export.mesh import surface_points, write_mesh, write_points
+from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
+from polarguide.results.export.model.build import BASE_COLORS, textured_model
+from polarguide.results.export.model.gltf import write_glb
+from polarguide.results.export.model.obj import write_obj
 from polarguide.results.export.placement import (
     Origin,
     Placement,
@@ -32,8 +36,8 @@ from polarguide.results.export.placement import (
 )
 from polarguide.results.export.share import share_page
 from polarguide.results.export.splats import write_sog, write_spz
-from polarguide.results.rendering.mesh import RESOLUTION, ColoredMesh, implicit_mesh, scene_mesh
-from polarguide.results.rendering.relight import needs_radiance, panorama, write_exr
+from polarguide.results.rendering.mesh import RESOLUTION, implicit_mesh, scene_mesh
+from polarguide.results.rendering.relight import needs_radiance, panorama, write_exr, write_hdr
 from polarguide.runs.model import GaussianModel, write_run_ply
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.gbuffer import RenderRequest, render
@@ -55,6 +59,7 @@ def export(
     *,
     resolution: int = RESOLUTION,
     spz_version: int = 3,
+    model: ModelOptions = ModelOptions(),
     reporter: Reporter = SILENT,
 ) -> list[Path]:
     """Write a run as the files of other programs, as it is presented: cropped, in meters, upright (see ``Placement``).
@@ -62,12 +67,13 @@ def export(
     Args:
         run: the run; its scene is read for all but ply, spz and sog.
         format: ply, spz and sog are ordinary splats, with reflections baked as far as harmonics carry them; mesh (GLB
-            and PLY) is fused from rendered depth, with diffuse colors and learned normals; points are opaque Gaussians
-            with normals; environment is the learned light as a panorama (EXR and PNG); cameras are a COLMAP model and
-            transforms.json.
+            and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb and obj are a
+            textured model; points are opaque Gaussians with normals; environment is the learned light as a panorama
+            (EXR, HDR and PNG); cameras are a COLMAP model and transforms.json.
         out: folder to write; ``export`` in the run's folder by default.
         resolution: voxels of the mesh along its longest side, 16 to 1024.
         spz_version: of the SPZ file, 3 or 4; readers are split between them.
+        model: options of the textured model.
         reporter: receives progress.
 
     Returns:
@@ -85,6 +91,8 @@ def export(
         "spz": lambda: [_spz(run, presented, folder / "splats.spz", spz_version)],
         "sog": lambda: [_sog(run, presented, folder / "splats.sog")],
         "mesh": lambda: _mesh(run, presented, folder, resolution, reporter),
+        "glb": lambda: _model(run, presented, folder, resolution, model, reporter, "glb"),
+        "obj": lambda: _model(run, presented, folder, resolution, model, reporter, "obj"),
         "points": lambda: _points(run, presented, folder),
         "environment": lambda: _environment(run, presented, folder),
         "cameras": lambda: _cameras(run, presented, folder),
@@ -240,7 +248,7 @@ def _mesh(
     if isinstance(run.model, FieldModel):
         mesh = implicit_mesh(run.cameras, run.model, resolution=resolution)
     else:
-        mesh = _fused(run, presented, resolution)
+        mesh = scene_mesh(run.cameras, _surface_view(run, presented, "format mesh"), resolution=resolution)
     if (crop := presented.presentation.crop) is not None:
         inside = crop.inside(torch.from_numpy(mesh.surface.vertices), run.camera_frame).numpy()
         mesh = mesh.within(inside)
@@ -251,13 +259,39 @@ def _mesh(
     return paths
 
 
-def _fused(run: OpenedRun, presented: _Presented, resolution: int) -> ColoredMesh:
-    """The mesh of Gaussians."""
-    model = run.gaussian_model("format mesh")
+def _model(
+    run: OpenedRun,
+    presented: _Presented,
+    folder: Path,
+    resolution: int,
+    options: ModelOptions,
+    reporter: Reporter,
+    kind: Literal["glb", "obj"],
+) -> list[Path]:
+    view = _surface_view(run, presented, f"format {kind}")
+    place, presentation = presented.placement, presented.presentation
+    with temporary_folder(folder / kind) as parts:
+        textured = textured_model(run, view, presentation, place, options, resolution, parts, reporter)
+    meaning = BASE_COLORS[options.resolved_base_color]
+    if kind == "obj":
+        upright = replace(place, upright=False)  # +y is up whatever was chosen
+        lines = [*comments(presented.origin, upright), "up_axis +y", f"base_color {meaning}"]
+        return write_obj(folder, textured, lines, jpeg=options.jpeg)
+    asset = asset_record(place, presented.origin)
+    asset["extras"]["base_color"] = meaning
+    path = folder / ("model-unlit.glb" if options.unlit else "model.glb")
+    write_glb(path, textured, asset, jpeg=options.jpeg)
+    return [path]
+
+
+def _surface_view(run: OpenedRun, presented: _Presented, what: str) -> Callable[[Camera], RenderResult]:
+    """Renders a view of the Gaussians within the crop box, with the surface at the median depth."""
+    model = run.gaussian_model(what)
     gaussians = presented.gaussians
     assert gaussians is not None
 
-    def seen(camera: Camera) -> RenderResult:
+    @torch.no_grad()
+    def surface_view(camera: Camera) -> RenderResult:
         return render(
             gaussians,
             camera,
@@ -267,8 +301,7 @@ def _fused(run: OpenedRun, presented: _Presented, resolution: int) -> ColoredMes
             light=model.light,
         )
 
-    with torch.no_grad():
-        return scene_mesh(run.cameras, seen, resolution=resolution)
+    return surface_view
 
 
 def _points(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
@@ -283,10 +316,11 @@ def _points(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
 def _environment(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
     cubemap = needs_radiance(run.model.shading, what="format")
     picture = panorama(run.light[cubemap.name], cubemap, run.frame, PANORAMA_HEIGHT)
-    paths = [folder / "environment.exr", folder / "environment.png"]
+    paths = [folder / f"environment.{kind}" for kind in ("exr", "hdr", "png")]
     credit = presented.presentation.credit
     write_exr(paths[0], picture, {"owner": credit} if credit else {})
-    figures.write_png(paths[1], figures.radiance_to_rgb(balanced(picture, presented.presentation.gains)))
+    write_hdr(paths[1], picture)
+    figures.write_png(paths[2], figures.radiance_to_rgb(balanced(picture, presented.presentation.gains)))
     return paths
 
 

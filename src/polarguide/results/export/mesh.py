@@ -73,7 +73,7 @@ def write_mesh(
         scene.add_geometry(solid, node_name="mesh", geom_name="mesh", transform=pose)
 
         def about(tree: dict[str, Any]) -> None:
-            tree["asset"] |= _asset(placement, origin)
+            tree["asset"] |= asset_record(placement, origin)
 
         data = scene.export(file_type="glb", include_normals=True, tree_postprocessor=about)
     else:
@@ -81,7 +81,7 @@ def write_mesh(
     write_whole(path, data)
 
 
-def _asset(placement: Placement, origin: Origin) -> dict[str, Any]:
+def asset_record(placement: Placement, origin: Origin) -> dict[str, Any]:
     """The asset record of a glTF file. Its unit is the meter; where the scale is not known, ``units`` says so."""
     units = "meters" if placement.metric else "units of the scene; how long one is, is not known"
     credit = origin.presentation.credit

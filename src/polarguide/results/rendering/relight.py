@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from torch.nn.functional import grid_sample, pad
 
 from polarguide.capture.formats.arrays import read_radiance
 from polarguide.core.errors import PolarguideError, optional_import
-from polarguide.core.files import atomic, in_utf8
+from polarguide.core.files import atomic, in_utf8, write_whole
 from polarguide.core.options import PathLike
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.geometry.scene_frame import SceneFrame
@@ -133,6 +134,13 @@ def write_exr(path: Path, picture: Tensor, attributes: Mapping[str, str] = {}) -
             file.write(str(name))
         except RuntimeError as error:
             raise OSError(str(error).strip().splitlines()[-1]) from None
+
+
+def write_hdr(path: Path, picture: Tensor) -> None:
+    """Write linear radiance [H, W, 3] as Radiance RGBE, which more viewers read: 8 bits a channel, one exponent."""
+    pixels = np.ascontiguousarray(picture.detach().numpy().astype(np.float32)[..., ::-1])
+    _, data = cv2.imencode(".hdr", pixels)
+    write_whole(path, data.tobytes())
 
 
 def read_panorama(path: Path) -> Tensor:

@@ -1,0 +1,92 @@
+"""Base color of exported models against the true one: PSNR of sRGB values, of dielectrics, on held-out views.
+
+    python benchmarks/accuracy/base_color.py RUN MODEL.glb [MODEL.glb ...]
+
+RUN's scene is one that ``polarguide synth`` has rendered with ``albedo`` in its ground truth; the models are exports of
+RUN in the scene's own units. Rays from the test views look the texture up in the file, as a viewer would. One factor
+is fitted for each model, never one a channel, since the brightness of base color is not known without it. Pixels count
+in the foreground, two pixels off outlines. Needs trimesh and embreex.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
+
+from polarguide.api import open_run
+from polarguide.geometry.camera import Camera
+from polarguide.optics.color import srgb_decode_array, srgb_encode_array
+
+OUTLINE = 5
+"""Pixels of the window in which all have to show one object."""
+
+
+def looked_up(mesh: trimesh.Trimesh, camera: Camera, axes: np.ndarray) -> np.ndarray:
+    """Linear base color [H, W, 3] of a model from a camera of the scene, NaN where there is no surface."""
+    rays = camera.world_rays(dtype=torch.float64).reshape(-1, 3).numpy() @ axes
+    starts = np.broadcast_to(camera.center.numpy() @ axes, rays.shape)
+    places, ray, face = mesh.ray.intersects_location(starts, rays, multiple_hits=False)
+    shares = trimesh.triangles.points_to_barycentric(mesh.triangles[face], places)
+    uv = (mesh.visual.uv[mesh.faces[face]] * shares[..., None]).sum(axis=1)
+    image = srgb_decode_array(np.array(mesh.visual.material.baseColorTexture)[..., :3] / 255)
+    size = image.shape[0]
+    places_in_texture = (
+        np.stack([(1 - uv[:, 1]) * size, uv[:, 0] * size]) - 0.5
+    )  # trimesh counts v from below
+    colors = np.full((len(rays), 3), np.nan)
+    for channel in range(3):
+        colors[ray, channel] = map_coordinates(
+            image[..., channel], places_in_texture, order=1, mode="nearest"
+        )
+    return colors.reshape(camera.height, camera.width, 3)
+
+
+def psnr(first: np.ndarray, second: np.ndarray) -> float:
+    """In dB, of linear colors as sRGB shows them."""
+    shown = [srgb_encode_array(np.clip(values, 0, 1)) for values in (first, second)]
+    return float(-10 * np.log10(np.mean((shown[0] - shown[1]) ** 2)))
+
+
+def main() -> None:
+    """Print a table: each model, then its objects."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("models", type=Path, nargs="+")
+    arguments = parser.parse_args()
+    run = open_run(arguments.run)
+    axes = run.frame.panorama_axes().numpy()
+    names = {thing.id: thing.name for thing in run.scene.objects if thing.foreground}
+    print(f"{'model':32} {'as it is':>9} {'1 factor':>9} {'factor':>7}  objects with that factor")
+    for path in arguments.models:
+        mesh = trimesh.load(path, process=False).to_geometry()
+        model, true, which = [], [], []
+        for view in run.scene.test_views:
+            with np.load(run.scene.root / "gt" / f"{view.name}.npz") as truth:
+                albedo, objects, metal = (truth[name] for name in ("albedo", "objid", "metalness"))
+            assert objects.shape == (view.camera.height, view.camera.width), "train without --downscale"
+            inner = (minimum_filter(objects, OUTLINE) == objects) & (
+                maximum_filter(objects, OUTLINE) == objects
+            )
+            color = looked_up(mesh, view.camera, axes)
+            counts = inner & (metal == 0) & np.isin(objects, [*names]) & np.isfinite(color).all(axis=-1)
+            model.append(color[counts])
+            true.append(albedo[counts].astype(float))
+            which.append(objects[counts])
+        colors, expected, objects = (np.concatenate(parts) for parts in (model, true, which))
+        factor = float((colors * expected).sum() / (colors * colors).sum())
+        each = [
+            f"{names[number]} {psnr(factor * colors[here], expected[here]):.1f}"
+            for number in np.unique(objects)
+            if (here := objects == number).sum() >= 20
+        ]
+        scores = f"{psnr(colors, expected):9.2f} {psnr(factor * colors, expected):9.2f} {factor:7.2f}"
+        print(f"{path.parent.name + '/' + path.name:32} {scores}  {', '.join(each)}")
+
+
+if __name__ == "__main__":
+    main()

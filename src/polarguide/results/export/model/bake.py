@@ -1,0 +1,194 @@
+"""Textures from a trained scene: every texel has the weighted mean of what the views show of its place.
+
+A view counts where its own rendered surface lies at the texel's depth, so that nothing is painted with what stands
+before or behind it, and by the square of the cosine at which it looks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn.functional import grid_sample, max_pool2d
+
+from polarguide.capture import View
+from polarguide.core.progress import Reporter
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
+from polarguide.raster.surface import WIDTH
+from polarguide.results.rendering.mesh import OPAQUE
+from polarguide.runs.model import GaussianModel
+from polarguide.runs.opened import OpenedRun
+from polarguide.shading.gbuffer import splats
+from polarguide.shading.metal import any_nonzero, metal_channels, reflectance
+from polarguide.shading.result import RenderResult
+
+ColorSource = Literal["diffuse", "final", "photograph"]
+STEEPEST = 0.15
+"""Cosine below which a view does not count: its pixels are stretched seven times over the surface."""
+NEAR = 2.0
+"""Voxels by which a texel may lie off the rendered depth, where it is seen squarely."""
+SEEN = 0.05
+"""Sum of weights from which a texel counts as seen: one view at a cosine of 0.22."""
+_TOGETHER = 1 << 19
+_FILLED_FROM = 200_000
+"""Seen texels among which the nearest one of an unseen texel is looked for, at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Baked:
+    """Of M texels, single precision.
+
+    Attributes:
+        color: [M, 3] linear. roughness: [M] as glTF has it. metalness: [M]. strength: [M] of the reflection.
+        reflectance: [M, 3] of metals at normal incidence. index: [M] refractive index.
+        seen: [M] bool, whether a view shows the texel. nearest: [U] for each of the others the nearest texel in space
+            that one does, whose values it has.
+    """
+
+    color: NDArray[np.float32]
+    roughness: NDArray[np.float32]
+    metalness: NDArray[np.float32]
+    strength: NDArray[np.float32]
+    reflectance: NDArray[np.float32]
+    index: NDArray[np.float32]
+    seen: NDArray[np.bool_]
+    nearest: NDArray[np.int64]
+
+    def filled(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Values [M, C] with those of unseen texels replaced."""
+        values = values.copy()
+        values[~self.seen] = values[self.nearest]
+        return values
+
+
+CHANNELS = {"color": 3, "roughness": 1, "metalness": 1, "strength": 1, "reflectance": 3, "index": 1}
+CONSTANTS = {"roughness": 1.0, "metalness": 0.0, "strength": 0.0}
+"""Of recipes that learn nothing of the kind: a matte dielectric."""
+
+
+@torch.no_grad()
+def bake(
+    run: OpenedRun,
+    views: Sequence[View],
+    places: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    color: ColorSource,
+    voxel: float,
+    reporter: Reporter,
+) -> Baked:
+    """Look up what views show at places on the surface.
+
+    Args:
+        run: of Gaussians. views: that count. places, normals: [M, 3] in the scene, normals unit.
+        color: the layer, or the photographs. voxel: side of those that the surface was fused in.
+        reporter: receives progress.
+    """
+    model = run.gaussian_model("a textured model")
+    points, facing = torch.from_numpy(places), torch.from_numpy(normals)
+    total = torch.zeros(len(points), sum(CHANNELS.values()))
+    weights = torch.zeros(len(points))
+    with reporter.track("baking textures", len(views)) as progress:
+        for count, view in enumerate(views, 1):
+            result = run.result(view.camera).to("cpu")
+            picture = torch.cat([*_layers(model, result, view, color).values()], dim=-1)
+            depth = _reliable_depth(result, view if color == "photograph" else None)
+            for begin in range(0, len(points), _TOGETHER):
+                part = slice(begin, begin + _TOGETHER)
+                rows, weight, pixels = _visible(points[part], facing[part], view.camera, depth, voxel)
+                sampled = grid_sample(picture.permute(2, 0, 1)[None], pixels[None, None], align_corners=False)
+                total[part].index_add_(0, rows, weight[:, None] * sampled[0, :, 0].T)
+                weights[part].index_add_(0, rows, weight)
+            progress(count)
+    seen = (weights > SEEN).numpy()
+    nearest = _nearest_seen(places, seen)
+    total /= weights.clamp(min=1e-6)[:, None]
+    values = total.numpy()
+    values[~seen] = values[nearest]
+    parts = np.split(values, np.cumsum([*CHANNELS.values()])[:-1], axis=1)
+    named = {
+        name: part if CHANNELS[name] == 3 else part[:, 0] for name, part in zip(CHANNELS, parts, strict=True)
+    }
+    return Baked(**named, seen=seen, nearest=nearest)
+
+
+def _layers(model: GaussianModel, result: RenderResult, view: View, color: ColorSource) -> dict[str, Tensor]:
+    """Pictures [H, W, C] of the channels, in their order, of the surface alone: blended values over alpha."""
+    alpha = result.alpha.clamp(min=0.05)[..., None]
+    size = result.alpha.shape
+    if color == "photograph":
+        colors = view.photograph().cpu()
+    elif color == "final":
+        colors = result.final / alpha
+    else:
+        colors = (result.base if result.diffuse is None else result.diffuse) / alpha
+    layers = {"color": colors}
+    for name, constant in CONSTANTS.items():
+        values = getattr(result, name)
+        layers[name] = torch.full((*size, 1), constant) if values is None else values[..., None]
+    layers["strength"] = (layers["strength"] / alpha).clamp(max=1)
+    layers["reflectance"] = _reflectance(model, view.camera)
+    index = torch.full(size, model.shading.refractive_index) if result.index is None else result.index
+    layers["index"] = index[..., None]
+    return layers
+
+
+def _reflectance(model: GaussianModel, camera: Camera) -> Tensor:
+    """Reflectance [H, W, 3] of metals at normal incidence; 0 where there are none."""
+    gaussians = model.state.gaussians
+    if not model.shading.knows_metals or not any_nonzero(gaussians["metalness"]):
+        return torch.zeros(camera.height, camera.width, 3)
+    own = metal_channels(gaussians["metalness"], reflectance(gaussians["reflectance_logits"]))
+    picture = model.backend.rasterize(splats(gaussians, own), camera).features.cpu()
+    return picture[..., :3] / picture[..., 3:].clamp(min=1e-3)
+
+
+def _reliable_depth(result: RenderResult, view: View | None) -> Tensor:
+    """Depth [H, W] of the surface; 0 where a pixel is translucent, on the outline of something, or, of photographs,
+    invalid."""
+    assert result.depth is not None
+    depth = result.depth
+    far = max_pool2d(depth[None, None], 3, 1, 1)[0, 0]
+    near = -max_pool2d(-depth[None, None], 3, 1, 1)[0, 0]
+    # Further apart than the surface picture is thick, to both sides: a pixel between them mixes two surfaces.
+    solid = (result.alpha > OPAQUE) & (far - near < 2 * WIDTH * depth)
+    if view is not None:
+        solid &= ~view.invalid.cpu()
+    return torch.where(solid, depth, 0.0)
+
+
+def _visible(
+    points: Tensor, normals: Tensor, camera: Camera, depth: Tensor, voxel: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Rows [K] of the points that a view shows, their weights [K], and where, [K, 2] in [-1, 1] as PyTorch counts."""
+    offsets = points - camera.center.float()
+    cosine = -dot(unit(offsets), normals)
+    rows = (cosine > STEEPEST).nonzero()[:, 0]
+    x, y, z = camera.to_camera(offsets[rows]).unbind(-1)
+    column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    inside = (
+        (z > 0) & (column > 0.5) & (column < camera.width - 0.5) & (row > 0.5) & (row < camera.height - 0.5)
+    )
+    rows, z, column, row = rows[inside], z[inside], column[inside], row[inside]
+    surface = depth[row.long(), column.long()]
+    cosine = cosine[rows]
+    # Half a pixel beside it, an inclined surface has another depth, too.
+    tolerance = (NEAR * voxel + 0.5 * z / camera.fx) / cosine.clamp(min=0.3)
+    seen = (surface > 0) & ((surface - z).abs() < tolerance)
+    places = torch.stack((2 * column / camera.width - 1, 2 * row / camera.height - 1), dim=-1)
+    return rows[seen], cosine[seen].square(), places[seen]
+
+
+def _nearest_seen(places: NDArray[np.float32], seen: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """For each texel that no view shows the nearest that one does, about; itself where none is."""
+    known, unseen = seen.nonzero()[0], (~seen).nonzero()[0]
+    if not len(known) or not len(unseen):
+        return unseen
+    known = known[:: -(-len(known) // _FILLED_FROM)]
+    return np.asarray(known[cKDTree(places[known]).query(places[unseen])[1]])

@@ -1,0 +1,236 @@
+"""From a run to a textured mesh: surface, charts, baked textures, and base color without shading."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from polarguide.capture.presentation import Crop, Presentation, balanced
+from polarguide.core.errors import PolarguideError, require_package
+from polarguide.core.options import BaseColor, ModelOptions
+from polarguide.core.progress import Reporter
+from polarguide.core.system import free_memory
+from polarguide.geometry.camera import Camera
+from polarguide.results.export.model.bake import Baked, ColorSource, bake
+from polarguide.results.export.model.gltf import Textured, color_pixels, linear_pixels
+from polarguide.results.export.model.irradiance import WHAT, Surroundings, delit, irradiance
+from polarguide.results.export.model.texels import Texels, texels_of
+from polarguide.results.export.model.topology import simplified, topology
+from polarguide.results.export.model.unwrap import Unwrapped, unwrap
+from polarguide.results.export.placement import Placement
+from polarguide.results.rendering.mesh import ColoredMesh, Surface, fused_surface, painted
+from polarguide.results.rendering.relight import needs_radiance
+from polarguide.runs.opened import OpenedRun
+from polarguide.shading.cubemap import cubemap_lookup
+from polarguide.shading.deferred import DeferredShading
+from polarguide.shading.result import RenderResult
+
+SurfaceView = Callable[[Camera], RenderResult]
+SOURCES: dict[BaseColor, ColorSource] = {
+    "delit": "diffuse",
+    "diffuse": "diffuse",
+    "photographs": "photograph",
+    "picture": "final",
+}
+BASE_COLORS: dict[BaseColor, str] = {
+    "delit": "highlights taken off, shading divided out by the learned light, up to one brightness factor",
+    "diffuse": "highlights taken off, shading baked in",
+    "photographs": "mean of the photographs, highlights and shading baked in",
+    "picture": "mean of the rendered pictures, highlights and shading baked in",
+}
+"""The words about base color in exported files."""
+WHITEST = 0.9
+"""Reflectance of the whitest surfaces, such as white paint and porcelain, which hardly anything exceeds."""
+BRIGHT_SHARE = 0.01
+"""Of the surface may be brighter before all of it is darkened: highlights that are left, and noise."""
+SURROUNDINGS_RESOLUTION = 128
+"""Voxels along the longest side of what lies outside the crop box: it only shades, and shadows are soft."""
+BYTES_PER_TEXEL = 160
+"""Most that a texel takes while textures are baked and filled: the sum of the arrays that are held together."""
+
+
+def require_room(texture: int) -> None:
+    """Check that a texture of so many texels along its side fits into memory.
+
+    Raises:
+        PolarguideError: it does not.
+    """
+    needed, free = BYTES_PER_TEXEL * texture**2, free_memory()
+    if free is not None and needed > free:
+        raise PolarguideError(
+            "--texture",
+            expected=f"a texture that fits into {free / 1e9:.1f} GB of free memory",
+            found=f"{texture} x {texture} texels, which take {needed / 1e9:.1f} GB",
+            remedy="Give a smaller one.",
+        )
+
+
+def textured_model(
+    run: OpenedRun,
+    surface_view: SurfaceView,
+    presentation: Presentation,
+    placement: Placement,
+    options: ModelOptions,
+    resolution: int,
+    folder: Path,
+    reporter: Reporter,
+) -> Textured:
+    """The subject of a run as a textured mesh, upright (+y) as glTF has it.
+
+    Args:
+        run: of Gaussians; its scene is read. surface_view: renders a view of what lies in the crop box.
+        presentation, placement: how it is presented. options: of the model. resolution: voxels along its longest side.
+        folder: for temporary files. reporter: receives progress, counts and warnings.
+
+    Raises:
+        PolarguideError: a package is missing, the texture does not fit into memory, there is no surface, or delighting
+            is asked of a recipe that learns no radiance.
+    """
+    require_room(options.texture)
+    kind = options.resolved_base_color
+    if kind == "delit":
+        needs_radiance(run.model.shading, what=WHAT)
+        require_package("embreex", WHAT, extra="model")
+    with reporter.track("fusing the surface"):
+        mesh, voxel = _subject(run, surface_view, presentation.crop, options, resolution)
+    reporter.say(_counted(mesh.surface))
+    unwrapped = unwrap(mesh.surface.vertices, mesh.surface.faces, options.texture, folder, reporter)
+    texels = texels_of(unwrapped, options.texture)
+    vertices, normals = (values[unwrapped.source] for values in (mesh.surface.vertices, mesh.surface.normals))
+    facing = texels.interpolated(unwrapped.faces, normals)
+    facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-9)
+    places = texels.interpolated(unwrapped.faces, vertices)
+    baked = bake(run, run.scene.train_views, places, facing, SOURCES[kind], voxel, reporter)
+    reporter.say(
+        f"{unwrapped.charts:,} charts, {len(texels.index) / options.texture**2:.0%} of the texture used; "
+        f"{1 - baked.seen.mean():.1%} of the surface is in no view and has the nearest color"
+    )
+    color = baked.color
+    if kind == "delit":
+        light = _irradiance(run, mesh, presentation.crop, reporter)[unwrapped.source]
+        color = delit(color, texels.interpolated(unwrapped.faces, light), _index(run))
+        color = _within_white(baked.filled(color), baked, reporter)
+    else:
+        color = balanced(torch.from_numpy(color), presentation.gains).numpy()
+    axes = run.frame.panorama_axes().numpy()
+    textures = _textures(run, baked, texels, options.albedo_scale * color, lit=not options.unlit)
+    return Textured(
+        placement.scale * vertices @ axes,
+        _unit(normals @ axes),
+        unwrapped.uv,
+        _drawn(unwrapped),
+        *textures,
+        _index(run),
+    )
+
+
+def _within_white(color: NDArray[np.float32], baked: Baked, reporter: Reporter) -> NDArray[np.float32]:
+    """Delit color [M, 3] that is nowhere whiter than surfaces can be: it is known up to one factor only, and what few
+    texels have beyond is light that the environment does not hold. Hues stay."""
+    dielectric = color[baked.seen & (baked.metalness < 0.5)]
+    brightest = float(np.quantile(dielectric.max(axis=1), 1 - BRIGHT_SHARE)) if len(dielectric) else 0.0
+    if brightest > WHITEST:
+        factor = WHITEST / brightest
+        reporter.say(f"base color times {factor:.2f}, so that surfaces reflect {WHITEST:.0%} at most")
+        color = color * np.float32(factor)
+    return color * np.minimum(1, WHITEST / np.maximum(color.max(axis=1, keepdims=True), 1e-6)).astype(
+        np.float32
+    )
+
+
+def _counted(surface: Surface) -> str:
+    """The counts of a mesh, for people."""
+    counts = topology(surface.faces)
+    return (
+        f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, {counts.pieces} pieces; "
+        f"{counts.boundary_edges:,} boundary edges, {counts.non_manifold_edges} non-manifold edges"
+    )
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit vectors [V, 3] once they are rounded; up where there is no direction."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(length > 1e-9, vectors / np.maximum(length, 1e-9), [[0.0, 1.0, 0.0]])
+
+
+def _drawn(mesh: Unwrapped) -> NDArray[np.int64]:
+    """Faces with three different vertices."""
+    a, b, c = mesh.faces.T
+    return mesh.faces[(a != b) & (b != c) & (c != a)]
+
+
+def _index(run: OpenedRun) -> float:
+    return float(run.model.shading.refractive_index)
+
+
+def _subject(
+    run: OpenedRun, surface_view: SurfaceView, crop: Crop | None, options: ModelOptions, resolution: int
+) -> tuple[ColoredMesh, float]:
+    """The mesh of the subject with learned normals and diffuse colors, and the side of a voxel."""
+    surface, views, box = fused_surface(run.cameras, surface_view, resolution=resolution)
+    if crop is not None:
+        inside = crop.inside(torch.from_numpy(surface.vertices), run.camera_frame).numpy()
+        surface = ColoredMesh(surface, surface.vertices).within(inside).surface
+    return painted(simplified(surface, options.triangles), views, box), box.size
+
+
+def _irradiance(
+    run: OpenedRun, mesh: ColoredMesh, crop: Crop | None, reporter: Reporter
+) -> NDArray[np.float64]:
+    """Irradiance [V, 3] at the vertices of the subject."""
+    cubemap = needs_radiance(run.model.shading, what=WHAT)
+    texels = run.light[cubemap.name].cpu()
+
+    def radiance(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        found = cubemap.radiance(cubemap_lookup(texels, torch.from_numpy(directions).float()))
+        return np.asarray(found.double().numpy())
+
+    around = Surroundings(radiance, mesh if crop is None else _joined(mesh, _outside(run, crop)))
+    surface = mesh.surface
+    with reporter.track("light on the surface", len(surface.vertices)) as progress:
+        return irradiance(surface.vertices, surface.normals, around, _index(run), progress)
+
+
+def _outside(run: OpenedRun, crop: Crop) -> ColoredMesh:
+    """What the scene has outside the crop box: it shades the subject and gives light back."""
+    surface, views, box = fused_surface(run.cameras, run.result, resolution=SURROUNDINGS_RESOLUTION)
+    mesh = painted(surface, views, box)
+    inside = crop.inside(torch.from_numpy(surface.vertices), run.camera_frame).numpy()
+    faces = surface.faces[~inside[surface.faces].any(axis=1)]
+    kept, used = mesh.surface.with_faces(faces)
+    return ColoredMesh(kept, mesh.colors[used])
+
+
+def _joined(first: ColoredMesh, second: ColoredMesh) -> ColoredMesh:
+    a, b = first.surface, second.surface
+    surface = Surface(
+        np.concatenate([a.vertices, b.vertices]),
+        np.concatenate([a.faces, b.faces + len(a.vertices)]),
+        np.concatenate([a.normals, b.normals]),
+    )
+    return ColoredMesh(surface, np.concatenate([first.colors, second.colors]))
+
+
+def _textures(
+    run: OpenedRun, baked: Baked, texels: Texels, color: NDArray[np.float32], *, lit: bool
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None, NDArray[np.uint8] | None]:
+    """Base color, surface and specular factor, as ``Textured`` has them."""
+    if not lit:
+        return color_pixels(texels.texture(color)), None, None
+    metal = baked.metalness[:, None]
+    mixed = (1 - metal) * color + metal * baked.reflectance
+    surface = np.stack([np.zeros_like(baked.roughness), baked.roughness, baked.metalness], axis=1)
+    shading, specular = run.model.shading, None
+    if isinstance(shading, DeferredShading) and shading.blend == "fresnel":
+        # The file has one index: others reflect as much at normal incidence by a factor, as far as it reaches.
+        ratio = _normal_reflectance(baked.index) / _normal_reflectance(np.float32(_index(run)))
+        specular = linear_pixels(texels.texture((baked.strength * ratio)[:, None]))[..., 0]
+    return color_pixels(texels.texture(mixed)), linear_pixels(texels.texture(surface)), specular
+
+
+def _normal_reflectance(index: NDArray[np.float32] | np.float32) -> NDArray[np.float32]:
+    return np.asarray(((index - 1) / (index + 1)) ** 2, np.float32)

@@ -1,0 +1,101 @@
+"""The texels of an unwrapped mesh: which place on the surface each one shows, and textures filled to their ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from polarguide.core.errors import PolarguideError
+from polarguide.results.export.model.unwrap import Unwrapped
+
+_CANDIDATES = 1 << 21
+"""Pairs of triangle and texel that are looked at together: about 200 MB."""
+
+
+@dataclass(frozen=True, eq=False)
+class Texels:
+    """The M texels of a square texture whose centers lie on a triangle.
+
+    Attributes:
+        size: texels along the texture's side. index: [M] row times ``size`` plus column.
+        face: [M] the triangle. weights: [M, 3] of its corners, they sum to 1; single precision.
+    """
+
+    size: int
+    index: NDArray[np.int64]
+    face: NDArray[np.int64]
+    weights: NDArray[np.float32]
+
+    def interpolated(self, faces: NDArray[np.int64], values: NDArray[Any]) -> NDArray[np.float32]:
+        """Values [V, C] at the vertices of faces, at the texels: [M, C]."""
+        out = np.zeros((len(self.index), values.shape[1]), np.float32)
+        for corner in range(3):
+            out += self.weights[:, corner, None] * values[faces[self.face, corner]].astype(np.float32)
+        return out
+
+    def texture(self, values: NDArray[Any]) -> NDArray[np.float32]:
+        """A whole texture [size, size, C] of values [M, C]: beside the charts that of the nearest texel."""
+        picture = np.zeros((self.size * self.size, values.shape[1]), np.float32)
+        empty = np.ones(self.size * self.size, bool)
+        picture[self.index], empty[self.index] = values, False
+        row, column = distance_transform_edt(
+            empty.reshape(self.size, self.size), return_distances=False, return_indices=True
+        )
+        return np.asarray(picture.reshape(self.size, self.size, -1)[row, column])
+
+
+def texels_of(mesh: Unwrapped, size: int) -> Texels:
+    """Rasterize the triangles of a mesh in its texture of ``size`` x ``size`` texels.
+
+    Raises:
+        PolarguideError: no texel lies on a triangle.
+    """
+    corners = mesh.uv[mesh.faces] * size - 0.5  # the center of texel k is at k
+    low = np.clip(np.ceil(corners.min(axis=1)), 0, size).astype(np.int64)
+    high = np.clip(np.floor(corners.max(axis=1)), -1, size - 1).astype(np.int64)
+    extent = np.maximum(high - low + 1, 0)
+    counts = extent.prod(axis=1)
+    parts, begin = [], 0
+    ends = np.cumsum(counts)
+    while begin < len(counts):
+        reached = ends[begin - 1] if begin else 0
+        end = max(begin + 1, int(np.searchsorted(ends, reached + _CANDIDATES, side="right")))
+        parts.append(_inside(corners, low, extent, counts, np.arange(begin, end)))
+        begin = end
+    column, row, face, weights = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    index, first = np.unique(row * size + column, return_index=True)  # on a common edge: one of the two
+    if not len(index):
+        raise PolarguideError(
+            "texture", expected="texels on the triangles", found="none", remedy="Give a larger --texture."
+        )
+    return Texels(size, index, face[first], weights[first])
+
+
+def _inside(
+    corners: NDArray[np.float64],
+    low: NDArray[np.int64],
+    extent: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    faces: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+    """Columns, rows, faces and corner weights of the texels whose centers lie in some of the triangles."""
+    face = np.repeat(faces, counts[faces])
+    number = np.arange(len(face)) - np.repeat(np.cumsum(counts[faces]) - counts[faces], counts[faces])
+    column = low[face, 0] + number % np.maximum(extent[face, 0], 1)
+    row = low[face, 1] + number // np.maximum(extent[face, 0], 1)
+    a, b, c = (corners[face, k] for k in range(3))
+    place = np.stack([column, row], axis=1)
+    area = _cross(b - a, c - a)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        second, third = _cross(place - a, c - a) / area, _cross(b - a, place - a) / area
+    weights = np.stack([1 - second - third, second, third], axis=1)
+    inside = (weights >= -1e-9).all(axis=1)  # NaN, of triangles without area, is not
+    return column[inside], row[inside], face[inside], weights[inside].astype(np.float32)
+
+
+def _cross(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])

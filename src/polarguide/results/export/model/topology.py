@@ -1,0 +1,161 @@
+"""Clean and simplify a triangle mesh so that every edge has one face on each side, or is counted as a boundary."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from polarguide.core.errors import optional_import
+from polarguide.results.rendering.mesh import Surface, largest_pieces
+
+ISLAND = 0.01
+"""Pieces with fewer faces than this share of the largest one's are dropped."""
+WELD = 1e-6
+"""Vertices nearer than about this share of the longest side are one."""
+SMALL_HOLE = 0.1
+"""A hole is closed up to this perimeter, as a share of the diagonal of the mesh: about a thirtieth of it across. Larger
+ones are where no camera looked."""
+
+Faces = NDArray[np.int64]
+Places = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Topology:
+    """Counts of a mesh: edges with a face on one side alone, edges with more than two faces or with faces of opposite
+    orientation, and connected pieces."""
+
+    boundary_edges: int
+    non_manifold_edges: int
+    pieces: int
+
+
+def topology(faces: Faces) -> Topology:
+    """The counts of faces [F, 3]."""
+    directed = _directed(faces)
+    _, edge, count = np.unique(_keys(np.sort(directed, axis=1)), return_inverse=True, return_counts=True)
+    forward = np.bincount(edge, weights=directed[:, 0] < directed[:, 1])
+    wrong = (count > 2) | ((count == 2) & (forward != 1))
+    used, numbers = np.unique(faces, return_inverse=True)
+    ends = numbers.reshape(-1, 3)[:, [0, 1, 1, 2]].reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(len(used),) * 2)
+    pieces = connected_components(graph, directed=False, return_labels=False)
+    return Topology(int((count == 1).sum()), int(wrong.sum()), int(pieces))
+
+
+def _directed(faces: Faces) -> NDArray[np.int64]:
+    """The three edges of each face in its sense of rotation, [3 F, 2]; those of face f are 3 f to 3 f + 2."""
+    return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+def _keys(edges: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One number for each pair of vertices [N, 2]."""
+    return edges[:, 0] << 32 | edges[:, 1]
+
+
+def simplified(surface: Surface, triangles: int) -> Surface:
+    """At most about so many triangles (quadric error, Garland and Heckbert 1997), cleaned; see ``cleaned``.
+
+    Raises:
+        PolarguideError: fast-simplification is not installed.
+    """
+    if len(surface.faces) <= triangles:
+        return cleaned(surface.vertices, surface.faces)
+    simplify: Any = optional_import("fast_simplification", "a textured model", extra="model").simplify
+    middle = surface.vertices.mean(axis=0)  # it computes in single precision
+    vertices, faces = simplify(
+        np.ascontiguousarray(surface.vertices - middle, np.float32),
+        np.ascontiguousarray(surface.faces, np.int32),
+        target_count=triangles,
+    )
+    return cleaned(vertices.astype(np.float64) + middle, faces.astype(np.int64))
+
+
+def cleaned(vertices: Places, faces: Faces) -> Surface:
+    """The surface of faces whose edges each occur once in each direction at most, without islands and small holes."""
+    vertices, faces = _welded(vertices, faces)
+    surface = Surface(vertices, consistent(vertices, faces), np.zeros_like(vertices))
+    surface = largest_pieces(surface, ISLAND)
+    vertices, faces = _closed(surface.vertices, surface.faces)
+    return Surface(vertices, faces, vertex_normals(vertices, faces))
+
+
+def _welded(vertices: Places, faces: Faces) -> tuple[Places, Faces]:
+    """With one vertex for all that single precision, as files have it, hardly tells apart."""
+    size = np.ptp(vertices, axis=0).max()
+    cells = np.rint((vertices - vertices.min(axis=0)) / max(WELD * float(size), 1e-30)).astype(np.int64)
+    _, first, number = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    return vertices[first], number.ravel()[faces]
+
+
+def consistent(vertices: Places, faces: Faces) -> Faces:
+    """Without degenerate faces, and of faces with the same edge in the same direction with one alone.
+
+    Then no edge has more than two faces, and those agree in their orientation. The face stays that fits best around it,
+    of equals the largest.
+    """
+    corners = np.sort(faces, axis=1)
+    faces = faces[(corners[:, 0] < corners[:, 1]) & (corners[:, 1] < corners[:, 2])]
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    directed = _directed(faces)
+    _, edge, count = np.unique(_keys(directed), return_inverse=True, return_counts=True)
+    _, either, both = np.unique(_keys(np.sort(directed, axis=1)), return_inverse=True, return_counts=True)
+    # An edge fits where it has one face on each side.
+    misfits = ((count[edge] != 1) | (both[either] != 2)).reshape(-1, 3).sum(axis=1)
+    rival = (count[edge] > 1).reshape(-1, 3).any(axis=1)
+    kept, taken = [faces[~rival]], set(_keys(_directed(faces[~rival])).tolist())
+    contested = faces[rival][np.lexsort((-area[rival], misfits[rival]))]
+    for face, keys in zip(contested, _keys(_directed(contested)).reshape(-1, 3).tolist(), strict=True):
+        if taken.isdisjoint(keys):
+            taken.update(keys)
+            kept.append(face[None])
+    return np.concatenate(kept)
+
+
+def _closed(vertices: Places, faces: Faces) -> tuple[Places, Faces]:
+    """Close small holes, each with a fan of triangles about the mean of its vertices."""
+    directed = _directed(faces)
+    edges = directed[~np.isin(_keys(directed), _keys(directed[:, ::-1]))]
+    starts, count = np.unique(edges[:, 0], return_counts=True)
+    ambiguous = set(
+        starts[count > 1].tolist()
+    )  # where two holes touch, a fan could give an edge a third face
+    following = dict(edges.tolist())
+    limit = SMALL_HOLE * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    added: list[Places] = []
+    new_faces: list[tuple[int, int, int]] = []
+    done: set[int] = set()
+    for start in following:
+        loop, at = [], start
+        while at in following and at not in done and at not in ambiguous:
+            done.add(at)
+            loop.append(at)
+            at = following[at]
+        if len(loop) < 3 or at != start:
+            continue
+        places = vertices[loop]
+        if np.linalg.norm(places - np.roll(places, 1, axis=0), axis=1).sum() > limit:
+            continue
+        middle = len(vertices) + len(added)
+        added.append(places.mean(axis=0))
+        new_faces += [(b, a, middle) for a, b in zip(loop, [*loop[1:], loop[0]], strict=True)]
+    if not added:
+        return vertices, faces
+    return np.concatenate([vertices, added]), np.concatenate([faces, np.array(new_faces, np.int64)])
+
+
+def vertex_normals(vertices: Places, faces: Faces) -> Places:
+    """Unit normals [V, 3], of the faces around each vertex, weighted by their areas; +z where these cancel."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    across = np.cross(b - a, c - a)
+    total = np.stack(
+        [np.bincount(faces.ravel(), np.repeat(across[:, k], 3), len(vertices)) for k in range(3)], axis=1
+    )
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length > 0, total / np.maximum(length, 1e-300), [[0.0, 0.0, 1.0]])
