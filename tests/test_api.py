@@ -77,6 +77,21 @@ def test_the_demo_scene_is_a_folder_like_any_other() -> None:
     assert scene.view("v000").camera.width == 128
 
 
+def test_a_run_represents_itself_in_two_lines_and_html_even_where_parts_are_missing(copy: Path) -> None:
+    run = polarguide.open_run(copy)
+    first, second = repr(run).splitlines()
+    assert f"{copy}: polarguide-stokes, 40 steps" in first
+    assert second == f" polarization: {run.polarization}>"
+    page = run._repr_html_()
+    assert (page.count("<img"), page.count("not there")) == (3, 1)  # it has not been scored
+    run.evaluate(speed=False)
+    assert "PSNR" in run._repr_html_()
+    (copy / "health.json").write_text("{}")
+    assert "not known" in repr(run)
+    edit(copy, scene=str(copy / "elsewhere"))
+    assert "elsewhere" in polarguide.open_run(copy)._repr_html_()
+
+
 def test_runs_open_and_render_in_inference_mode(trained: Path) -> None:
     run = polarguide.open_run(trained)
     expected = run.render("v000", run.layers)

@@ -14,6 +14,7 @@ from torch import Tensor
 from polarguide.capture import Scene, load_scene, read_model
 from polarguide.capture.layout import find_layout
 from polarguide.capture.presentation import Presentation, read_presentation
+from polarguide.capture.scene import IN_MEMORY
 from polarguide.capture.variants import mask_background, select_exposures
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.options import DeviceName, PathLike, SceneOptions, check_choice
@@ -58,7 +59,14 @@ class OpenedRun:
 
     def __repr__(self) -> str:
         of = f"{self.recipe.name}, {self.steps} steps, {self.model.size}"
-        return f"<{type(self).__name__} {self.folder}: {of}>"
+        return f"<{type(self).__name__} {self.folder}: {of}\n polarization: {self._evidence()}>"
+
+    def _evidence(self) -> str:
+        """``polarization``, also where its record is damaged: for representations, which raise nothing."""
+        try:
+            return self.polarization
+        except PolarguideError as error:
+            return f"not known ({error.where})"
 
     @classmethod
     def open(
@@ -168,7 +176,7 @@ class OpenedRun:
         options = SceneOptions(configuration.downscale, configuration.transfer, split="every-8th")
         recorded = configuration.test_views
         if not isinstance(scene, Scene):
-            folder = configuration.scene if scene is None else scene
+            folder = self._folder_to_read()
             scene = read_scene(folder, options, self._reporter, recorded)
         if (scene.downscale, scene.transfer) != (options.downscale, options.transfer):
             expected = (
@@ -208,8 +216,25 @@ class OpenedRun:
         """
         if "scene" in self.__dict__ or isinstance(self._scene_source, Scene):
             return scene_frame(list(self.cameras.values()))
-        model = read_model(self.scene_folder)
-        return scene_frame([model.camera(name) for name in find_layout(self.scene_folder).names])
+        folder = self._folder_to_read()
+        model = read_model(folder)
+        return scene_frame([model.camera(name) for name in find_layout(folder).names])
+
+    def _folder_to_read(self) -> Path:
+        """``scene_folder``, for what is read from it.
+
+        Raises:
+            PolarguideError: the scene was one of arrays, and has no folder.
+        """
+        folder = self.scene_folder
+        if folder == IN_MEMORY:
+            raise PolarguideError(
+                "scene",
+                expected=f"the scene of arrays that {self.folder} was trained on",
+                found="none",
+                remedy="Make it again, and give it: polarguide.open_run(folder, scene=scene).",
+            )
+        return folder
 
     @property
     def frame(self) -> SceneFrame:

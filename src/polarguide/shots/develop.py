@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,7 +22,7 @@ from polarguide.capture.filter.develop import (
     require_known_encoding,
 )
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
-from polarguide.capture.filter.shots import read_shots, require_four_shots
+from polarguide.capture.filter.shots import read_shots, require_four_shots, stacked
 from polarguide.capture.formats.pictures import is_lossy
 from polarguide.capture.layout import find_layout, select_views
 from polarguide.capture.memory import KEPT, READ, require_memory_of_each
@@ -50,6 +51,7 @@ from polarguide.shots.samples import (
     levels_of_shot,
     piled_up,
     read_set,
+    samples_of_arrays,
     samples_of_loaded,
     samples_of_view,
 )
@@ -96,7 +98,7 @@ def develop(shot: ExposureSet, options: ShotOptions) -> Developed:
         try:
             return _mosaic(shot, options)
         except PolarguideError as error:
-            path = shot.files[0]
+            path = shot.where
             if error.where.startswith(str(path)):
                 raise
             # An option or the dark frame does not fit this file; of many, it has to be named.
@@ -116,6 +118,8 @@ def set_samples(shot: ExposureSet, options: ShotOptions) -> SetSamples | None:
     if shot.fault is not None:
         raise shot.fault
     options.require_kind(shot.kind, shot.name)
+    if shot.kind == "set" and shot.stored is not None:
+        return samples_of_arrays(shot.name, shot.stored, shot.angles, options)
     if shot.kind == "set":
         return read_set(shot.name, shot.pictures, options)
     if shot.kind != "scene" or shot.files:
@@ -137,12 +141,17 @@ def check_files(options: ShotOptions) -> None:
 
 
 def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
-    path, files = shot.files[0], MosaicFiles(options.preparation())
-    stored, pattern = files.read(path), files.pattern
-    _require_on_sensor(path, stored.shape, options)
+    files = MosaicFiles(options.preparation())
+    if shot.stored is None:
+        path = shot.files[0]
+        stored = files.read(path)
+        container = files.container(path, stored)
+    else:
+        stored, container = files.given(shot.stored, shot.name), 8 * shot.stored.dtype.itemsize
+    pattern = files.pattern
+    _require_on_sensor(shot.where, stored.shape, options)
     dark = files.dark(stored.shape)
     values = files.cut(stored)
-    container = files.container(path, stored)
     levels = estimate_levels(
         int(stored.max()),
         int(np.bitwise_or.reduce(stored, None)),
@@ -231,7 +240,7 @@ def _read(path: Path, *_: int) -> AnalyzerCalibration:
     return read_analyzers(path)
 
 
-def _require_on_sensor(path: Path, shape: tuple[int, ...], options: ShotOptions) -> None:
+def _require_on_sensor(path: Path | str, shape: tuple[int, ...], options: ShotOptions) -> None:
     """Refuse what is larger than the sensor: another one, or no mosaic."""
     most = tuple(n - o for n, o in zip(SENSOR_SIZE, (options.offset_x, options.offset_y), strict=True))
     if shape[1] > most[0] or shape[0] > most[1]:
@@ -277,16 +286,22 @@ def _gains(
 
 
 def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
-    require_four_shots(shot.paths[0].parent, {shot.name: shot.files})
-    paths = [shot.files[angle] for angle in ANGLES]
-    shots = read_shots(shot.files)
+    if shot.stored is None:
+        require_four_shots(shot.paths[0].parent, {shot.name: shot.files})
+    paths = [shot.files[angle] for angle in ANGLES] if shot.stored is None else []
+    shots = read_shots(shot.files) if shot.stored is None else stacked(shot.stored)
     levels, notes = levels_of_shot(shots.pictures, 8 * shots.pictures.dtype.itemsize, options)
     if levels is not None:
-        shots = read_shots(shot.files, levels=levels)
+        shots = (
+            read_shots(shot.files, levels=levels)
+            if shot.stored is None
+            else stacked(shot.stored, levels=levels)
+        )
     transfer: str = options.transfer
     if transfer == "auto":
-        require_known_encoding(paths[0])
-        decision = decide_transfer([shots], lossy=is_lossy(shot.files[0]))
+        if paths:
+            require_known_encoding(paths[0])
+        decision = decide_transfer([shots], lossy=bool(paths) and is_lossy(paths[0]))
         transfer = decision.transfer
         notes += [f"Transfer {decision.reason}.", *filter(None, [decision.doubt])]
     linear = linear_intensities(shots.pictures, transfer)
@@ -302,11 +317,13 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
         ]
         notes += [f"Shots moved, in pixels: {', '.join(moved)}."] if moved else []
     saturated = np.asarray(clipped.any(axis=0))
-    stated = stated_exposures({shot.name: paths}).get(shot.name)
+    stated = stated_exposures({shot.name: paths}).get(shot.name) if paths else None
     exposed = np.asarray(stated or UNIT_GAINS)
     notes += [corrected_note(stated)] if stated else []
     if options.gains == "auto" and options.calibration.gains is None:
-        measured = exposures_of_view(paths, linear.mean(axis=3), ~(saturated | dark), exposed.tolist())
+        measured = exposures_of_view(
+            _labels(paths), linear.mean(axis=3), ~(saturated | dark), exposed.tolist()
+        )
         exposed = np.asarray(measured.gains)
         notes += [f"Shots {measured.warning}"] if measured.warning else []
     if (exposed != 1.0).any():
@@ -336,6 +353,11 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
         pair_ratio=ratio,
         notes=(*notes, *said),
     )
+
+
+def _labels(paths: Sequence[Path]) -> list[str]:
+    """What messages call four shots."""
+    return [path.name for path in paths] or [f"picture {number}" for number in range(1, len(ANGLES) + 1)]
 
 
 def _scene_view(shot: ExposureSet, options: ShotOptions) -> Developed:

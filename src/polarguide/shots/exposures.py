@@ -7,8 +7,11 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from polarguide.capture.exposures import TABLE
+from numpy.typing import NDArray
+
+from polarguide.capture.exposures import TABLE, Angle
 from polarguide.capture.filter import shots as filter_shots
 from polarguide.capture.filter.names import covers_turn
 from polarguide.capture.layout import (
@@ -51,6 +54,8 @@ class ExposureSet:
             a scene, its pictures where they are not the usual four.
         pictures: of a set, by angle.
         table: that states their angles; None where names do.
+        stored: the pictures of a shot in memory, which has no files: [H, W] of a mosaic, else [K, H, W, 3].
+        angles: theirs, as the user counts them; none of a mosaic.
     """
 
     name: str
@@ -62,13 +67,20 @@ class ExposureSet:
     others: tuple[Path, ...] = ()
     pictures: tuple[sets.SetPicture, ...] = ()
     table: Path | None = None
+    stored: NDArray[Any] | None = None
+    angles: tuple[Angle, ...] = ()
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The files, by angle, and the table of a set; at least one."""
+        """The files, by angle, and the table of a set; at least one, or none of a shot in memory."""
         of_set = dict.fromkeys(picture.path for picture in self.pictures)
         more = [] if self.table is None else [self.table]
         return (*(path for _, path in sorted(self.files.items())), *of_set, *more, *self.others)
+
+    @property
+    def where(self) -> Path | str:
+        """What messages call it: its first file, or its name."""
+        return self.paths[0] if self.paths else self.name
 
     @property
     def whole(self) -> bool:

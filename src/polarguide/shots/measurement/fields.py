@@ -59,7 +59,7 @@ def _difference(key: str, unit: str, what: str, mean: str, more: str = "") -> tu
 FIELDS = (
     Field("shot", "", "name of the shot", False),
     Field("files", "", "paths of its files, separated by semicolons", False),
-    Field("taken", "", "when the last of its files was written, UTC", False),
+    Field("taken", "", "when the last of its files was written, UTC; empty of a shot without files", False),
     Field("region", "", "name of the region; empty where the shot could not be read", False),
     Field("x", "pixels", "left column of the region", False),
     Field("y", "pixels", "top row of the region", False),

@@ -94,7 +94,7 @@ def _wrong(expected: str, found: str) -> PolarguideError:
     )
 
 
-def placed(regions: Sequence[Region], size: tuple[int, int], where: Path) -> tuple[Region, ...]:
+def placed(regions: Sequence[Region], size: tuple[int, int], where: Path | str) -> tuple[Region, ...]:
     """The regions of a picture of this width and height; the whole picture where there are none.
 
     Raises:
@@ -232,7 +232,7 @@ class Reference:
         """
         if maps.size != self.size:
             raise PolarguideError(
-                maps.files[0],
+                maps.files[0] if maps.files else maps.name,
                 expected=f"{self.size[0]}x{self.size[1]} pixels like the reference {self.name}",
                 found=f"{maps.size[0]}x{maps.size[1]}",
                 remedy="Take both with one camera and one region, and develop them alike.",
