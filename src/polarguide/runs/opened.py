@@ -27,7 +27,7 @@ from polarguide.runs.families import family_of
 from polarguide.runs.folder import RunConfiguration, load_checkpoint
 from polarguide.runs.health import Health
 from polarguide.runs.model import GaussianModel, Model
-from polarguide.shading.result import LAYERS, RenderResult
+from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
 from polarguide.training.recipe import Method
 
 Opened = TypeVar("Opened", bound="OpenedRun")
@@ -248,11 +248,17 @@ class OpenedRun:
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """Names of the layers that this run renders, in the order of ``LAYERS``."""
+        """Names of the layers that this run renders, in the order of ``LAYERS`` and ``POLARIZED``."""
         return self.model.layers
 
     def result(
-        self, camera: Camera | str, *, normals: bool = True, depth: bool = True, surface: bool = True
+        self,
+        camera: Camera | str,
+        *,
+        normals: bool = True,
+        depth: bool = True,
+        surface: bool = True,
+        polarized: bool = False,
     ) -> RenderResult:
         """Everything that can be rendered, as one typed record on the run's device.
 
@@ -261,9 +267,11 @@ class OpenedRun:
             normals, depth: whether to render these layers where the recipe can do without them.
             surface: whether they are those of the surface at the pixel's median depth; otherwise blended, which is
                 faster.
+            polarized: whether to predict Stokes vectors, where the model can.
         """
         chosen = self.scene.view(camera).camera if isinstance(camera, str) else camera
-        return self.model.render(chosen, normals=normals, depth=depth, surface=surface)
+        found = self.model.render(chosen, normals=normals, depth=depth, surface=surface)
+        return replace(found, predicted=self.model.stokes(found, chosen)) if polarized else found
 
     def render(self, camera: Camera | str, layers: Iterable[str] = ("final",)) -> dict[str, Tensor]:
         """Layers of a picture.
@@ -274,14 +282,17 @@ class OpenedRun:
 
         Returns:
             By name: linear radiance [H, W, 3] on the scale of S0/2, world normals [H, W, 3] of any length, or [H, W]
-            for strength, roughness, metalness, depth and alpha.
+            for strength, roughness, metalness, depth and alpha. Predicted polarization: ``stokes`` [3, H, W, 3] in the
+            lens frame, as ``View.stokes`` measures it; ``dolp`` [H, W] in [0, 1] and ``aolp`` [H, W] radians in
+            [0, pi) of its luminance.
 
         Raises:
             PolarguideError: there is no such layer, or this recipe has not got it.
         """
         names = checked_layers([layers] if isinstance(layers, str) else list(layers))
         geometry = {"normal", "depth"} & {*names}
-        return self.chosen_layers(self.result(camera, surface=bool(geometry)), names)
+        result = self.result(camera, surface=bool(geometry), polarized=not {*names}.isdisjoint(POLARIZED))
+        return self.chosen_layers(result, names)
 
     def chosen_layers(self, result: RenderResult, names: Iterable[str]) -> dict[str, Tensor]:
         """Layers of a picture by name.
@@ -308,7 +319,7 @@ def checked_layers(names: list[str]) -> list[str]:
         PolarguideError: otherwise.
     """
     for name in names or ["none"]:
-        check_choice("layers", name, LAYERS)
+        check_choice("layers", name, (*LAYERS, *POLARIZED))
     return names
 
 

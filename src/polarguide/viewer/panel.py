@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from polarguide.capture.presentation import Crop, Presentation, Vector
-from polarguide.shading.result import LAYERS
 from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
 from polarguide.viewer.presenting import PresentingControls
 from polarguide.viewer.scenery import MEASURED, Appearance
@@ -60,9 +59,11 @@ class Panel:
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._status, self._lines, self._note = gui.add_markdown(""), tuple[str, ...](), ""
         self.pause = gui.add_checkbox("Pause training", False, visible=options.trains)
-        layers = [name for name in LAYERS if name in options.layers]
+        layers = options.layers
         self.layer = gui.add_dropdown(
-            "Layer", (*layers, *MEASURED), hint="The last four need a photograph's pose"
+            "Layer",
+            (*layers, *MEASURED),
+            hint=f"From {MEASURED[0]} on, a photograph's pose is needed; stokes, dolp and aolp are predicted",
         )
         self.exposure = gui.add_slider("Exposure", *EXPOSURE, 0.1, 0.0, hint="In stops")
         self.strength = gui.add_slider("Reflection", *STRENGTH, 0.05, 1.0, visible="specular" in layers)
@@ -74,7 +75,7 @@ class Panel:
             self.frusta = gui.add_checkbox("Show cameras", True)
         with gui.add_folder("Crop", expand_by_default=False):
             self._use_crop = gui.add_checkbox("Crop", self._saved_crop is not None)
-            self.box = gui.add_checkbox("Show box", True)
+            self.box = gui.add_checkbox("Show box", False)
             for label, sides in zip(SIDES, _percent(self._saved_crop), strict=True):
                 self._crop.append(gui.add_multi_slider(label, *CROP, 1, sides, min_range=1))
         self.presenting = PresentingControls(gui, options.presentation, saves=options.saves)
