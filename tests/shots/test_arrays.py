@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from test_read import CUP, MONO, PLAIN, SHAPE, light, write_four, write_mosaic
+from test_read import CUP, MONO, PLAIN, SHAPE, TINT, light, write_four, write_mosaic
 
 import polarguide
+from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.polarizer import malus
 from polarguide.shots.maps import ShotMaps
@@ -151,3 +152,98 @@ def test_a_region_beyond_an_array_is_in_its_line() -> None:
     outcome = polarguide.measure([MOSAIC], options=MeasureOptions(roi=("1,1,500,5",)), reading=MONO)
     assert (outcome.exit_status, outcome.rows[0]["status"]) == (2, "unread")
     assert str(outcome.rows[0]["why"]).startswith("array-1: expected the region roi1 within 96x64 pixels")
+
+
+@pytest.mark.parametrize("mode", ["full", "half", "quarter"])
+@pytest.mark.parametrize("sensor", ["IMX250MZR", "IMX250MYR"])
+def test_regions_alone_are_what_the_whole_picture_says(sensor: str, mode: str) -> None:
+    """With the noise of the sensor given; the rest of a large mosaic is not developed."""
+    height, width = 400, 480
+    angles = tiled(sensor_pattern(sensor).angles, (height, width))
+    values = malus(light(height, width), np.deg2rad(angles)) * 3000
+    if (colors := sensor_pattern(sensor).colors) is not None:
+        values = values * np.array(TINT)[tiled(colors, (height, width))]
+    frame = np.rint(np.random.default_rng(0).normal(values, np.sqrt(values))).astype(np.uint16)
+    options = replace(MONO, sensor=sensor, demosaic=mode, full_well=4000.0)  # type: ignore[arg-type]
+    step = {"full": 1, "half": 2, "quarter": 4}[mode]
+    box = (203 // step, 98 // step, 70 // step, 90 // step)
+    part, whole = read_shot(frame, options, part=box), read_shot(frame, options)
+    assert part.whole == whole.size == (width // step, height // step)
+    assert part.reason.size < 0.5 * whole.reason.size
+    x, y = box[0] - part.origin[0], box[1] - part.origin[1]
+    assert min(x, y) >= 0
+    for name in ("s0", "dolp", "aolp", "sigma_dolp", "reason"):
+        expected = getattr(whole, name)[box[1] : box[1] + box[3], box[0] : box[0] + box[2]]
+        found = getattr(part, name)[y : y + box[3], x : x + box[2]]
+        np.testing.assert_array_equal(found, expected, err_msg=name)
+    roi = ",".join(map(str, box))
+    alone, beside = (
+        polarguide.measure([frame], options=MeasureOptions(roi=regions), reading=options).rows[0]
+        for regions in ((roi,), (roi, f"all=0,0,{width // step},{height // step}"))
+    )
+    assert alone == beside
+
+
+def test_a_shot_beyond_a_limit_is_drawn_whole(tmp_path: Path) -> None:
+    frame = np.full((400, 480), 900, np.uint16)
+    (tmp_path / "limits.json").write_text('{"limits": {"s0_mean": {"max": 0.1}}}')
+    options = MeasureOptions(roi=("pin=200,100,40,40",), limits=tmp_path / "limits.json")
+    outcome = polarguide.measure([frame], tmp_path / "out", options, MONO)
+    assert outcome.exit_status == 3
+    picture = cv2.imread(str(tmp_path / "out" / "beyond" / "array-1.png"))
+    assert picture.shape[1] == 960
+    # The region in red where it is in the whole picture, twice as large.
+    red = (picture[..., 2] > 200) & (picture[..., 1] < 60)
+    rows, columns = np.nonzero(red[: 2 * 400])
+    assert abs(columns.min() - 400) <= 6
+    assert abs(columns.max() - 480) <= 6
+    assert abs(rows.max() - 280) <= 6
+
+
+def test_a_polygon_counts_pixels_whose_centers_it_holds(tmp_path: Path) -> None:
+    """A triangle of half a square, beside the square; an hourglass, whose waist is crossed."""
+    values = np.full((64, 96), 500, np.uint16)
+    values[16:48, 16:48][np.tri(32, dtype=bool)] = 1500
+    options = MeasureOptions(
+        roi=("square=16,16,32,32", "low=16,16;48,48;16,48", "glass=16,16;48,16;16,48;48,48")
+    )
+    rows = polarguide.measure([values], options=options, reading=replace(MONO, demosaic="full")).rows
+    square, low, glass = rows
+    assert [row["pixels"] for row in rows] == [1024, 496, 512]
+    assert (low["x"], low["y"], low["width"], low["height"]) == (16, 16, 32, 32)
+    assert glass["usable"] + glass["noise"] + glass["dark"] + glass["saturated"] + glass["masked"] == 512
+    assert float(low["s0_mean"]) == pytest.approx(2 * 1500 / 4095, rel=0.03)  # type: ignore[arg-type]
+    assert float(square["s0_mean"]) < 0.8 * float(low["s0_mean"])  # type: ignore[arg-type]
+    (tmp_path / "limits.json").write_text('{"limits": {"s0_mean": {"max": 0.1}}}')
+    limited = replace(options, limits=tmp_path / "limits.json")
+    assert polarguide.measure([values], tmp_path / "out", limited, MONO).exit_status == 3
+    drawn = cv2.imread(str(tmp_path / "out" / "beyond" / "array-1.png"))
+    scale = drawn.shape[1] // 96
+    assert (drawn[32 * scale, 32 * scale] == (32, 32, 255)).all()  # on the triangle's long side
+
+
+@pytest.mark.parametrize("roi", ["1,1;5,5", "a=1,1;9,1;5,1", "1,1;5,5;-1,3", "1,1;5,5;1.5,3", "=1,1;5,5;1,5"])
+def test_what_is_no_polygon_is_refused(roi: str) -> None:
+    with pytest.raises(PolarguideError) as caught:
+        polarguide.measure([MOSAIC], options=MeasureOptions(roi=(roi,)), reading=MONO)
+    assert caught.value.where == "--roi"
+
+
+@pytest.mark.parametrize("mode", ["full", "half", "quarter"])
+@pytest.mark.parametrize("sensor", ["IMX250MZR", "IMX250MYR"])
+def test_means_scatter_by_their_standard_errors(sensor: str, mode: str) -> None:
+    """Forty frames of one thing: the spread of the means, over the mean of what the table states."""
+    shape, step = (64, 96), {"full": 1, "half": 2, "quarter": 4}[mode]
+    values = malus(light(*shape), np.deg2rad(tiled(sensor_pattern(sensor).angles, shape))) * 3000
+    if (colors := sensor_pattern(sensor).colors) is not None:
+        values = values * np.array(TINT)[tiled(colors, shape)]
+    random = np.random.default_rng(1)
+    frames = (np.rint(random.normal(values, np.sqrt(values))).astype(np.uint16) for _ in range(40))
+    options = replace(MONO, sensor=sensor, demosaic=mode, full_well=4095.0)  # type: ignore[arg-type]
+    roi = ",".join(str(n // step) for n in (16, 16, 64, 32))
+    rows = polarguide.measure(frames, options=MeasureOptions(roi=(roi,)), reading=options).rows
+    for key in ("s0", "dolp", "aolp"):
+        means, errors = (
+            np.array([row[f"{key}_{what}"] for row in rows], float) for what in ("mean", "error")
+        )
+        assert 0.7 < means.std() / errors.mean() < 1.4, key  # of 40, within three standard deviations

@@ -24,7 +24,7 @@ from polarguide.capture.sensor.defects import defects, defects_note
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
 from polarguide.capture.sensor.pattern import (
     FULL_16,
-    SENSORS,
+    SENSOR_NAMES,
     SIDE,
     Levels,
     Pattern,
@@ -66,9 +66,9 @@ class MosaicFiles:
         if settings.sensor is None:
             raise PolarguideError(
                 "--sensor",
-                expected=f"the sensor of raw mosaics: {', '.join(SENSORS)}",
+                expected=f"the sensor of raw mosaics: {SENSOR_NAMES}",
                 found="none",
-                remedy="Name it; color (MYR) and monochrome (MZR) sensors have different patterns.",
+                remedy="Name it; color and monochrome sensors have different patterns.",
             )
         self._settings = settings
         self._raw = RawFormat(settings.width, settings.height, settings.packing)

@@ -22,6 +22,7 @@ from polarguide.capture.layout import (
     find_layout,
     list_files,
 )
+from polarguide.capture.sensor.pattern import SENSOR_NAMES
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
 from polarguide.core.errors import PolarguideError
@@ -32,7 +33,7 @@ from polarguide.shots.video import VIDEO_SUFFIXES
 
 _EXPECTED = "raw mosaics with --sensor, or shots with angles in their names"
 _REMEDY = (
-    "Raw mosaics need --sensor (IMX250MYR is color, IMX250MZR monochrome); shots need their angles in the names "
+    f"Raw mosaics need --sensor: {SENSOR_NAMES}; shots need their angles in the names "
     "(<shot>_0, _45, _90 and _135; at others <shot>_a10, _a40, ...), folders 0, 45, 90 and 135, or angles.csv with the "
     "columns file,angle."
 )

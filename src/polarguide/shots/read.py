@@ -22,7 +22,8 @@ from polarguide.core.options import check_finite, index_of
 from polarguide.core.text import decimal
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
-from polarguide.shots.develop import Developed, develop, develop_view, samples_of, set_samples
+from polarguide.shots.develop import develop, develop_view, samples_of, set_samples
+from polarguide.shots.developed import Developed, Part
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.fit import DARK_SNR, maps_of_set
 from polarguide.shots.given import array_shot, is_array, stacked_array
@@ -45,6 +46,7 @@ def read_shot(
     | Sequence[Array],
     options: ShotOptions | None = None,
     angles: Sequence[Angle] = ANGLES,
+    part: Part | None = None,
 ) -> ShotMaps:
     """Read one exposure set: S0, DoLP, AoLP, their standard deviations, and which pixels say nothing.
 
@@ -54,6 +56,8 @@ def read_shot(
             or torch: with ``options.sensor`` a raw mosaic [H, W] of uint8 or uint16; else pictures through a filter,
             [K, H, W] or [K, H, W, 3] RGB (or K of them), whole numbers as stored or linear floats from 0 to 1.
         options: how to read it.
+        part: x, y, width and height of what is wanted of the picture of a mosaic: the rest is left out where that saves
+            time, as ``ShotMaps.origin`` and ``whole`` say. Noise that is not given is then estimated from the part.
         angles: of the K pictures of an array, degrees counter-clockwise as displayed; files state theirs.
 
     Raises:
@@ -81,7 +85,7 @@ def read_shot(
     samples = set_samples(shot, options)
     if samples is not None:
         return maps_of_set(shot.name, shot.paths, samples, options)
-    return maps_of(shot, develop(shot, options), options)
+    return maps_of(shot, develop(shot, options, part), options)
 
 
 def fault_of(shot: ExposureSet, error: BaseException) -> PolarguideError:
@@ -151,6 +155,10 @@ def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> Sh
         noise=developed.noise,
         pair_ratio=developed.pair_ratio,
         notes=developed.notes,
+        pixel_variance=float(developed.factors.mean()),
+        mean_variance=developed.mean_variance,
+        origin=developed.origin,
+        whole=developed.whole,
     )
 
 

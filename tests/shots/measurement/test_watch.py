@@ -112,8 +112,8 @@ def test_a_file_that_changes_while_it_is_read_is_measured_once(
 
     read, touched = measurer.read_shot, []
 
-    def read_and_touch(shot, options):
-        maps = read(shot, options)
+    def read_and_touch(shot, options, part):
+        maps = read(shot, options, part=part)
         if not touched:
             touched.append(shot.name)
             os.utime(shot.paths[0], ns=(1, 1))

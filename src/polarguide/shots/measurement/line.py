@@ -118,7 +118,7 @@ class Line:
                 remedy="Repeat the command when it is complete; --watch waits for that.",
             )
         measured = self.measurer.measured(shot, maps)
-        entry = measured.entry(files, self._draw(measured))
+        entry = measured.entry(files, self._draw(shot, measured))
         self.table.add(entry)
         return entry
 
@@ -128,13 +128,14 @@ class Line:
         self.table.add(entry)
         return entry
 
-    def _draw(self, measured: Measured) -> str:
+    def _draw(self, shot: ExposureSet, measured: Measured) -> str:
         """Write pictures before the line of the table: where that is, they are. Their name, "" if there are none."""
         maps, differences = measured.maps, measured.differences
         if not measured.beyond and differences is None:
             return ""
         name = self.table.picture_name(maps.name)
         if measured.beyond:
+            maps = maps if maps.whole is None else self.measurer.read(shot, whole=True)
             make_folder(self.out / BEYOND)
             write_png(self.out / BEYOND / f"{name}.png", regions_picture(maps, measured.beyond))
         if differences is not None:

@@ -19,6 +19,7 @@ from polarguide.shots.measurement.regions import (
     Differences,
     Reference,
     Region,
+    box_of,
     difference_figures,
     parse_regions,
     placed,
@@ -72,6 +73,7 @@ class Measurer:
         if options.reference is not None:
             self._reference = Reference.read(options.reference, self._reading)
             placed(self._regions, self._reference.size, options.reference)
+        self._part = None if self._reference is not None else box_of(self._regions)
 
     @property
     def reference_files(self) -> tuple[Path, ...]:
@@ -83,13 +85,14 @@ class Measurer:
         """Its name; empty without one."""
         return "" if self._reference is None else self._reference.name
 
-    def read(self, shot: ExposureSet) -> ShotMaps:
-        """The maps of a shot.
+    def read(self, shot: ExposureSet, *, whole: bool = False) -> ShotMaps:
+        """The maps of a shot: of all of it where ``whole``, or where it is compared with a reference; else at least of
+        the regions.
 
         Raises:
             PolarguideError, OSError, MemoryError: it cannot be read.
         """
-        return read_shot(shot, self._reading)
+        return read_shot(shot, self._reading, part=None if whole else self._part)
 
     def measured(self, shot: ExposureSet, maps: ShotMaps) -> Measured:
         """What its maps say.
@@ -97,7 +100,7 @@ class Measurer:
         Raises:
             PolarguideError: it does not fit the regions or the reference.
         """
-        regions = placed(self._regions, maps.size, shot.where)
+        regions = placed(self._regions, maps.whole or maps.size, shot.where)
         differences = None if self._reference is None else self._reference.differences(maps)
         found = [self._region(maps, region, differences) for region in regions]
         statuses = [str(figures["status"]) for _, figures, _ in found]
@@ -117,9 +120,10 @@ class Measurer:
     def _region(
         self, maps: ShotMaps, region: Region, differences: Differences | None
     ) -> tuple[Region, dict[str, Value], list[str]]:
+        local = dataclasses.replace(region, x=region.x - maps.origin[0], y=region.y - maps.origin[1])
         figures = {
-            **region_figures(maps, region, self._options.threshold),
-            **difference_figures(differences, region),
+            **region_figures(maps, local, self._options.threshold),
+            **difference_figures(differences, local),
         }
         bounds = self._limits.of(region.name)
         beyond = faults(figures, bounds)
@@ -143,7 +147,14 @@ class Measurer:
             {
                 "reading": reading,
                 "read_files": stamps(tuple(named)),
-                "regions": self._regions,
+                "regions": [
+                    {
+                        name: value
+                        for name, value in dataclasses.asdict(region).items()
+                        if name != "corners" or value
+                    }
+                    for region in self._regions
+                ],
                 "threshold": self._options.threshold,
                 "limits": self._limits,
                 "reference": stamps(self.reference_files),
