@@ -23,6 +23,7 @@ from polarguide.shading.result import LAYERS, POLARIZED
 from polarguide.training.settings import TrainSettings
 from polarguide.viewer.cameras import FRAMES_PER_SECOND, Keyframes, free_camera, letterbox, window_fov
 from polarguide.viewer.scenery import (
+    BESIDE,
     MEASURED,
     Appearance,
     FieldScenery,
@@ -153,6 +154,24 @@ def test_predicted_polarization_is_the_runs_and_has_a_key_to_its_colors():
     for layer, keyed in (("dolp", True), ("aolp", True), ("depth", True), ("final", False)):
         corner = paint(seen, Appearance(layer=layer), camera=wide)[-8:-4, :160]
         assert bool((corner == 255).all(axis=-1).mean() > 0.5) == keyed, layer
+
+
+def test_a_wipe_shows_what_was_measured_from_the_left():
+    seen = shown()
+    view = photograph("v1", CAMERA, seen).view
+    for layer, measured in BESIDE.items():
+        left, right = (
+            paint(seen, Appearance(layer=measured), view),
+            paint(seen, Appearance(layer=layer), view),
+        )
+        wiped = paint(seen, Appearance(layer=layer, wipe=0.5), view)
+        middle = CAMERA.width // 2
+        assert np.array_equal(wiped[:, : middle - 1], left[:, : middle - 1]), layer
+        assert np.array_equal(wiped[:, middle + 1 :], right[:, middle + 1 :]), layer
+        assert (wiped[:, middle] == 255).all()
+    free, depth = Appearance(wipe=0.5), Appearance(layer="depth", wipe=0.5)
+    assert np.array_equal(paint(seen, free), paint(seen))
+    assert np.array_equal(paint(seen, depth, view), paint(seen, replace(depth, wipe=0.0), view))
 
 
 def test_colors_of_depths_stay_while_the_camera_moves():

@@ -17,6 +17,7 @@ NOTHING = Presentation()
 # Ranges of the controls.
 SIDES = ("Left, right", "Down, up", "Front, back")
 EXPOSURE, STRENGTH, TURN, SECONDS, CROP = (-4.0, 4.0), (0.0, 2.0), (-180, 180), (0.5, 10.0), (-150, 150)
+WIPE = 0, 100
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,8 @@ class Panel:
             self.view = gui.add_dropdown("Go to", (FREE_VIEW, *options.views))
             self.step = gui.add_button_group("", STEPS)
             self.frusta = gui.add_checkbox("Show cameras", True)
+            hint = "At a photograph's pose: what was measured, from the left, in percent of the width"
+            self.wipe = gui.add_slider("Wipe", *WIPE, 1, 0, hint=hint)
         with gui.add_folder("Crop", expand_by_default=False):
             self._use_crop = gui.add_checkbox("Crop", self._saved_crop is not None)
             self.box = gui.add_checkbox("Show box", False)
@@ -88,7 +91,10 @@ class Panel:
             self.play = gui.add_button("Play")
             self.save_path = gui.add_button("Save path")
         self.accepts = self._accepted([*layers, *MEASURED], options.views)
-        controls = (self.layer, self.exposure, self.strength, self.turn, self._use_crop, *self._crop)
+        controls = (
+            *(self.layer, self.exposure, self.strength, self.turn, self.wipe),
+            *(self._use_crop, *self._crop),
+        )
         for control in self._crop:
             control.on_update(lambda _: self._forget_saved())
         for control in controls:
@@ -104,6 +110,7 @@ class Panel:
             (self.exposure, number(*EXPOSURE)),
             (self.strength, number(*STRENGTH)),
             (self.turn, number(*TURN)),
+            (self.wipe, number(*WIPE)),
             (self.view, choice([FREE_VIEW, *views])),
             (self.step, choice(STEPS)),
             (self.seconds, number(*SECONDS)),
@@ -146,6 +153,7 @@ class Panel:
             crop=self.crop(chosen.up_axis),
             white_balance=chosen.white_balance,
             up_axis=chosen.up_axis,
+            wipe=float(self.wipe.value) / 100,
         )
 
 

@@ -193,6 +193,11 @@ def training_scenery(trainer: AnyTrainer) -> Scenery:
 
 OF_POLARIZATION = {f"{name}, measured": name for name in POLARIZED}
 """Layers that need pictures which determine the polarization, and what is predicted of the same."""
+BESIDE = {
+    **dict.fromkeys(("final", "base"), "photograph"),
+    **{of: name for name, of in OF_POLARIZATION.items()},
+}
+"""What was measured of a layer, for a wipe between the two."""
 MEASURED = ("photograph", *OF_POLARIZATION, "error")
 """Layers that only a photograph's pose has."""
 LEGEND = 0.25, 128, 512
@@ -209,6 +214,8 @@ class Appearance:
         strength: factor on the specular layer; predicted polarization is that of the layers as they were learned.
         turn: degrees of the far environment, counter-clockwise seen from above.
         crop: what is shown of the scene; None: all.
+        wipe: share of the picture's width, from the left, that shows what was measured (``BESIDE``) in place of the
+            layer, at a photograph's pose.
         white_balance: gains of R, G and B on radiance. up_axis: the axis of turning; None: as the cameras say.
     """
 
@@ -219,6 +226,7 @@ class Appearance:
     crop: Crop | None = None
     white_balance: Vector | None = None
     up_axis: Vector | None = None
+    wipe: float = 0.0
 
 
 class Painter:
@@ -264,7 +272,24 @@ class Painter:
         if layer in POLARIZED:
             result = replace(result, predicted=scenery.stokes(result, camera))
         picture = self._layer(result, camera, appearance, settled=settled)
-        return None if picture is None else self._with_scale(picture, layer)
+        if picture is None:
+            return None
+        if view is not None and appearance.wipe > 0:
+            picture = self._wiped(picture, scenery, view, appearance)
+        return self._with_scale(picture, layer)
+
+    def _wiped(self, picture: Picture, scenery: Scenery, view: View, appearance: Appearance) -> Picture:
+        """A picture of a layer with what was measured to the left; as it is where nothing of the kind was."""
+        other = BESIDE.get(appearance.layer)
+        if other is None or (other in OF_POLARIZATION and not view.is_determined):
+            return picture
+        place = letterbox(view.camera, (picture.shape[1], picture.shape[0]))
+        measured = place.apply(self._measured(scenery, view, replace(appearance, layer=other)))
+        column = round(min(appearance.wipe, 1.0) * picture.shape[1])
+        wiped = picture.copy()
+        wiped[:, :column] = measured[:, :column]
+        wiped[:, max(0, column - 1) : column + 1] = 255
+        return wiped
 
     def _with_scale(self, picture: Picture, layer: str) -> Picture:
         """A picture with the key to the colors of its layer at its lower left, where there is one."""

@@ -28,6 +28,8 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 FONT_SCALE = 0.6
 SMALLEST_FONT_SCALE = 0.35
 LINE_HEIGHT = 28
+READ_AT = 384
+"""Width of a tile up to which type keeps its size; a sheet of larger ones is read from farther away."""
 
 
 def contact_sheet(
@@ -74,17 +76,19 @@ def contact_sheet(
     if not pictures:
         raise ValueError("contact sheet: expected at least one picture, found none")
     width, height = _tile_size(pictures, minimum_width, maximum_width)
-    margin = max((_text_width(label, FONT_SCALE) for label in row_labels), default=0)
+    larger = max(1.0, width / READ_AT)
+    line = round(LINE_HEIGHT * larger)
+    margin = max((_text_width(label, FONT_SCALE * larger) for label in row_labels), default=0)
     left = gutter + (margin + gutter if margin else 0)
-    top = gutter + (LINE_HEIGHT if any(column_labels) else 0)
+    top = gutter + (line if any(column_labels) else 0)
     sheet: Picture = np.full(
         (top + len(rows) * (height + gutter), left + columns * (width + gutter), 3), BACKGROUND, np.uint8
     )
     for j, label in enumerate(column_labels):
-        _write(sheet, label, left + j * (width + gutter), gutter + LINE_HEIGHT // 2, width)
+        _write(sheet, label, left + j * (width + gutter), gutter + line // 2, width, larger)
     for i, (row, label) in enumerate(zip(rows, row_labels, strict=True)):
         y = top + i * (height + gutter)
-        _write(sheet, label, gutter, y + height // 2, margin)
+        _write(sheet, label, gutter, y + height // 2, margin, larger)
         for j, cell in enumerate(row):
             if cell is not None:
                 _place(sheet[y : y + height, left + j * (width + gutter) :][:, :width], cell)
@@ -92,9 +96,9 @@ def contact_sheet(
         sheet = np.concatenate((sheet, _strip(footer, sheet.shape[1], width, left, gutter)))
     if not caption:
         return sheet
-    line: Picture = np.full((LINE_HEIGHT, sheet.shape[1], 3), BACKGROUND, np.uint8)
-    _write(line, caption, gutter, LINE_HEIGHT // 2, sheet.shape[1] - 2 * gutter)
-    return np.concatenate((sheet, line))
+    strip: Picture = np.full((line, sheet.shape[1], 3), BACKGROUND, np.uint8)
+    _write(strip, caption, gutter, line // 2, sheet.shape[1] - 2 * gutter, larger)
+    return np.concatenate((sheet, strip))
 
 
 def _strip(cells: Sequence[Picture | None], across: int, width: int, left: int, gutter: int) -> Picture:
@@ -136,17 +140,21 @@ def _text_width(text: str, scale: float) -> int:
     return cv2.getTextSize(text, FONT, scale, 1)[0][0] if text else 0
 
 
-def _write(sheet: Picture, text: str, x: int, y: int, width: int) -> None:
-    """Draw text centered in ``width`` pixels from ``x``, around the line ``y``; smaller if it has to be."""
+def _write(sheet: Picture, text: str, x: int, y: int, width: int, larger: float) -> None:
+    """Draw text centered in ``width`` pixels from ``x``, around the line ``y``; smaller if it has to be.
+
+    Args:
+        larger: how many times as large as on small tiles.
+    """
     if not text:
         return
     text = text.encode("ascii", "replace").decode()
-    scale = FONT_SCALE
-    while _text_width(text, scale) > width and scale > SMALLEST_FONT_SCALE:
+    scale = FONT_SCALE * larger
+    while _text_width(text, scale) > width and scale > SMALLEST_FONT_SCALE * larger:
         scale -= 0.05
     (drawn, height), _ = cv2.getTextSize(text, FONT, scale, 1)
     origin = (x + max(0, (width - drawn) // 2), y + height // 2)
-    cv2.putText(sheet, text, origin, FONT, scale, INK, 1, cv2.LINE_AA)
+    cv2.putText(sheet, text, origin, FONT, scale, INK, round(larger), cv2.LINE_AA)
 
 
 COLOR_MAPS = {
