@@ -22,7 +22,7 @@ from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.core.progress import Advance
 from polarguide.results.evaluation.record import validate_metrics
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, PLY
-from polarguide.shading.result import LAYERS
+from polarguide.shading.result import LAYERS, POLARIZED
 from polarguide.training.trainer import StepReport, Trainer
 
 EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"))
@@ -149,7 +149,7 @@ def test_what_training_returns_is_what_it_wrote(demo_scene: Path, tmp_path: Path
     for name, values in run.render("v000", layers=run.layers).items():
         assert torch.equal(values, opened.render("v000", layers=[name])[name]), name
     assert "reflection" in run.layers
-    assert set(run.layers) <= set(LAYERS)
+    assert {*run.layers} <= {*LAYERS, *POLARIZED}
 
 
 def test_a_keyboard_interrupt_saves_a_whole_state_and_goes_on_to_the_same_bits(
