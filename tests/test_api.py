@@ -22,7 +22,7 @@ from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.core.progress import Advance
 from polarguide.results.evaluation.record import validate_metrics
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, PLY
-from polarguide.shading.result import LAYERS
+from polarguide.shading.result import LAYERS, POLARIZED
 from polarguide.training.trainer import StepReport, Trainer
 
 EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"))
@@ -75,6 +75,21 @@ def test_the_demo_scene_is_a_folder_like_any_other() -> None:
     scene = polarguide.load_scene(polarguide.demo_scene(), views=["v000"])
     assert scene.root == polarguide.demo_scene()
     assert scene.view("v000").camera.width == 128
+
+
+def test_a_run_represents_itself_in_two_lines_and_html_even_where_parts_are_missing(copy: Path) -> None:
+    run = polarguide.open_run(copy)
+    first, second = repr(run).splitlines()
+    assert f"{copy}: polarguide-stokes, 40 steps" in first
+    assert second == f" polarization: {run.polarization}>"
+    page = run._repr_html_()
+    assert (page.count("<img"), page.count("not there")) == (3, 1)  # it has not been scored
+    run.evaluate(speed=False)
+    assert "PSNR" in run._repr_html_()
+    (copy / "health.json").write_text("{}")
+    assert "not known" in repr(run)
+    edit(copy, scene=str(copy / "elsewhere"))
+    assert "elsewhere" in polarguide.open_run(copy)._repr_html_()
 
 
 def test_runs_open_and_render_in_inference_mode(trained: Path) -> None:
@@ -134,7 +149,7 @@ def test_what_training_returns_is_what_it_wrote(demo_scene: Path, tmp_path: Path
     for name, values in run.render("v000", layers=run.layers).items():
         assert torch.equal(values, opened.render("v000", layers=[name])[name]), name
     assert "reflection" in run.layers
-    assert set(run.layers) <= set(LAYERS)
+    assert {*run.layers} <= {*LAYERS, *POLARIZED}
 
 
 def test_a_keyboard_interrupt_saves_a_whole_state_and_goes_on_to_the_same_bits(

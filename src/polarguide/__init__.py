@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from polarguide.core.progress import Reporter
     from polarguide.experiments.compare import ablate, compare
     from polarguide.experiments.options import CompareOptions
+    from polarguide.geometry.camera import Camera
     from polarguide.inspection.settings import InspectSettings
     from polarguide.preparation.settings import PrepareSettings
     from polarguide.shots.calibration.settings import CalibrateSettings
@@ -66,6 +67,7 @@ _NAMES = {
     "core.errors": ("PolarguideError", "PolarguideWarning"),
     "experiments.compare": ("ablate", "compare"),
     "experiments.options": ("CompareOptions",),
+    "geometry.camera": ("Camera",),
     "inspection.settings": ("InspectSettings",),
     "shots.measurement.options": ("MeasureOptions", "WatchOptions"),
     "shots.measurement.watch": ("watch_folder",),
@@ -86,6 +88,7 @@ _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = [
     "AnalyzerCalibration",
     "CalibrateSettings",
+    "Camera",
     "CompareOptions",
     "InspectSettings",
     "MeasureOptions",

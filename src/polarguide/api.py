@@ -14,6 +14,7 @@ from typing import Any
 from polarguide.capture import Scene
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.metadata import refractive_index_of
+from polarguide.capture.thumbnails import figure, table
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file, require_folder
 from polarguide.core.options import (
@@ -32,6 +33,7 @@ from polarguide.preparation.prepare import prepare_scene
 from polarguide.raster import choose_backend
 from polarguide.results.evaluation import evaluate
 from polarguide.results.evaluation.record import read_metrics
+from polarguide.results.evaluation.table import shown_metrics
 from polarguide.results.export import formats
 from polarguide.results.rendering import film, pictures, relight
 from polarguide.results.rendering import present as presenting
@@ -50,6 +52,8 @@ from polarguide.viewer import server
 
 _OF_MAPS = ("full_well", "read_noise", "snr")
 """Options of shots that maps of views of a scene depend on."""
+_PICTURED = 3
+"""Views that a notebook shows of a run: each is drawn."""
 
 
 class Run(OpenedRun):
@@ -79,6 +83,23 @@ class Run(OpenedRun):
             PolarguideError: the run has not been scored, or the file is not such a record.
         """
         return read_metrics(self.folder)
+
+    def _repr_html_(self) -> str:
+        """For notebooks: held-out views as drawn, counts, and the verdicts of health and scores."""
+        facts = {"run": str(self), "polarization": self._evidence()}
+        pictures = ""
+        try:  # a run's scene may have moved, and its records may be damaged; the rest is there
+            views = self.scene.test_views or self.scene.views
+            for view in views[:_PICTURED]:
+                drawn = self.render(view.camera)["final"]
+                pictures += figure(drawn.cpu().numpy(), f"{view.name}, as drawn")
+            health = self.health
+            facts["warnings"] = "\n".join(health.warnings) or "none" if health is not None else "not recorded"
+            scores = shown_metrics(self.metrics(), scores_only=True)
+            facts["scores"] = "\n".join(f"{label}: {text}" for label, text in scores)
+        except PolarguideError as error:
+            facts["not there"] = str(error)
+        return f"{pictures}{table(self.folder.name, facts)}"
 
 
 open_run = Run.open

@@ -18,7 +18,7 @@ from polarguide.core.text import decimal
 
 REQUIRES = ["viser==1.1.*", "scikit-image>=0.22", "flip-evaluator>=1.6; python_version < '3.14'",
             'mitsuba==3.9.*; extra == "synth"', "torchmetrics>=1.4; extra == 'lpips'",
-            'torchvision; extra == "lpips"', 'mitsuba==3.9.*; extra == "test"']  # fmt: skip
+            'mitsuba==3.9.*; extra == "test"']  # fmt: skip
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_from_a_source_folder_the_folder_is_named(
 def test_without_one_the_packages_are_named(installed, url: str | None) -> None:
     installed(url)
     assert install_extra("synth") == "pip install 'mitsuba==3.9.*'"
-    assert install_extra("lpips") == "pip install 'torchmetrics>=1.4' torchvision"
+    assert install_extra("lpips") == "pip install 'torchmetrics>=1.4'"
 
 
 def test_packages_have_the_versions_that_are_required(installed) -> None:

@@ -64,7 +64,9 @@ def test_exposures_that_files_state_are_taken_back(tmp_path, stated):
         image.save(paths[-1], exif=exif)
     light = stated_exposures({"v": paths}, lambda done: None).get("v", [1.0] * 4)
     true = 1 / np.array(stated if light != [1.0] * 4 else (100, 100, 140, 100))
-    found = exposures_of_view(paths, four() * true[:, None, None] * 50, np.ones((96, 128), bool), light)
+    found = exposures_of_view(
+        [path.name for path in paths], four() * true[:, None, None] * 50, np.ones((96, 128), bool), light
+    )
     assert np.array(found.gains) / found.gains[0] == pytest.approx(true / true[0], rel=2e-3)
     assert bool(found.warning) == (light == [1.0] * 4)
     assert not found.warning or ("v_90.jpg" in found.warning and "v_45.jpg" not in found.warning)

@@ -14,7 +14,7 @@ from polarguide import optics
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.vectors import unit
 from polarguide.results.rendering.priors import _guide
-from polarguide.shots.develop import Developed
+from polarguide.shots.developed import Developed
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.maps import NoiseModel, ShotMaps
 from polarguide.shots.options import ShotOptions
@@ -81,7 +81,7 @@ def made(degree: np.ndarray, angle: np.ndarray) -> ShotMaps:
     nothing = np.zeros(degree.shape, bool)
     developed = Developed(
         four.astype(np.float32), nothing, nothing, nothing, NoiseModel(1e-8, 0.0, "given"),
-        np.ones((4, 1, 1), np.float32), 1.0, (),
+        np.ones((4, 1, 1), np.float32), 1.0, 1.0, (),
     )  # fmt: skip
     return maps_of(ExposureSet("made", "mosaic", {0: Path("made.png")}), developed, ShotOptions())
 

@@ -1,7 +1,7 @@
 """Terms of the loss at inputs whose value is known."""
 
 import math
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 
 import pytest
 import torch
@@ -25,6 +25,7 @@ from polarguide.training.losses import (
     normal_loss,
     step_loss,
     stokes_loss,
+    term,
 )
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.targets import Step, StepTargets, ViewPriors, stokes_weight, surface_weight
@@ -388,3 +389,23 @@ def test_pixels_without_weight_do_not_count_for_consistency() -> None:
 def test_a_picture_without_an_inner_pixel_has_no_loss() -> None:
     normal, ones = torch.zeros(2, 30, 3), torch.ones(2, 30)
     assert float(consistency_loss(surface(normal, ones, ones), TURNED)) == 0
+
+
+@dataclass(frozen=True)
+class MoreWeights(Weights):
+    """As a package of its own has them."""
+
+    brightness: float = term(rendered=("layers",))
+
+    def own_terms(self):
+        return (lambda step, weights: weights.brightness * step.result.final.mean(),)
+
+
+def test_a_term_of_another_package_is_in_the_loss():
+    shown = srgb_encode(picture(6))
+    rendered = result()
+    plain, *_ = step_loss(step(rendered, shown, None), Weights())
+    more, *_ = step_loss(step(rendered, shown, None), MoreWeights(brightness=2.0))
+    assert_close(more - plain, 2.0 * rendered.final.mean())
+    assert MoreWeights(brightness=2.0).layers
+    assert not MoreWeights().layers

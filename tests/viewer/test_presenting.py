@@ -177,6 +177,7 @@ def test_what_was_saved_is_shown_and_the_box_stands_as_it_was(visit: Visit) -> N
 
     again = Visit(msgspec.structs.replace(WHITE, crop=crop, author="A"), save)
     assert again.client.control("White").value == "picked"
+    again.press("Show box", True)  # type: ignore[arg-type]
     np.testing.assert_allclose(again.client.scene.boxes[-1][0][0], crop.corners(AROUND)[0], atol=1e-5)
     again.press("Save to the run")
     assert saved == [Presentation(white_balance=(0.5, 1.0, 1.5), crop=crop, author="A")]

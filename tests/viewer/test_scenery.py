@@ -20,10 +20,11 @@ from polarguide.geometry.trajectory import read_path
 from polarguide.raster.magnification import footprints
 from polarguide.runs.defaults import resolve
 from polarguide.runs.train import train
-from polarguide.shading.result import LAYERS
+from polarguide.shading.result import LAYERS, POLARIZED
 from polarguide.training.settings import TrainSettings
 from polarguide.viewer.cameras import FRAMES_PER_SECOND, Keyframes, free_camera, letterbox, window_fov
 from polarguide.viewer.scenery import (
+    BESIDE,
     MEASURED,
     Appearance,
     FieldScenery,
@@ -32,6 +33,7 @@ from polarguide.viewer.scenery import (
     training_scenery,
 )
 from polarguide.visualization import figures
+from polarguide.visualization.layers import polarization_picture
 
 CAMERAS = ring()
 CAMERA = CAMERAS["v1"]
@@ -132,13 +134,45 @@ def test_what_was_measured_there():
     # S1 / S0 = (1.3 - 0.7) / 2 everywhere, along the rows.
     there = view.photograph().mean(dim=-1) > 0.02
     dolp = figures.dolp_to_rgb(torch.full(there.shape, 0.3), 0.5)
-    assert np.abs(found["DoLP"].astype(int) - dolp)[there].max() <= 3
+    assert np.abs(found["dolp, measured"].astype(int) - dolp)[there].max() <= 3
     aolp = figures.aolp_to_rgb(torch.zeros(there.shape))
-    assert np.abs(found["AoLP"].astype(int) - aolp)[there].max() <= 3
+    assert np.abs(found["aolp, measured"].astype(int) - aolp)[there].max() <= 3
     final = seen.render(CAMERA, depth=False).final
     assert np.array_equal(found["error"], figures.error_to_rgb(final, view.photograph()))
     right = paint(replace(seen, gaussians=seen.gaussians), Appearance(layer="error"), view)
     assert np.array_equal(right, found["error"])
+
+
+def test_predicted_polarization_is_the_runs_and_has_a_key_to_its_colors():
+    seen = shown()
+    for layer in POLARIZED:
+        picture = paint(seen, Appearance(layer=layer))
+        result = seen.render(CAMERA, depth=False)
+        predicted = seen.shading.predicted_stokes(result, CAMERA)
+        assert np.array_equal(picture, polarization_picture(layer, predicted)), layer
+        assert np.array_equal(picture, paint(seen, Appearance(layer=layer, strength=0.5))), layer
+    wide = replace(CAMERA, width=640, height=480)
+    for layer, keyed in (("dolp", True), ("aolp", True), ("depth", True), ("final", False)):
+        corner = paint(seen, Appearance(layer=layer), camera=wide)[-8:-4, :160]
+        assert bool((corner == 255).all(axis=-1).mean() > 0.5) == keyed, layer
+
+
+def test_a_wipe_shows_what_was_measured_from_the_left():
+    seen = shown()
+    view = photograph("v1", CAMERA, seen).view
+    for layer, measured in BESIDE.items():
+        left, right = (
+            paint(seen, Appearance(layer=measured), view),
+            paint(seen, Appearance(layer=layer), view),
+        )
+        wiped = paint(seen, Appearance(layer=layer, wipe=0.5), view)
+        middle = CAMERA.width // 2
+        assert np.array_equal(wiped[:, : middle - 1], left[:, : middle - 1]), layer
+        assert np.array_equal(wiped[:, middle + 1 :], right[:, middle + 1 :]), layer
+        assert (wiped[:, middle] == 255).all()
+    free, depth = Appearance(wipe=0.5), Appearance(layer="depth", wipe=0.5)
+    assert np.array_equal(paint(seen, free), paint(seen))
+    assert np.array_equal(paint(seen, depth, view), paint(seen, replace(depth, wipe=0.0), view))
 
 
 def test_colors_of_depths_stay_while_the_camera_moves():

@@ -189,6 +189,8 @@ def test_the_crop_is_drawn_as_a_box_and_hides_the_rest(viewing):
     client = viewing.client
     client.control("Left, right").value = (-10, 10)
     client.control("Crop").value = True
+    assert client.scene.boxes == []  # it is drawn where it is asked for
+    client.control("Show box").value = True
     assert client.scene.boxes[-1].shape == (12, 2, 3)
     assert viewing.rest().sum() < 0.8 * whole.sum()
     client.control("Crop").value = False

@@ -172,6 +172,35 @@ def test_sheet_refuses_labels_that_do_not_fit():
             contact_sheet([rows], ["a"], ["b"])
 
 
+def test_the_wheel_has_the_color_of_each_angle_in_its_direction():
+    wheel = figures.angle_wheel().astype(int)
+    for degrees in (10, 45, 90, 135, 170):
+        a = math.radians(degrees)
+        x, y = round(128 + 72 * math.cos(a)), round(100 - 72 * math.sin(a))
+        expected = figures.aolp_to_rgb(torch.tensor([[a]]))[0, 0].astype(int)
+        assert np.abs(wheel[y, x] - expected).max() <= 20, degrees
+    assert (wheel[105] == 255).all(axis=-1).mean() > 0.7
+
+
+def test_the_ball_has_the_colors_of_normals():
+    ball = figures.normal_ball()
+    for (x, y), color in (
+        ((128, 32), (128, 128, 255)),
+        ((157, 32), (251, 128, 160)),
+        ((128, 3), (128, 251, 160)),
+    ):
+        assert np.abs(ball[y, x].astype(int) - color).max() <= 8
+
+
+def test_a_key_lies_over_the_lower_left_corner():
+    picture = np.zeros((100, 300, 3), np.uint8)
+    keyed = figures.with_key(picture, figures.scale_bar(0, 1, "viridis"), 128)
+    assert (keyed[-1, :134] == 255).all()
+    assert (keyed[:70] == 0).all()
+    assert (keyed[:, 140:] == 0).all()
+    assert (picture == 0).all()
+
+
 def test_scale_bar_runs_through_the_colors_of_its_map():
     bar = figures.scale_bar(0.0, 45.0, "inferno")
     assert bar.shape == (44, 256, 3)

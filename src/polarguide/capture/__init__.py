@@ -9,13 +9,14 @@ if TYPE_CHECKING:
     from polarguide.capture.colmap.model import ColmapModel, read_model
     from polarguide.capture.ground_truth import GroundTruth
     from polarguide.capture.reader import load_scene
-    from polarguide.capture.view import Scene, View
+    from polarguide.capture.scene import Scene
+    from polarguide.capture.view import View
 
 # Where each name is defined. It is loaded when it is asked for: a calibration can be read without torch.
 _MODULES = {
     "ColmapModel": "colmap.model",
     "GroundTruth": "ground_truth",
-    "Scene": "view",
+    "Scene": "scene",
     "View": "view",
     "load_scene": "reader",
     "read_model": "colmap.model",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -15,14 +15,15 @@ from numpy.typing import NDArray
 
 from polarguide.capture import checks
 from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unseen_points, unused_poses
-from polarguide.capture.exposures import FOUR
 from polarguide.capture.formats.pictures import TRANSFERS
 from polarguide.capture.ground_truth import GroundTruth, objects_of
 from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.memory import check_memory, stated_size
 from polarguide.capture.metadata import held_out, indices_of, mount_of, refractive_index_of
+from polarguide.capture.scene import Scene
 from polarguide.capture.split import chosen_views, far_from_training, held_out_band
-from polarguide.capture.view import Scene, listed
+from polarguide.capture.stored import StoredViews
+from polarguide.capture.view import listed
 from polarguide.capture.view_reader import Files, ViewData, ViewFiles, check_materials, read_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import Split, check_choice
@@ -30,25 +31,6 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.geometry.camera import Camera
 
 _THREADS = 4
-
-
-@dataclass(frozen=True, eq=False)
-class StoredViews:
-    """The views of a capture as read, with a pose or without.
-
-    Attributes:
-        data: the views, sorted by name.
-        cameras: of each view at the size of its averaged pictures; None where the model has no pose.
-        measures: ``checks.measure`` of each view.
-        largest_value: the largest value that the files can store, 255 or 65535.
-        full_scale: the stored value at which the capture saturates; None if nothing is saturated.
-    """
-
-    data: tuple[ViewData, ...]
-    cameras: tuple[Camera | None, ...]
-    measures: tuple[checks.Measures, ...]
-    largest_value: int
-    full_scale: int | None
 
 
 def load_scene(
@@ -157,7 +139,7 @@ def load_scene(
         downscale=downscale,
         transfer=transfer,
         digest=files.digest(root),
-        warnings=(*warnings, *_picture_warnings(stored, transfer)),
+        warnings=(*warnings, *stored.picture_warnings(transfer)),
         objects=objects_of(root / "scene.json", about) if told_apart else (),
         indices=indices,
     )
@@ -234,13 +216,7 @@ def read_views(
                 camera = camera if downscale == 1 else camera.downscaled(downscale)
             cameras.append(camera)
             advance(len(data))
-    largest_value = _largest_value(data)
-    scale = checks.full_scale(np.sum([item.histogram for item in data], axis=0), largest_value)
-    measures = [
-        checks.measure(item.codes, ~(item.invalid | item.saturated(scale)), four=item.exposures == FOUR)
-        for item in data
-    ]
-    return StoredViews(tuple(data), tuple(cameras), tuple(measures), largest_value, scale)
+    return StoredViews.of(data, cameras)
 
 
 def _without_pictures(data: ViewData) -> ViewData:
@@ -264,19 +240,6 @@ def check_transfer(transfer: str) -> None:
             found=repr(transfer),
             remedy="Use srgb for display-encoded pictures, linear for all others.",
         )
-
-
-def _largest_value(data: Sequence[ViewData]) -> int:
-    """The largest value of the views' common type, 255 or 65535."""
-    first = {item.peak.dtype.itemsize: item.name for item in reversed(data)}
-    if len(first) > 1:
-        raise PolarguideError(
-            "pictures",
-            expected="one number of bits for all views",
-            found=f"8 bits in view {first[1]} and 16 in view {first[2]}",
-            remedy="Export all pictures alike.",
-        )
-    return int(np.iinfo(data[0].peak.dtype).max)
 
 
 def _content_warnings(layout: Layout, stored: StoredViews, invalid: list[str]) -> list[str]:
@@ -314,15 +277,6 @@ def _content_warnings(layout: Layout, stored: StoredViews, invalid: list[str]) -
             f"Views have the same pictures ({copies}). Copy those of the other views, or leave them out."
         )
     return found
-
-
-def _picture_warnings(stored: StoredViews, transfer: str) -> list[str]:
-    """Warnings about the exposure, encoding and file order of the pictures."""
-    names, scale = [item.name for item in stored.data], stored.full_scale
-    blown = [0.0 if scale is None else float((item.peak >= scale).mean()) for item in stored.data]
-    largest = max(int(item.peak.max()) for item in stored.data)
-    warnings = checks.exposure_warnings(names, stored.measures, blown, largest, stored.largest_value)
-    return warnings + checks.polarization_warnings(names, stored.measures, transfer)
 
 
 def _pose_warnings(model: ColmapModel, all_names: list[str], data: Sequence[ViewData]) -> list[str]:

@@ -17,7 +17,8 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.capture.box_filter import agreed, every, maximum, mean_codes
 from polarguide.capture.exposures import FOUR, PLAIN, Exposure
-from polarguide.capture.view import FULL_CODE, Latest, Loader, Scene, View
+from polarguide.capture.scene import Scene
+from polarguide.capture.view import FULL_CODE, Latest, Loader, View
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import EXPOSURES, Exposures, check_choice
 from polarguide.geometry.camera import seen_at

@@ -1,11 +1,10 @@
-"""The data types of a capture: a view with four polarizer angles, and the scene of all views."""
+"""A view of a capture: one camera pose with its pictures, mostly four behind a polarizer."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -20,7 +19,8 @@ from polarguide.capture.exposures import (
     measure_radiance,
     radiance_places,
 )
-from polarguide.capture.ground_truth import GroundTruth, SceneObject
+from polarguide.capture.ground_truth import GroundTruth
+from polarguide.capture.thumbnails import figure, table
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.polarizer import ANGLES as ANGLES
@@ -129,6 +129,20 @@ class View:
         """
         return self.truth() if isinstance(self.truth, Loader) else self.truth
 
+    def __repr__(self) -> str:
+        size, angles = f"{self.camera.width}x{self.camera.height}", ", ".join(e.words for e in self.exposures)
+        beside = {"mask": self.mask, "materials": self.materials, "ground truth": self.truth}
+        more = ", ".join(name for name, there in beside.items() if there is not None) or "no mask"
+        return (
+            f"<View {self.name}: {size} pixels, {len(self.exposures)} pictures ({angles})\n"
+            f" {more}; {float(self.invalid.float().mean()):.1%} invalid, "
+            f"{float(self.saturated.float().mean()):.1%} without polarization>"
+        )
+
+    def _repr_html_(self) -> str:
+        facts = {"pictures": ", ".join(exposure.words for exposure in self.exposures), "state": repr(self)}
+        return figure(self.photograph().cpu().numpy(), self.name) + table(self.name, facts)
+
     @property
     def device(self) -> torch.device:
         """Where the tensors are."""
@@ -230,62 +244,6 @@ class View:
             found=f"{len(self.exposures)} ({angles})",
             remedy="Choose views with more pictures.",
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """A capture: posed views, sparse points and their origin.
-
-    Attributes:
-        root: the folder that was read.
-        name: its name.
-        views: all views, sorted by name.
-        test_names: names of the views held out for evaluation, sorted.
-        points: sparse points in the world, [M, 3] float32.
-        point_colors: their colors as the COLMAP model gives them (display-encoded), [M, 3] uint8.
-        refractive_index: the one index that ``scene.json`` gives, or None if it gives none or several.
-        downscale: side of the pixel boxes that were averaged; 1 is full size.
-        transfer: the assumed encoding of the files, "linear" or "srgb". The views are always linear.
-        digest: SHA-256 over the names and contents of all files that were read, as hexadecimal digits.
-        warnings: about possible faults that do not prevent the use of the scene.
-        objects: the objects that ``scene.json`` lists, if the ground truth of some view tells objects apart.
-        indices: refractive indices of the dielectrics that ``materials/`` names by numbers from 3 on.
-    """
-
-    root: Path
-    name: str
-    views: tuple[View, ...]
-    test_names: tuple[str, ...]
-    points: Tensor
-    point_colors: Tensor
-    refractive_index: float | None
-    downscale: int
-    transfer: str
-    digest: str
-    warnings: tuple[str, ...]
-    objects: tuple[SceneObject, ...] = ()
-    indices: Mapping[int, float] = field(default_factory=dict)
-
-    @property
-    def train_views(self) -> tuple[View, ...]:
-        """The training views, sorted by name."""
-        return tuple(view for view in self.views if view.name not in self.test_names)
-
-    @property
-    def test_views(self) -> tuple[View, ...]:
-        """The views held out for evaluation, sorted by name."""
-        return tuple(view for view in self.views if view.name in self.test_names)
-
-    def view(self, name: str) -> View:
-        """The view called ``name``.
-
-        Raises:
-            PolarguideError: there is none; the message lists the names nearest to it.
-        """
-        for view in self.views:
-            if view.name == name:
-                return view
-        raise unknown_view(self.root, name, [view.name for view in self.views])
 
 
 def unknown_view(where: object, name: str, names: list[str]) -> PolarguideError:

@@ -185,15 +185,7 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
     files = Files()
     raw = _read_pictures(files, layout.files(name))
     height, width = raw[0].shape[:2]
-    if factor > min(height, width):
-        raise PolarguideError(
-            "downscale",
-            expected=f"at most {min(height, width)} for pictures of {width}x{height}",
-            found=str(factor),
-            remedy="Choose a smaller factor.",
-        )
-    channels = [pixels[..., channel] for pixels in raw for channel in range(3)]
-    peak = functools.reduce(np.maximum, channels)
+    require_factor(factor, height, width)
     ground_truth = None
     any_value = functools.partial(decode_mask, any_value=True)
     invalid = _read_beside(files, layout.invalid, name, (height, width), any_value)
@@ -203,6 +195,57 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
     if name in layout.ground_truth:
         path = layout.ground_truth[name]
         ground_truth = read_ground_truth(path, files.read(path), size=(height, width), factor=factor)
+    return view_data(
+        name,
+        raw,
+        layout.exposures(name),
+        factor=factor,
+        transfer=transfer,
+        invalid=invalid,
+        mask=mask,
+        materials=materials,
+        ground_truth=ground_truth,
+        digests=files.digests,
+    )
+
+
+def require_factor(factor: int, height: int, width: int) -> None:
+    """Check that boxes of ``factor`` x ``factor`` pixels fit into a picture.
+
+    Raises:
+        PolarguideError: they do not.
+    """
+    if factor > min(height, width):
+        raise PolarguideError(
+            "downscale",
+            expected=f"at most {min(height, width)} for pictures of {width}x{height}",
+            found=str(factor),
+            remedy="Choose a smaller factor.",
+        )
+
+
+def view_data(
+    name: str,
+    raw: Sequence[NDArray[Any]],
+    exposures: tuple[Exposure, ...],
+    *,
+    factor: int,
+    transfer: str,
+    invalid: NDArray[np.bool_] | None = None,
+    mask: NDArray[np.bool_] | None = None,
+    materials: NDArray[np.uint8] | None = None,
+    ground_truth: GroundTruth | None = None,
+    digests: Mapping[Path, str] | None = None,
+) -> ViewData:
+    """A view of its stored pictures [H, W, 3], averaged over boxes of ``factor`` x ``factor`` pixels.
+
+    Args:
+        name, exposures, ground_truth, digests: as in ``ViewData``; the ground truth is averaged already.
+        raw: uint8 or uint16, all of one shape and type. transfer: how they are encoded.
+        invalid, mask, materials: [H, W] of the stored pictures.
+    """
+    height, width = raw[0].shape[:2]
+    peak = functools.reduce(np.maximum, [pixels[..., channel] for pixels in raw for channel in range(3)])
     return ViewData(
         name=name,
         size=(width, height),
@@ -213,8 +256,8 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
         invalid=boxes.maximum(np.zeros((height, width), bool) if invalid is None else invalid, factor),
         mask=None if mask is None else boxes.every(mask, factor),
         ground_truth=ground_truth,
-        digests=files.digests,
-        exposures=layout.exposures(name),
+        digests=dict(digests or {}),
+        exposures=exposures,
         material_numbers=frozenset() if materials is None else frozenset(np.unique(materials).tolist()),
         materials=None
         if materials is None

@@ -16,7 +16,7 @@ def render(
     /,
     *,
     views: str = "test",
-    layers: str = "final,base,reflection,specular,diffuse,strength,roughness,metalness,normal,depth",
+    layers: str = "final,base,reflection,specular,diffuse,strength,roughness,metalness,normal,depth,dolp,aolp",
     path: str = "",
     frames: int = FRAMES,
     video: Path | None = None,
@@ -36,7 +36,7 @@ def render(
         run: Run folder.
         views: test, train, all, or names separated by commas.
         layers: Any of final, base, reflection, specular, diffuse, strength, roughness, metalness, normal, depth,
-            alpha.
+            alpha, and the predicted polarization: stokes, dolp, aolp.
         path: In place of views: orbit, spiral, interpolate (through the photographs), or a JSON file of cameras.
         frames: Pictures along the path (a file has its own).
         video: MP4 file to write of the path, layers side by side; PNG files if not given.

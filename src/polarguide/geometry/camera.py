@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from polarguide.core.errors import PolarguideError
 from polarguide.geometry.vectors import unit, unit_array
 
 FARTHEST = 1e9
@@ -90,6 +91,39 @@ class Camera:
     rotation: Tensor
     translation: Tensor
 
+    @classmethod
+    def from_matrices(
+        cls, intrinsics: ArrayLike | Tensor, world_to_camera: ArrayLike | Tensor, width: int, height: int
+    ) -> Camera:
+        """A camera of two matrices, as OpenCV and COLMAP have them.
+
+        Args:
+            intrinsics: [3, 3], focal lengths and principal point in pixels, without skew.
+            world_to_camera: [3, 4] or [4, 4], axes right, down, forward.
+            width, height: picture size in pixels.
+
+        Raises:
+            PolarguideError: they are no such matrices.
+        """
+        inner, outer = (
+            torch.as_tensor(m).cpu().numpy().astype(np.float64) for m in (intrinsics, world_to_camera)
+        )
+        if inner.shape != (3, 3) or outer.shape not in ((3, 4), (4, 4)):
+            found = f"{list(inner.shape)} and {list(outer.shape)}"
+            raise _no_matrices("intrinsics [3, 3] and world_to_camera [3, 4] or [4, 4]", found)
+        rotation, translation = outer[:3, :3], outer[:3, 3]
+        turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) and np.linalg.det(rotation) > 0
+        if not turns or not (np.abs(translation) <= FARTHEST).all():
+            found = np.array2string(outer[:3], precision=4).replace("\n", "")
+            raise _no_matrices(f"a rotation (determinant 1) and a translation up to {FARTHEST:g}", found)
+        lens = (inner[0, 0], inner[1, 1]), (inner[0, 2], inner[1, 2])
+        rest = inner - np.array([[inner[0, 0], 0, inner[0, 2]], [0, inner[1, 1], inner[1, 2]], [0, 0, 1]])
+        if min(width, height) < 1 or not can_be_lens((width, height), *lens) or np.abs(rest).max() > 1e-9:
+            found = np.array2string(inner, precision=4).replace("\n", "")
+            raise _no_matrices(f"no skew, and {LENS}", f"{found} for {width}x{height} pixels")
+        (fx, fy), (cx, cy) = ((float(a), float(b)) for a, b in lens)
+        return cls(width, height, fx, fy, cx, cy, torch.from_numpy(rotation), torch.from_numpy(translation))
+
     @property
     def center(self) -> Tensor:
         """Camera center in the world, [3] float64."""
@@ -142,6 +176,11 @@ class Camera:
         """The camera of the same view averaged over ``factor`` x ``factor`` pixel boxes (remainders are cut)."""
         inner = {name: getattr(self, name) / factor for name in ("fx", "fy", "cx", "cy")}
         return replace(self, width=self.width // factor, height=self.height // factor, **inner)
+
+
+def _no_matrices(expected: str, found: str) -> PolarguideError:
+    remedy = "Correct the matrices; a pose that is camera to world has to be inverted."
+    return PolarguideError("camera", expected=expected, found=found, remedy=remedy)
 
 
 def seen_at(offsets: Tensor, camera: Camera) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:

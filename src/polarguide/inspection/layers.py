@@ -14,12 +14,11 @@ from polarguide.inspection.capture import InspectedView, ViewMeasurements, quant
 from polarguide.visualization import figures
 from polarguide.visualization.embedded import data_uri
 from polarguide.visualization.figures import Picture
+from polarguide.visualization.layers import AOLP_FULL_DOLP, DOLP_HIGH
 
 SIDE = 240
 """Longest side of the pictures in pixels."""
-DOLP_HIGH, NOISE_HIGH, EXCESS_HIGH = 0.5, 0.05, 0.1
-AOLP_FULL_DOLP = 0.1
-"""DoLP from which the AoLP is shown at full brightness."""
+NOISE_HIGH, EXCESS_HIGH = 0.05, 0.1
 SATURATED_COLOR, INVALID_COLOR = (255, 40, 40), (60, 120, 255)
 
 

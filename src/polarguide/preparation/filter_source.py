@@ -250,7 +250,9 @@ class FilterSource(ShotsSource):
         light = [measured["light"].get(self._name(path), 1.0) for path in paths]
         exposed = ShotExposures(UNIT_GAINS)
         if asked.gains == "auto":
-            exposed = exposures_of_view(paths, found.linear.mean(axis=3), usable, light)
+            exposed = exposures_of_view(
+                [path.name for path in paths], found.linear.mean(axis=3), usable, light
+            )
         if exposed.warning:
             warnings.warn(f"{view}: {exposed.warning}", PolarguideWarning, stacklevel=2)
         linear = found.linear / np.asarray(exposed.gains, np.float32)[:, None, None, None]

@@ -24,7 +24,7 @@ from polarguide.capture.sensor.defects import defects, defects_note
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
 from polarguide.capture.sensor.pattern import (
     FULL_16,
-    SENSORS,
+    SENSOR_NAMES,
     SIDE,
     Levels,
     Pattern,
@@ -35,7 +35,7 @@ from polarguide.capture.sensor.pattern import (
     tiled,
     unusable_samples,
 )
-from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic
+from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic, require_mosaic
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.write import EXACT, Rounding, rounding_of
 from polarguide.core.errors import PolarguideError
@@ -66,9 +66,9 @@ class MosaicFiles:
         if settings.sensor is None:
             raise PolarguideError(
                 "--sensor",
-                expected=f"the sensor of raw mosaics: {', '.join(SENSORS)}",
+                expected=f"the sensor of raw mosaics: {SENSOR_NAMES}",
                 found="none",
-                remedy="Name it; color (MYR) and monochrome (MZR) sensors have different patterns.",
+                remedy="Name it; color and monochrome sensors have different patterns.",
             )
         self._settings = settings
         self._raw = RawFormat(settings.width, settings.height, settings.packing)
@@ -90,6 +90,15 @@ class MosaicFiles:
             what = f"a mosaic of {raw.width}x{raw.height}"
             require_memory(path, worked * raw.width * raw.height, what, remedy=remedy)
         return self._unmirrored(read_mosaic(path, self._raw, least=SMALLEST))
+
+    def given(self, values: NDArray[Any], where: str) -> NDArray[Any]:
+        """The values of a whole mosaic in memory, [H, W] uint8 or uint16, as ``read`` gives those of a file.
+
+        Raises:
+            PolarguideError: they are too few, or four pictures.
+        """
+        require_mosaic(where, values, least=SMALLEST)
+        return self._unmirrored(values)
 
     def _unmirrored(self, values: NDArray[Any]) -> NDArray[Any]:
         """A stored mosaic without the mirroring that ``flip`` names."""

@@ -15,6 +15,7 @@ from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
 from polarguide.capture.layout import angle_folders, describe_contents, index_files, list_files
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import read_pose_file
+from polarguide.capture.sensor.pattern import SENSOR_NAMES
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
@@ -97,7 +98,8 @@ def _unknown_layout(root: Path) -> PolarguideError:
         f"polarguide prepare {source} {out}."
     )
     if mosaics:
-        remedy = f"Raw mosaics: polarguide prepare {source} {out} --sensor IMX250MYR (color) or IMX250MZR. {remedy}"
+        command = f"polarguide prepare {source} {out} --sensor IMX250MYR"
+        remedy = f"Raw mosaics: {command}, or yours of {SENSOR_NAMES}. {remedy}"
     if photographs and not mosaics:
         remedy += (
             " Photographs through a filter that was turned between them: --angles unknown, or angles.csv with the "

@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, Sense, checked, read_calibration
 from polarguide.capture.sensor.analyzer_file import is_analyzer_file
-from polarguide.capture.sensor.pattern import Packing
+from polarguide.capture.sensor.pattern import Packing, SensorName
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options, option_name
 from polarguide.core.text import decimal
@@ -48,7 +48,7 @@ class PrepareSettings:
     Attributes:
         format: What the source is; auto looks for datasets, the four shots of a filter, and singles (photographs
             through a filter at any angles, each with a pose of its own), else takes mosaics.
-        sensor: Sensor of raw mosaics: MYR are color, MZR is monochrome.
+        sensor: Sensor of raw mosaics: IMX250MYR and IMX264MYR are color, IMX250MZR is monochrome.
         packing: Packing of .raw files (there are several of 10 and of 12 bits; never guessed).
         width: Width of .raw files in pixels.
         height: Height of .raw files in pixels.
@@ -88,7 +88,7 @@ class PrepareSettings:
     """
 
     format: Literal["auto", "mosaic", "filter", "singles"] | Dataset = "auto"
-    sensor: Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"] | None = None
+    sensor: SensorName | None = None
     packing: Packing | None = None
     width: _Positive | None = None
     height: _Positive | None = None

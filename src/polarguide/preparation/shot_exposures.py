@@ -83,12 +83,12 @@ class ShotExposures:
 
 
 def exposures_of_view(
-    paths: Sequence[Path], gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_], stated: Sequence[float]
+    names: Sequence[str], gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_], stated: Sequence[float]
 ) -> ShotExposures:
     """The exposures of four shots: as their files state, unless their pair sums surely say otherwise.
 
     Args:
-        paths: the files, for messages.
+        names: of the shots, for messages.
         gray: linear intensities [4, H, W]. usable: [H, W].
         stated: exposures that the files state, or ones.
     """
@@ -100,7 +100,7 @@ def exposures_of_view(
         return ShotExposures(_gains(logs))
     differ = float(np.ptp(logs)) >= _EQUAL
     named = ", ".join(
-        f"{paths[ANGLES.index(angle)].name} ({angle} degrees) by {factor - 1:+.0%}"
+        f"{names[ANGLES.index(angle)]} ({angle} degrees) by {factor - 1:+.0%}"
         for angle, factor in off.items()
     )
     than = "than their EXIF exposures say" if differ else "than the other shots of the view"

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from polarguide import __version__
 from polarguide.capture import Scene
+from polarguide.capture.scene import IN_MEMORY
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import atomic, in_utf8, make_folder, read_file, require_file, write_text, writing
 from polarguide.core.options import Transfer
@@ -52,7 +53,7 @@ class RunConfiguration:
     """The record that defines a run.
 
     Attributes:
-        scene: absolute path of the scene folder.
+        scene: absolute path of the scene folder; ``IN_MEMORY`` of a scene of arrays.
         scene_digest: hash of the scene's files, so that a run does not go on with other data.
         recipe: its name. recipe_data: all its values, for the record.
         settings: steps, seed, refractive index, with what was taken where nothing was specified.
@@ -82,7 +83,7 @@ class RunConfiguration:
     ) -> RunConfiguration:
         """What is recorded of a training."""
         return cls(
-            scene=str(scene.root.resolve()),
+            scene=str(scene.root if scene.root == IN_MEMORY else scene.root.resolve()),
             scene_digest=scene.digest,
             recipe=recipe.name,
             recipe_data=recipe.data(),

@@ -21,7 +21,7 @@ from polarguide.raster.magnification import as_trained
 from polarguide.raster.surface import alpha_in_front
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.model import Light, Parameters, ShadingModel
-from polarguide.shading.result import LAYERS, RenderResult
+from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
 from polarguide.training.state import TrainingState
 
 
@@ -42,7 +42,7 @@ class Model(Protocol):
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """Names of the layers that it renders, in the order of ``LAYERS``."""
+        """Names of the layers that it renders, in the order of ``LAYERS``; then ``POLARIZED`` where it predicts it."""
 
     @property
     def steps(self) -> int:
@@ -73,6 +73,14 @@ class Model(Protocol):
         """Share of each pixel's alpha that lies nearer than a depth [H, W]."""
 
 
+def layers_of(shading: ShadingModel) -> tuple[str, ...]:
+    """Names of the layers of Gaussians that are shaded like this, in the order of ``LAYERS``; then ``POLARIZED`` where
+    it predicts that.
+    """
+    predicts = {"specular", "diffuse", "normal"} <= {*shading.layers}
+    return (*(name for name in LAYERS if name in shading.layers), *(POLARIZED if predicts else ()))
+
+
 @dataclass(frozen=True, eq=False)
 class GaussianModel:
     """A trained model for scoring and viewing: Gaussians, their light, and their shading."""
@@ -94,7 +102,7 @@ class GaussianModel:
     @property
     def layers(self) -> tuple[str, ...]:
         """Names of the layers that it renders, in the order of ``LAYERS``."""
-        return tuple(name for name in LAYERS if name in self.shading.layers)
+        return layers_of(self.shading)
 
     @property
     def steps(self) -> int:

@@ -14,6 +14,7 @@ from torch import Tensor
 from polarguide.capture import Scene, load_scene, read_model
 from polarguide.capture.layout import find_layout
 from polarguide.capture.presentation import Presentation, read_presentation
+from polarguide.capture.scene import IN_MEMORY
 from polarguide.capture.variants import mask_background, select_exposures
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.options import DeviceName, PathLike, SceneOptions, check_choice
@@ -26,7 +27,7 @@ from polarguide.runs.families import family_of
 from polarguide.runs.folder import RunConfiguration, load_checkpoint
 from polarguide.runs.health import Health
 from polarguide.runs.model import GaussianModel, Model
-from polarguide.shading.result import LAYERS, RenderResult
+from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
 from polarguide.training.recipe import Method
 
 Opened = TypeVar("Opened", bound="OpenedRun")
@@ -58,7 +59,14 @@ class OpenedRun:
 
     def __repr__(self) -> str:
         of = f"{self.recipe.name}, {self.steps} steps, {self.model.size}"
-        return f"<{type(self).__name__} {self.folder}: {of}>"
+        return f"<{type(self).__name__} {self.folder}: {of}\n polarization: {self._evidence()}>"
+
+    def _evidence(self) -> str:
+        """``polarization``, also where its record is damaged: for representations, which raise nothing."""
+        try:
+            return self.polarization
+        except PolarguideError as error:
+            return f"not known ({error.where})"
 
     @classmethod
     def open(
@@ -168,7 +176,7 @@ class OpenedRun:
         options = SceneOptions(configuration.downscale, configuration.transfer, split="every-8th")
         recorded = configuration.test_views
         if not isinstance(scene, Scene):
-            folder = configuration.scene if scene is None else scene
+            folder = self._folder_to_read()
             scene = read_scene(folder, options, self._reporter, recorded)
         if (scene.downscale, scene.transfer) != (options.downscale, options.transfer):
             expected = (
@@ -208,8 +216,25 @@ class OpenedRun:
         """
         if "scene" in self.__dict__ or isinstance(self._scene_source, Scene):
             return scene_frame(list(self.cameras.values()))
-        model = read_model(self.scene_folder)
-        return scene_frame([model.camera(name) for name in find_layout(self.scene_folder).names])
+        folder = self._folder_to_read()
+        model = read_model(folder)
+        return scene_frame([model.camera(name) for name in find_layout(folder).names])
+
+    def _folder_to_read(self) -> Path:
+        """``scene_folder``, for what is read from it.
+
+        Raises:
+            PolarguideError: the scene was one of arrays, and has no folder.
+        """
+        folder = self.scene_folder
+        if folder == IN_MEMORY:
+            raise PolarguideError(
+                "scene",
+                expected=f"the scene of arrays that {self.folder} was trained on",
+                found="none",
+                remedy="Make it again, and give it: polarguide.open_run(folder, scene=scene).",
+            )
+        return folder
 
     @property
     def frame(self) -> SceneFrame:
@@ -223,11 +248,17 @@ class OpenedRun:
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """Names of the layers that this run renders, in the order of ``LAYERS``."""
+        """Names of the layers that this run renders, in the order of ``LAYERS`` and ``POLARIZED``."""
         return self.model.layers
 
     def result(
-        self, camera: Camera | str, *, normals: bool = True, depth: bool = True, surface: bool = True
+        self,
+        camera: Camera | str,
+        *,
+        normals: bool = True,
+        depth: bool = True,
+        surface: bool = True,
+        polarized: bool = False,
     ) -> RenderResult:
         """Everything that can be rendered, as one typed record on the run's device.
 
@@ -236,9 +267,11 @@ class OpenedRun:
             normals, depth: whether to render these layers where the recipe can do without them.
             surface: whether they are those of the surface at the pixel's median depth; otherwise blended, which is
                 faster.
+            polarized: whether to predict Stokes vectors, where the model can.
         """
         chosen = self.scene.view(camera).camera if isinstance(camera, str) else camera
-        return self.model.render(chosen, normals=normals, depth=depth, surface=surface)
+        found = self.model.render(chosen, normals=normals, depth=depth, surface=surface)
+        return replace(found, predicted=self.model.stokes(found, chosen)) if polarized else found
 
     def render(self, camera: Camera | str, layers: Iterable[str] = ("final",)) -> dict[str, Tensor]:
         """Layers of a picture.
@@ -249,14 +282,17 @@ class OpenedRun:
 
         Returns:
             By name: linear radiance [H, W, 3] on the scale of S0/2, world normals [H, W, 3] of any length, or [H, W]
-            for strength, roughness, metalness, depth and alpha.
+            for strength, roughness, metalness, depth and alpha. Predicted polarization: ``stokes`` [3, H, W, 3] in the
+            lens frame, as ``View.stokes`` measures it; ``dolp`` [H, W] in [0, 1] and ``aolp`` [H, W] radians in
+            [0, pi) of its luminance.
 
         Raises:
             PolarguideError: there is no such layer, or this recipe has not got it.
         """
         names = checked_layers([layers] if isinstance(layers, str) else list(layers))
         geometry = {"normal", "depth"} & {*names}
-        return self.chosen_layers(self.result(camera, surface=bool(geometry)), names)
+        result = self.result(camera, surface=bool(geometry), polarized=not {*names}.isdisjoint(POLARIZED))
+        return self.chosen_layers(result, names)
 
     def chosen_layers(self, result: RenderResult, names: Iterable[str]) -> dict[str, Tensor]:
         """Layers of a picture by name.
@@ -283,7 +319,7 @@ def checked_layers(names: list[str]) -> list[str]:
         PolarguideError: otherwise.
     """
     for name in names or ["none"]:
-        check_choice("layers", name, LAYERS)
+        check_choice("layers", name, (*LAYERS, *POLARIZED))
     return names
 
 

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from polarguide import optics
+
 COLOR_CHANNELS = (0, 1, 2)
 NORMAL_CHANNELS = (3, 4, 5)
 
@@ -65,6 +67,9 @@ LAYERS = (
     "alpha",
 )
 """The pictures in a ``RenderResult``, by name."""
+POLARIZED = ("stokes", "dolp", "aolp")
+"""What a result with ``predicted`` Stokes vectors has besides. What a view's pictures say of the same has these names
+with ``, measured``."""
 
 
 class MetalPixels(NamedTuple):
@@ -113,6 +118,8 @@ class RenderResult:
         metal: what metals add to ``specular``; None where there is none.
         index: [H, W] refractive index of each pixel, without a gradient; None: that of the run everywhere.
         blended_normal: the blended normal, where ``normal`` is that of the surface.
+        predicted: [3, H, W, 3] Stokes vectors in the lens frame, as ``View.stokes`` measures them, S0 twice the
+            picture; None where they were not asked for, or the model predicts none.
     """
 
     final: Tensor
@@ -132,6 +139,22 @@ class RenderResult:
     roughness: Tensor | None = None
     index: Tensor | None = None
     blended_normal: Tensor | None = None
+    predicted: Tensor | None = None
+
+    @property
+    def stokes(self) -> Tensor | None:
+        """``predicted``, by its name as a layer."""
+        return self.predicted
+
+    @property
+    def dolp(self) -> Tensor | None:
+        """Predicted degree of linear polarization of the luminance, [H, W] in [0, 1]."""
+        return None if self.predicted is None else optics.dolp(optics.luminance(self.predicted))
+
+    @property
+    def aolp(self) -> Tensor | None:
+        """Predicted angle of linear polarization of the luminance, [H, W] radians in [0, pi)."""
+        return None if self.predicted is None else optics.aolp(optics.luminance(self.predicted))
 
     @property
     def shaded_normal(self) -> Tensor | None:
@@ -156,6 +179,14 @@ class RenderResult:
                 )
                 pictures[name] = layer[rows][:, columns]
         bare: dict[str, Any] = dict.fromkeys(
-            ("detached_layers", "rotation_only_normal", "radii", "metal", "index", "blended_normal")
+            (
+                "predicted",
+                "detached_layers",
+                "rotation_only_normal",
+                "radii",
+                "metal",
+                "index",
+                "blended_normal",
+            )
         )
         return replace(self, **bare, **pictures)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from polarguide.capture import checks
-from polarguide.capture.calibration import UNIT_GAINS, Calibration, balancing_gains, oriented, pair_ratio
+from polarguide.capture.calibration import UNIT_GAINS, oriented, pair_ratio
 from polarguide.capture.exposures import FOUR, analyzers
 from polarguide.capture.filter.develop import (
     align_shots,
@@ -21,70 +19,37 @@ from polarguide.capture.filter.develop import (
     require_known_encoding,
 )
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
-from polarguide.capture.filter.shots import read_shots, require_four_shots
+from polarguide.capture.filter.shots import Shots, read_shots, require_four_shots, stacked
 from polarguide.capture.formats.pictures import is_lossy
 from polarguide.capture.layout import find_layout, select_views
 from polarguide.capture.memory import KEPT, READ, require_memory_of_each
-from polarguide.capture.sensor.analyzer_file import read_analyzers
-from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
-from polarguide.capture.sensor.defects import defects, defects_note
-from polarguide.capture.sensor.demosaic import demosaic
-from polarguide.capture.sensor.pattern import (
-    SENSOR_SIZE,
-    SIDE,
-    estimate_levels,
-    tiled,
-    unusable_samples,
-)
+from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.view import ANGLES, FULL_CODE, View
 from polarguide.capture.view_reader import ViewData, read_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_file
-from polarguide.preparation.mosaic_source import MosaicFiles, block_intensities, sample_blocks
 from polarguide.preparation.shot_exposures import corrected_note, exposures_of_view, stated_exposures
+from polarguide.shots.developed import Developed, Mask, Part, gains_of
 from polarguide.shots.exposures import ExposureSet
-from polarguide.shots.maps import Map, NoiseModel, estimated_noise, given_noise, interpolation_factors
+from polarguide.shots.maps import Map, estimated_noise, given_noise
+from polarguide.shots.mosaic import calibration_of, develop_mosaic
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.samples import (
     SetSamples,
     levels_of_shot,
-    piled_up,
     read_set,
+    samples_of_arrays,
     samples_of_loaded,
     samples_of_view,
 )
 from polarguide.shots.sets import known_places
 
-Mask = NDArray[np.bool_]
-_LARGE_IMBALANCE = 0.01
 _MAPS = 4 * (4 * 3 + 3 + 5)
 """Bytes for each pixel of the intensities and of what is derived from them first, all at once."""
 
 
-@dataclass(frozen=True, eq=False)
-class Developed:
-    """Intensities of a shot before anything is derived from them.
-
-    Attributes:
-        intensities: [4, H, W, C] float32, linear; noise about black may be negative.
-        dark, saturated, masked: [H, W].
-        noise: of a sample. factors: variance of an intensity (of the luminance) as a multiple of a sample's,
-            [4, p, p] over a period of pixels.
-        pair_ratio, notes: as in ``ShotMaps``.
-    """
-
-    intensities: Map
-    dark: Mask
-    saturated: Mask
-    masked: Mask
-    noise: NoiseModel
-    factors: Map
-    pair_ratio: float | None
-    notes: tuple[str, ...]
-
-
-def develop(shot: ExposureSet, options: ShotOptions) -> Developed:
-    """Read the files of a shot.
+def develop(shot: ExposureSet, options: ShotOptions, part: Part | None = None) -> Developed:
+    """Read the files of a shot; of a mosaic, develop at least ``part`` of the picture, None: all of it.
 
     Raises:
         PolarguideError: one is missing, cannot be read, or does not fit the others or the options.
@@ -94,9 +59,9 @@ def develop(shot: ExposureSet, options: ShotOptions) -> Developed:
     options.require_kind(shot.kind, shot.name)
     if shot.kind == "mosaic":
         try:
-            return _mosaic(shot, options)
+            return develop_mosaic(shot, options, part)
         except PolarguideError as error:
-            path = shot.files[0]
+            path = shot.where
             if error.where.startswith(str(path)):
                 raise
             # An option or the dark frame does not fit this file; of many, it has to be named.
@@ -116,6 +81,8 @@ def set_samples(shot: ExposureSet, options: ShotOptions) -> SetSamples | None:
     if shot.fault is not None:
         raise shot.fault
     options.require_kind(shot.kind, shot.name)
+    if shot.kind == "set" and shot.stored is not None:
+        return samples_of_arrays(shot.name, shot.stored, shot.angles, options)
     if shot.kind == "set":
         return read_set(shot.name, shot.pictures, options)
     if shot.kind != "scene" or shot.files:
@@ -133,160 +100,29 @@ def check_files(options: ShotOptions) -> None:
     if options.dark_frame is not None:
         require_file(options.dark_frame, expected="a dark frame", remedy="Check --dark-frame.")
     if options.analyzers is not None:
-        _calibration(options.analyzers).require_sensor(options.sensor, options.analyzers)
+        calibration_of(options.analyzers).require_sensor(options.sensor, options.analyzers)
 
 
-def _mosaic(shot: ExposureSet, options: ShotOptions) -> Developed:
-    path, files = shot.files[0], MosaicFiles(options.preparation())
-    stored, pattern = files.read(path), files.pattern
-    _require_on_sensor(path, stored.shape, options)
-    dark = files.dark(stored.shape)
-    values = files.cut(stored)
-    container = files.container(path, stored)
-    levels = estimate_levels(
-        int(stored.max()),
-        int(np.bitwise_or.reduce(stored, None)),
-        container,
-        bits=options.bits,
-        black=options.black_level,
-        saturation=options.saturation,
+def _four(shot: ExposureSet, levels: Levels | None = None) -> Shots:
+    """The four pictures of a shot, of its files or in memory."""
+    return (
+        read_shots(shot.files, levels=levels) if shot.stored is None else stacked(shot.stored, levels=levels)
     )
-    notes = []
-    if options.bits is None and container == 16:
-        notes.append(f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale.")
-    pile, piled = piled_up(stored, container, options)
-    if pile is not None and pile < levels.saturation:
-        levels, notes = replace(levels, saturation=pile), [*notes, *piled]
-    levels = replace(levels, gamma=options.gamma)
-    files.require_kind(sample_blocks(values, SIDE), levels)
-    side = 2 * pattern.period
-    floor = None if dark is None else sample_blocks(dark, side)
-    assert options.sensor is not None
-    x, y = options.offset_x + files.crop[0], options.offset_y + files.crop[1]
-    analyzers, matrices = _analyzers(stored.shape, options), None
-    if analyzers is not None:
-        of_cells = analyzers.correction((x, y), values.shape[::-1])
-        matrices = np.stack([[sample_blocks(cell, pattern.period) for cell in row] for row in of_cells])
-    angles, _, usable = block_intensities([sample_blocks(values, side)], levels, floor, pattern, matrices)
-    ratio = pair_ratio(angles, usable)
-    gains, said = _gains(ratio, options)
-    saturated, black = unusable_samples(values, levels, dark)
-    defective = defects([np.minimum(values, levels.white)], pattern.period)
-    notes += [defects_note(int(defective.sum()), values.size)] if defective.any() else []
-    linear = levels.linear(values, dark)
-    if analyzers is not None:
-        linear = analyzers.apply(linear, offset=(x, y))
-        saturated, black, defective = map(spread_to_cells, (saturated, black, defective))
-    if gains != UNIT_GAINS:
-        of_angle = dict(zip(ANGLES, gains, strict=True))
-        linear *= tiled(np.vectorize(lambda a: np.float32(1 / of_angle[a]))(pattern.angles), linear.shape)
-    lsb = 1 / (levels.white - levels.black)
-    cells = {int(pattern.angles[r, c]): linear[r::2, c::2] for r, c in np.ndindex(2, 2)}
-    noise = given_noise(options, lsb)
-    if noise is None:
-        bad = saturated | black | defective
-        good = ~(bad[::2, ::2] | bad[1::2, ::2] | bad[::2, 1::2] | bad[1::2, 1::2])
-        noise = estimated_noise([cells[angle] for angle in ANGLES], good, lsb)
-    mode, way = options.demosaic, options.interpolation
-    picture = demosaic(linear, saturated, pattern, mode=mode, interpolation=way, colored=False)
-    lost = picture.invalid
-
-    def spoiled(samples: Mask) -> Mask:
-        """The pixels that are made from some samples."""
-        if not samples.any():
-            return np.zeros(lost.shape, bool)
-        return demosaic(linear, samples, pattern, mode=mode, interpolation=way, colored=False).invalid
-
-    return Developed(
-        intensities=oriented(picture.intensities, options.calibration),
-        dark=spoiled(black),
-        saturated=lost,
-        masked=spoiled(defective),
-        noise=noise,
-        factors=_placed(interpolation_factors(options.sensor, x, y, mode), options.calibration),
-        pair_ratio=ratio,
-        notes=(*notes, *said),
-    )
-
-
-def _analyzers(shape: tuple[int, ...], options: ShotOptions) -> AnalyzerCalibration | None:
-    """The calibration of the sensor, checked against what it is to correct; read once for all shots."""
-    path = options.analyzers
-    if path is None:
-        return None
-    found = _calibration(path)
-    found.require_sensor(options.sensor, path)
-    found.require_region((options.offset_x, options.offset_y), (shape[1], shape[0]), path)
-    return found
-
-
-def _calibration(path: Path) -> AnalyzerCalibration:
-    require_file(path, expected="a file of polarguide calibrate", remedy="Check --calibration.")
-    state = path.stat()
-    return _read(path, state.st_mtime_ns, state.st_size)
-
-
-@lru_cache(maxsize=1)
-def _read(path: Path, *_: int) -> AnalyzerCalibration:
-    return read_analyzers(path)
-
-
-def _require_on_sensor(path: Path, shape: tuple[int, ...], options: ShotOptions) -> None:
-    """Refuse what is larger than the sensor: another one, or no mosaic."""
-    most = tuple(n - o for n, o in zip(SENSOR_SIZE, (options.offset_x, options.offset_y), strict=True))
-    if shape[1] > most[0] or shape[0] > most[1]:
-        raise PolarguideError(
-            path,
-            expected=f"at most {most[0]}x{most[1]} pixels of {options.sensor}",
-            found=f"{shape[1]}x{shape[0]}",
-            remedy="Check --sensor, --offset-x and --offset-y; prepare reads larger sensors of the same pattern.",
-        )
-
-
-def _placed(factors: Map, calibration: Calibration) -> Map:
-    """The factors by true angle."""
-    if calibration.permutes:
-        return oriented(factors, calibration)
-    return np.broadcast_to(factors.mean(axis=0), factors.shape)
-
-
-def _gains(
-    ratio: float | None, options: ShotOptions
-) -> tuple[tuple[float, float, float, float], tuple[str, ...]]:
-    """Gains of the four pictures, and what to say of them."""
-    if options.analyzers is not None:
-        if ratio is None:
-            return UNIT_GAINS, ()
-        notes = [f"With the calibration, I0 + I90 is {ratio - 1:+.2%} off I45 + I135."]
-        if abs(ratio - 1) > _LARGE_IMBALANCE:
-            notes.append("That is more than a calibration of this camera leaves: is it one of another?")
-        return UNIT_GAINS, tuple(notes)
-    if options.calibration.gains is not None:
-        return options.calibration.gains, ()
-    if ratio is None:
-        return UNIT_GAINS, ()
-    said = f"I0 + I90 is {ratio - 1:+.2%} off I45 + I135"
-    found = balancing_gains(ratio)
-    if found is None:
-        return UNIT_GAINS, (f"{said}: the angles or the encoding are probably wrong.",)
-    if options.gains == "auto":
-        return found, (f"{said}; corrected.",)
-    if abs(ratio - 1) > _LARGE_IMBALANCE:
-        return UNIT_GAINS, (f"{said}; not corrected (--gains auto does, a calibration does better).",)
-    return UNIT_GAINS, ()
 
 
 def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
-    require_four_shots(shot.paths[0].parent, {shot.name: shot.files})
-    paths = [shot.files[angle] for angle in ANGLES]
-    shots = read_shots(shot.files)
+    if shot.stored is None:
+        require_four_shots(shot.paths[0].parent, {shot.name: shot.files})
+    paths = [shot.files[angle] for angle in ANGLES] if shot.stored is None else []
+    shots = _four(shot)
     levels, notes = levels_of_shot(shots.pictures, 8 * shots.pictures.dtype.itemsize, options)
     if levels is not None:
-        shots = read_shots(shot.files, levels=levels)
+        shots = _four(shot, levels)
     transfer: str = options.transfer
     if transfer == "auto":
-        require_known_encoding(paths[0])
-        decision = decide_transfer([shots], lossy=is_lossy(shot.files[0]))
+        if paths:
+            require_known_encoding(paths[0])
+        decision = decide_transfer([shots], lossy=bool(paths) and is_lossy(paths[0]))
         transfer = decision.transfer
         notes += [f"Transfer {decision.reason}.", *filter(None, [decision.doubt])]
     linear = linear_intensities(shots.pictures, transfer)
@@ -302,18 +138,20 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
         ]
         notes += [f"Shots moved, in pixels: {', '.join(moved)}."] if moved else []
     saturated = np.asarray(clipped.any(axis=0))
-    stated = stated_exposures({shot.name: paths}).get(shot.name)
+    stated = stated_exposures({shot.name: paths}).get(shot.name) if paths else None
     exposed = np.asarray(stated or UNIT_GAINS)
     notes += [corrected_note(stated)] if stated else []
     if options.gains == "auto" and options.calibration.gains is None:
-        measured = exposures_of_view(paths, linear.mean(axis=3), ~(saturated | dark), exposed.tolist())
+        measured = exposures_of_view(
+            _labels(paths), linear.mean(axis=3), ~(saturated | dark), exposed.tolist()
+        )
         exposed = np.asarray(measured.gains)
         notes += [f"Shots {measured.warning}"] if measured.warning else []
     if (exposed != 1.0).any():
         linear = linear / exposed.astype(np.float32)[:, None, None, None]
     gray = linear.mean(axis=3)
     ratio = pair_ratio(gray, ~(saturated | dark))
-    gains, said = _gains(ratio, options)
+    gains, said = gains_of(ratio, options)
     if gains != UNIT_GAINS:
         linear = linear / np.asarray(gains, np.float32)[:, None, None, None]
         gray = linear.mean(axis=3)
@@ -333,9 +171,15 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
         masked=np.zeros(upright.shape[1:3], bool),
         noise=noise,
         factors=np.full((4, 1, 1), factor, np.float32),
+        mean_variance=factor,
         pair_ratio=ratio,
         notes=(*notes, *said),
     )
+
+
+def _labels(paths: Sequence[Path]) -> list[str]:
+    """What messages call four shots."""
+    return [path.name for path in paths] or [f"picture {number}" for number in range(1, len(ANGLES) + 1)]
 
 
 def _scene_view(shot: ExposureSet, options: ShotOptions) -> Developed:
@@ -411,6 +255,7 @@ def _undistorted(
         masked=invalid if foreground is None else invalid | ~foreground,
         noise=noise,
         factors=np.ones((4, 1, 1), np.float32),
+        mean_variance=1.0,
         pair_ratio=pair_ratio(gray, good),
         notes=(),
     )

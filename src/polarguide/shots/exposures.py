@@ -7,8 +7,11 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from polarguide.capture.exposures import TABLE
+from numpy.typing import NDArray
+
+from polarguide.capture.exposures import TABLE, Angle
 from polarguide.capture.filter import shots as filter_shots
 from polarguide.capture.filter.names import covers_turn
 from polarguide.capture.layout import (
@@ -19,6 +22,7 @@ from polarguide.capture.layout import (
     find_layout,
     list_files,
 )
+from polarguide.capture.sensor.pattern import SENSOR_NAMES
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
 from polarguide.core.errors import PolarguideError
@@ -29,7 +33,7 @@ from polarguide.shots.video import VIDEO_SUFFIXES
 
 _EXPECTED = "raw mosaics with --sensor, or shots with angles in their names"
 _REMEDY = (
-    "Raw mosaics need --sensor (IMX250MYR is color, IMX250MZR monochrome); shots need their angles in the names "
+    f"Raw mosaics need --sensor: {SENSOR_NAMES}; shots need their angles in the names "
     "(<shot>_0, _45, _90 and _135; at others <shot>_a10, _a40, ...), folders 0, 45, 90 and 135, or angles.csv with the "
     "columns file,angle."
 )
@@ -51,6 +55,8 @@ class ExposureSet:
             a scene, its pictures where they are not the usual four.
         pictures: of a set, by angle.
         table: that states their angles; None where names do.
+        stored: the pictures of a shot in memory, which has no files: [H, W] of a mosaic, else [K, H, W, 3].
+        angles: theirs, as the user counts them; none of a mosaic.
     """
 
     name: str
@@ -62,13 +68,20 @@ class ExposureSet:
     others: tuple[Path, ...] = ()
     pictures: tuple[sets.SetPicture, ...] = ()
     table: Path | None = None
+    stored: NDArray[Any] | None = None
+    angles: tuple[Angle, ...] = ()
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The files, by angle, and the table of a set; at least one."""
+        """The files, by angle, and the table of a set; at least one, or none of a shot in memory."""
         of_set = dict.fromkeys(picture.path for picture in self.pictures)
         more = [] if self.table is None else [self.table]
         return (*(path for _, path in sorted(self.files.items())), *of_set, *more, *self.others)
+
+    @property
+    def where(self) -> Path | str:
+        """What messages call it: its first file, or its name."""
+        return self.paths[0] if self.paths else self.name
 
     @property
     def whole(self) -> bool:

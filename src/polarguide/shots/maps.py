@@ -109,6 +109,11 @@ class ShotMaps:
             clipping and wrong angles are more. None for others.
         left_out: [H, W] uint8, of a set: samples that were not fitted, at full scale or against the others. None for
             others.
+        pixel_variance: mean variance of a developed intensity (of the luminance), in variances of a sample.
+        mean_variance: that of the mean of many developed intensities, times their number: more, as neighbors share
+            samples. None of a set at other angles.
+        origin: column and row of the whole picture at which the maps begin.
+        whole: width and height of the whole picture, where only a part of it was developed; None: the maps are all.
     """
 
     name: str
@@ -127,6 +132,10 @@ class ShotMaps:
     pictures: tuple[PictureFit, ...] = ()
     residual: Map | None = None
     left_out: NDArray[np.uint8] | None = None
+    pixel_variance: float = 1.0
+    mean_variance: float | None = None
+    origin: tuple[int, int] = (0, 0)
+    whole: tuple[int, int] | None = None
 
     @property
     def s0(self) -> Map:
@@ -209,7 +218,6 @@ def noise_line(x: NDArray[np.float64], y: NDArray[np.float64], least: float) -> 
     return max(float(floor), least), max(float(slope), 0.0)
 
 
-@lru_cache(maxsize=8)
 def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> NDArray[np.float32]:
     """Variance of each developed intensity, as a multiple of a sample's: [4, p, p] over a period p of the pattern.
 
@@ -217,9 +225,24 @@ def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> NDArray[np.
     of the pattern becomes, by the demosaicing itself. Guided interpolation, which is not linear, is taken to be
     bilinear, and luminance as the mean of the colors. ``x`` and ``y`` are where the pattern of the sensor begins.
     """
+    return _variances(sensor, x, y, mode)[0]
+
+
+def averaged_factor(sensor: str, x: int, y: int, mode: str) -> float:
+    """Variance of the mean of many developed intensities, times their number, as a multiple of a sample's: more than
+    the mean of ``interpolation_factors``, as interpolated neighbors share samples.
+    """
+    return _variances(sensor, x, y, mode)[1]
+
+
+@lru_cache(maxsize=8)
+def _variances(sensor: str, x: int, y: int, mode: str) -> tuple[NDArray[np.float32], float]:
+    """``interpolation_factors`` and ``averaged_factor``."""
     pattern = sensor_pattern(sensor).shifted(x, y)
     side, step = 4 * _REACH, DEMOSAIC_MODES[mode]
     period, cell = max(1, pattern.period // step), max(pattern.period, step)
+    inner = slice(_REACH // step, 2 * _REACH // step)
+    summed = np.zeros(len(ANGLES))
     # Half size is the mean over cells of full size, but for S0, of whose noise DoLP and AoLP hardly depend.
     way = "quarter" if mode == "quarter" else "full"
     squares = np.zeros((len(ANGLES), side // step, side // step))
@@ -235,7 +258,8 @@ def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> NDArray[np.
             response = response.reshape(len(ANGLES), side // 2, 2, side // 2, 2).mean(axis=(2, 4))
         # Impulses of one position lie so far apart that no pixel sees two.
         squares += response**2
-    inner = slice(_REACH // step, 2 * _REACH // step)
+        summed += response[:, inner, inner].sum(axis=(1, 2)) ** 2  # by the only impulse in there
     found = squares[:, inner, inner]
     blocks = found.reshape(4, found.shape[1] // period, period, found.shape[2] // period, period)
-    return np.asarray(blocks.sum(axis=(1, 3)), np.float32)
+    mean = float(summed.mean()) * step**2 / cell**2
+    return np.asarray(blocks.sum(axis=(1, 3)), np.float32), mean

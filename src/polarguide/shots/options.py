@@ -10,7 +10,7 @@ import tyro
 from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, checked
-from polarguide.capture.sensor.pattern import Packing
+from polarguide.capture.sensor.pattern import Packing, SensorName
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options, option_name
 from polarguide.preparation.settings import PrepareSettings
@@ -54,7 +54,8 @@ class ShotOptions:
     """How the files of a shot become intensities, and from when on a pixel counts.
 
     Attributes:
-        sensor: Sensor of raw mosaics: MYR are color, MZR is monochrome. Without it files are shots through a filter.
+        sensor: Sensor of raw mosaics: IMX250MYR and IMX264MYR are color, IMX250MZR is monochrome. Without it files are
+            shots through a filter.
         packing: Packing of .raw files (there are several of 10 and of 12 bits; never guessed).
         width: Width of .raw files in pixels; others must have it, too.
         height: Height of .raw files in pixels.
@@ -81,7 +82,7 @@ class ShotOptions:
         snr: DoLP in units of its standard deviation from which on an angle counts.
     """
 
-    sensor: Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"] | None = None
+    sensor: SensorName | None = None
     packing: Packing | None = None
     width: _Positive | None = None
     height: _Positive | None = None

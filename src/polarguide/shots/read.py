@@ -14,16 +14,19 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture.colmap.model import fit_camera, read_model
-from polarguide.capture.exposures import FOUR
-from polarguide.capture.view import View
+from polarguide.capture.exposures import FOUR, Angle
+from polarguide.capture.given_arrays import Array
+from polarguide.capture.view import ANGLES, View
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import check_finite, index_of
 from polarguide.core.text import decimal
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
-from polarguide.shots.develop import Developed, develop, develop_view, samples_of, set_samples
+from polarguide.shots.develop import develop, develop_view, samples_of, set_samples
+from polarguide.shots.developed import Developed, Part
 from polarguide.shots.exposures import ExposureSet, find_shots
 from polarguide.shots.fit import DARK_SNR, maps_of_set
+from polarguide.shots.given import array_shot, is_array, stacked_array
 from polarguide.shots.maps import Map, Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
 
@@ -34,25 +37,41 @@ _TILE = 1 << 18
 
 
 def read_shot(
-    shot: ExposureSet | View | str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    shot: ExposureSet
+    | View
+    | Array
+    | str
+    | os.PathLike[str]
+    | Sequence[str | os.PathLike[str]]
+    | Sequence[Array],
     options: ShotOptions | None = None,
+    angles: Sequence[Angle] = ANGLES,
+    part: Part | None = None,
 ) -> ShotMaps:
     """Read one exposure set: S0, DoLP, AoLP, their standard deviations, and which pixels say nothing.
 
     Args:
         shot: of ``find_shots``; a view of a scene; or the path of a mosaic or of a video with its table, the paths of
-            shots through a filter at four or any three or more angles, or a folder with one shot.
+            shots through a filter at four or any three or more angles, or a folder with one shot. Or arrays of NumPy
+            or torch: with ``options.sensor`` a raw mosaic [H, W] of uint8 or uint16; else pictures through a filter,
+            [K, H, W] or [K, H, W, 3] RGB (or K of them), whole numbers as stored or linear floats from 0 to 1.
         options: how to read it.
+        part: x, y, width and height of what is wanted of the picture of a mosaic: the rest is left out where that saves
+            time, as ``ShotMaps.origin`` and ``whole`` say. Noise that is not given is then estimated from the part.
+        angles: of the K pictures of an array, degrees counter-clockwise as displayed; files state theirs.
 
     Raises:
-        PolarguideError: it is not one shot, or a file is missing, cannot be read, or does not fit.
+        PolarguideError: it is not one shot, a file is missing, cannot be read, or does not fit, or an array has
+            another shape or type.
     """
     options = (options or ShotOptions()).checked()
     if isinstance(shot, View):
         if shot.exposures != FOUR:
             return maps_of_set(shot.name, (), samples_of(shot), options)
         return maps_of(ExposureSet(shot.name, "scene", {}), develop_view(shot, options), options)
-    if not isinstance(shot, ExposureSet):
+    if is_array(shot):
+        shot = array_shot(stacked_array(shot), options, angles)
+    elif not isinstance(shot, ExposureSet):
         paths = [shot] if isinstance(shot, str | os.PathLike) else list(shot)
         found = find_shots(paths, options)
         if len(found) != 1:
@@ -66,7 +85,7 @@ def read_shot(
     samples = set_samples(shot, options)
     if samples is not None:
         return maps_of_set(shot.name, shot.paths, samples, options)
-    return maps_of(shot, develop(shot, options), options)
+    return maps_of(shot, develop(shot, options, part), options)
 
 
 def fault_of(shot: ExposureSet, error: BaseException) -> PolarguideError:
@@ -78,7 +97,7 @@ def fault_of(shot: ExposureSet, error: BaseException) -> PolarguideError:
     else:
         found, remedy = "it needs more memory than there is", "Free memory, or take a smaller region."
     expected = "a shot that can be read, and room for its maps"
-    return PolarguideError(shot.paths[0], expected=expected, found=found, remedy=remedy)
+    return PolarguideError(shot.where, expected=expected, found=found, remedy=remedy)
 
 
 def tiles(height: int, width: int) -> Iterator[slice]:
@@ -136,6 +155,10 @@ def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> Sh
         noise=developed.noise,
         pair_ratio=developed.pair_ratio,
         notes=developed.notes,
+        pixel_variance=float(developed.factors.mean()),
+        mean_variance=developed.mean_variance,
+        origin=developed.origin,
+        whole=developed.whole,
     )
 
 

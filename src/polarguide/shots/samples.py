@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from polarguide.capture.calibration import ANGLES, Calibration
 from polarguide.capture.exposures import Angle, Exposure, analyzers, nominal, turned
 from polarguide.capture.filter.develop import kind_of_file, require_known_encoding, transfer_of_kind
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
-from polarguide.capture.filter.shots import Shots, read_stack
+from polarguide.capture.filter.shots import Shots, read_stack, stacked
 from polarguide.capture.formats.pictures import linear_codes, rescaled
 from polarguide.capture.memory import require_memory
 from polarguide.capture.sensor.pattern import FULL_16, Levels, clipping_bits, estimate_levels
@@ -124,6 +124,70 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
     assert values is not None
     assert lost is not None
     assert dark is not None
+    gains, words = _gains(pictures)
+    read = _Stored(values, lost, dark, kind, step, code)
+    angles = [_degrees(picture.angle) for picture in pictures]
+    labels = tuple(picture.label for picture in pictures)
+    found = _samples(read, labels, angles, gains, transfer, options)
+    return replace(found, notes=(note, *found.notes, *words, *_unused(unused)))
+
+
+def samples_of_arrays(
+    name: str, stored: NDArray[Any], angles: Sequence[Angle], options: ShotOptions
+) -> SetSamples:
+    """The samples of a set in memory.
+
+    Args:
+        name: of the shot. stored: [K, H, W, 3] uint8 or uint16. angles: of the K pictures.
+    """
+    require_no_order(options.calibration, name)
+    places = [k for k, angle in enumerate(angles) if not isinstance(angle, str)]
+    shots = stacked(stored[places])
+    gray = bool((shots.pictures[..., :1] == shots.pictures).all())
+    values = shots.pictures[..., :1] if gray else shots.pictures
+    read = _Stored(
+        values.astype(np.uint16),
+        shots.clipped.copy(),
+        shots.dark,
+        stored.dtype,
+        1 / float(np.iinfo(stored.dtype).max),
+        1,
+    )
+    transfer = "linear" if options.transfer == "auto" else options.transfer
+    labels = tuple(f"picture {k + 1}" for k in places)
+    known = [_degrees(angles[k]) for k in places]
+    found = _samples(read, labels, known, [1.0] * len(places), transfer, options)
+    note = f"Transfer {transfer}, {'as arrays are' if options.transfer == 'auto' else 'as given'}."
+    return replace(found, notes=(note, *found.notes, *_unused(len(angles) - len(places))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Stored:
+    """Pictures of a set as stored.
+
+    Attributes:
+        values: [K, H, W, C] uint16. lost: [K, H, W]. dark: [H, W].
+        kind: of the files' values. step: one of them as a share of full scale. code: EXIF orientation.
+    """
+
+    values: NDArray[Any]
+    lost: Mask
+    dark: Mask
+    kind: np.dtype[Any]
+    step: float
+    code: int
+
+
+def _samples(
+    read: _Stored,
+    labels: tuple[str, ...],
+    angles: Sequence[float],
+    gains: Sequence[float],
+    transfer: str,
+    options: ShotOptions,
+) -> SetSamples:
+    """Linear samples of stored ones, upright; ``read`` is used up."""
+    values, lost, dark, kind, step, code = (getattr(read, f.name) for f in fields(read))
     levels, said = levels_of_shot(values, 8 * kind.itemsize, options)
     every = np.arange(np.iinfo(kind).max + 1, dtype=kind)
     if levels is not None:
@@ -135,20 +199,19 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
             clipped |= (picture >= levels.saturation).any(axis=2)
         if not as_stored:
             picture[...] = linear[picture]
-    gains, words = _gains(pictures)
     turn = orientation_calibration(code)
     return SetSamples(
-        labels=tuple(picture.label for picture in pictures),
+        labels=labels,
         values=apply_orientation(values.transpose(1, 2, 0, 3), code).transpose(2, 0, 1, 3),
         exposures=tuple(
-            Exposure(_degrees(turned(turned(picture.angle, options.calibration), turn)), gain=gain)
-            for picture, gain in zip(pictures, gains, strict=True)
+            Exposure(_degrees(turned(turned(angle, options.calibration), turn)), gain=gain)
+            for angle, gain in zip(angles, gains, strict=True)
         ),
         lost=apply_orientation(lost.transpose(1, 2, 0), code).transpose(2, 0, 1),
         dark=apply_orientation(dark, code),
         masked=np.zeros(apply_orientation(dark, code).shape, bool),
         step=step,
-        notes=(note, *said, *words, *_unused(unused)),
+        notes=tuple(said),
     )
 
 

@@ -6,7 +6,7 @@ A new term is a field of ``Weights``, which says what has to be rendered and whi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import Field, dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
@@ -84,6 +84,12 @@ class Weights:
     def normals(self) -> bool:
         """Whether a term reads the rendered normals."""
         return self._read("normal")
+
+    def own_terms(self) -> Sequence[Callable[[Step, Any], Tensor | None]]:
+        """Terms that only a subclass of another package has, for the weights that it adds; each gives its weighted
+        loss, or None where there is nothing to compare.
+        """
+        return ()
 
     @property
     def depth(self) -> bool:
@@ -410,7 +416,7 @@ def step_loss(step: Step, weights: Weights) -> StepLoss:
         total = weights.photometric * picture.loss
     else:
         total, picture = partial_terms(step, weights.photometric, weights.stokes)
-    for each in TERMS:
+    for each in (*TERMS, *weights.own_terms()):
         if (loss := each(step, weights)) is not None:
             total = total + loss
     if total.device.type == "cpu":

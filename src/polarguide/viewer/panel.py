@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from polarguide.capture.presentation import Crop, Presentation, Vector
-from polarguide.shading.result import LAYERS
 from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
 from polarguide.viewer.presenting import PresentingControls
 from polarguide.viewer.scenery import MEASURED, Appearance
@@ -18,6 +17,7 @@ NOTHING = Presentation()
 # Ranges of the controls.
 SIDES = ("Left, right", "Down, up", "Front, back")
 EXPOSURE, STRENGTH, TURN, SECONDS, CROP = (-4.0, 4.0), (0.0, 2.0), (-180, 180), (0.5, 10.0), (-150, 150)
+WIPE = 0, 100
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,11 @@ class Panel:
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._status, self._lines, self._note = gui.add_markdown(""), tuple[str, ...](), ""
         self.pause = gui.add_checkbox("Pause training", False, visible=options.trains)
-        layers = [name for name in LAYERS if name in options.layers]
+        layers = options.layers
         self.layer = gui.add_dropdown(
-            "Layer", (*layers, *MEASURED), hint="The last four need a photograph's pose"
+            "Layer",
+            (*layers, *MEASURED),
+            hint=f"From {MEASURED[0]} on, a photograph's pose is needed; stokes, dolp and aolp are predicted",
         )
         self.exposure = gui.add_slider("Exposure", *EXPOSURE, 0.1, 0.0, hint="In stops")
         self.strength = gui.add_slider("Reflection", *STRENGTH, 0.05, 1.0, visible="specular" in layers)
@@ -72,9 +74,11 @@ class Panel:
             self.view = gui.add_dropdown("Go to", (FREE_VIEW, *options.views))
             self.step = gui.add_button_group("", STEPS)
             self.frusta = gui.add_checkbox("Show cameras", True)
+            hint = "At a photograph's pose: what was measured, from the left, in percent of the width"
+            self.wipe = gui.add_slider("Wipe", *WIPE, 1, 0, hint=hint)
         with gui.add_folder("Crop", expand_by_default=False):
             self._use_crop = gui.add_checkbox("Crop", self._saved_crop is not None)
-            self.box = gui.add_checkbox("Show box", True)
+            self.box = gui.add_checkbox("Show box", False)
             for label, sides in zip(SIDES, _percent(self._saved_crop), strict=True):
                 self._crop.append(gui.add_multi_slider(label, *CROP, 1, sides, min_range=1))
         self.presenting = PresentingControls(gui, options.presentation, saves=options.saves)
@@ -87,7 +91,10 @@ class Panel:
             self.play = gui.add_button("Play")
             self.save_path = gui.add_button("Save path")
         self.accepts = self._accepted([*layers, *MEASURED], options.views)
-        controls = (self.layer, self.exposure, self.strength, self.turn, self._use_crop, *self._crop)
+        controls = (
+            *(self.layer, self.exposure, self.strength, self.turn, self.wipe),
+            *(self._use_crop, *self._crop),
+        )
         for control in self._crop:
             control.on_update(lambda _: self._forget_saved())
         for control in controls:
@@ -103,6 +110,7 @@ class Panel:
             (self.exposure, number(*EXPOSURE)),
             (self.strength, number(*STRENGTH)),
             (self.turn, number(*TURN)),
+            (self.wipe, number(*WIPE)),
             (self.view, choice([FREE_VIEW, *views])),
             (self.step, choice(STEPS)),
             (self.seconds, number(*SECONDS)),
@@ -145,6 +153,7 @@ class Panel:
             crop=self.crop(chosen.up_axis),
             white_balance=chosen.white_balance,
             up_axis=chosen.up_axis,
+            wipe=float(self.wipe.value) / 100,
         )
 
 

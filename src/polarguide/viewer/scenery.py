@@ -16,8 +16,6 @@ from polarguide.fields.trainer import FieldTrainer
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame
-from polarguide.inspection.layers import AOLP_FULL_DOLP, DOLP_HIGH
-from polarguide.optics import aolp, dolp, luminance
 from polarguide.raster.interface import Rasterize
 from polarguide.results.rendering.picking import SurfacePoint, surface_at
 from polarguide.results.rendering.relight import RELIT_RESOLUTION, turned_cubemap
@@ -25,12 +23,18 @@ from polarguide.runs.families import AnyTrainer
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
-from polarguide.shading.result import RenderResult
+from polarguide.shading.result import POLARIZED, RenderResult
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.viewer.cameras import letterbox
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
-from polarguide.visualization.layers import RADIANCE, depth_range, layer_picture
+from polarguide.visualization.layers import (
+    RADIANCE,
+    depth_range,
+    layer_picture,
+    layer_scale,
+    polarization_picture,
+)
 
 FIELD_SHARE = 4
 """A field is shown with so many times fewer pixels each way: it takes seconds for a picture of full size."""
@@ -53,6 +57,9 @@ class Scenery(Protocol):
         turn: Tensor | None = None,
     ) -> RenderResult:
         """All layers, on the CPU: see ``GaussianScenery.render``."""
+
+    def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
+        """The Stokes vectors [3, H, W, 3] that a result predicts; None: none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +115,12 @@ class GaussianScenery:
             footprints=footprints,
         ).to("cpu")
 
+    def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
+        """The Stokes vectors that a result predicts; None without both layers and a normal."""
+        if any(layer is None for layer in (result.specular, result.diffuse, result.normal)):
+            return None
+        return self.shading.predicted_stokes(result, camera)
+
     def _turned(self, turn: Tensor) -> Light:
         cubemap = self.shading.radiance_cubemap
         if cubemap is None:
@@ -144,6 +157,9 @@ class FieldScenery:
             cy=camera.cy * small[1] / camera.height,
         )
         return self.model.render(view, depth=depth, kept=kept).to("cpu").resized(camera.width, camera.height)
+
+    def stokes(self, result: RenderResult, camera: Camera) -> None:
+        """It predicts none."""
 
 
 def run_scenery(run: OpenedRun) -> Scenery:
@@ -186,10 +202,17 @@ def training_scenery(trainer: AnyTrainer) -> Scenery:
     )
 
 
-MEASURED = ("photograph", "DoLP", "AoLP", "error")
+OF_POLARIZATION = {f"{name}, measured": name for name in POLARIZED}
+"""Layers that need pictures which determine the polarization, and what is predicted of the same."""
+BESIDE = {
+    **dict.fromkeys(("final", "base"), "photograph"),
+    **{of: name for name, of in OF_POLARIZATION.items()},
+}
+"""What was measured of a layer, for a wipe between the two."""
+MEASURED = ("photograph", *OF_POLARIZATION, "error")
 """Layers that only a photograph's pose has."""
-POLARIZED = ("DoLP", "AoLP")
-"""Those of them that need pictures which determine the polarization."""
+LEGEND = 0.25, 128, 512
+"""Width of the key to a layer's colors: as a share of the picture, and at least and at most in pixels."""
 
 
 @dataclass(frozen=True)
@@ -197,11 +220,13 @@ class Appearance:
     """A visitor's choices.
 
     Attributes:
-        layer: a name in ``LAYERS`` or ``MEASURED``.
+        layer: a name in ``LAYERS``, ``POLARIZED`` or ``MEASURED``.
         exposure: stops by which radiance is brightened.
-        strength: factor on the specular layer.
+        strength: factor on the specular layer; predicted polarization is that of the layers as they were learned.
         turn: degrees of the far environment, counter-clockwise seen from above.
         crop: what is shown of the scene; None: all.
+        wipe: share of the picture's width, from the left, that shows what was measured (``BESIDE``) in place of the
+            layer, at a photograph's pose.
         white_balance: gains of R, G and B on radiance. up_axis: the axis of turning; None: as the cameras say.
     """
 
@@ -212,6 +237,7 @@ class Appearance:
     crop: Crop | None = None
     white_balance: Vector | None = None
     up_axis: Vector | None = None
+    wipe: float = 0.0
 
 
 class Painter:
@@ -246,17 +272,48 @@ class Painter:
             uint8 [H, W, 3] of the camera's size; None where there is no such layer.
         """
         layer = appearance.layer
-        if layer in MEASURED and (view is None or (layer in POLARIZED and not view.is_determined)):
+        if layer in MEASURED and (view is None or (layer in OF_POLARIZATION and not view.is_determined)):
             return None
-        size = camera.width, camera.height
-        if view is None:
-            result = self._result(scenery, camera, appearance)
-            return self._layer(result, camera, appearance, settled=settled)
-        place = letterbox(view.camera, size)
-        if layer in MEASURED:
-            return place.apply(self._measured(scenery, view, appearance))
-        camera = place.camera(view.camera)
-        return self._layer(self._result(scenery, camera, appearance), camera, appearance, settled=settled)
+        if view is not None and layer in MEASURED:
+            place = letterbox(view.camera, (camera.width, camera.height))
+            return self._with_scale(place.apply(self._measured(scenery, view, appearance)), layer)
+        if view is not None:
+            camera = letterbox(view.camera, (camera.width, camera.height)).camera(view.camera)
+        result = self._result(scenery, camera, appearance)
+        if layer in POLARIZED:
+            result = replace(result, predicted=scenery.stokes(result, camera))
+        picture = self._layer(result, camera, appearance, settled=settled)
+        if picture is None:
+            return None
+        if view is not None and appearance.wipe > 0:
+            picture = self._wiped(picture, scenery, view, appearance)
+        return self._with_scale(picture, layer)
+
+    def _wiped(self, picture: Picture, scenery: Scenery, view: View, appearance: Appearance) -> Picture:
+        """A picture of a layer with what was measured to the left; as it is where nothing of the kind was."""
+        other = BESIDE.get(appearance.layer)
+        if other is None or (other in OF_POLARIZATION and not view.is_determined):
+            return picture
+        place = letterbox(view.camera, (picture.shape[1], picture.shape[0]))
+        measured = place.apply(self._measured(scenery, view, replace(appearance, layer=other)))
+        column = round(min(appearance.wipe, 1.0) * picture.shape[1])
+        wiped = picture.copy()
+        wiped[:, :column] = measured[:, :column]
+        wiped[:, max(0, column - 1) : column + 1] = 255
+        return wiped
+
+    def _with_scale(self, picture: Picture, layer: str) -> Picture:
+        """A picture with the key to the colors of its layer at its lower left, where there is one."""
+        scale = (
+            figures.scale_bar(0.0, figures.LARGE_ERROR, "inferno", middle="difference, sRGB")
+            if layer == "error"
+            else layer_scale(layer, self._depths)
+        )
+        share, least, most = LEGEND
+        width = min(max(round(share * picture.shape[1]), least), most)
+        if scale is None or picture.shape[1] < 2 * least:
+            return picture  # it would hide what it explains
+        return figures.with_key(picture, scale, width)
 
     def point(
         self,
@@ -275,6 +332,7 @@ class Painter:
 
     def _result(self, scenery: Scenery, camera: Camera, appearance: Appearance) -> RenderResult:
         crop, turn = appearance.crop, None
+        strength = 1.0 if appearance.layer in POLARIZED else appearance.strength
         kept = None if crop is None else lambda means: crop.inside(means, self.around)
         if appearance.turn % 360:
             presented = Presentation(up_axis=appearance.up_axis)
@@ -283,9 +341,9 @@ class Painter:
         result = scenery.render(
             camera, depth=appearance.layer == "depth", surface=surface, kept=kept, turn=turn
         )
-        if result.specular is None or result.diffuse is None or appearance.strength == 1.0:
+        if result.specular is None or result.diffuse is None or strength == 1.0:
             return result
-        specular = appearance.strength * result.specular
+        specular = strength * result.specular
         return replace(result, specular=specular, final=result.diffuse + specular)
 
     def _layer(
@@ -309,10 +367,7 @@ class Painter:
         if appearance.layer == "error":
             final = self._result(scenery, view.camera, appearance).final
             return figures.error_to_rgb(final * brighter, view.photograph() * brighter)
-        gray = luminance(view.stokes())
-        if appearance.layer == "DoLP":
-            return figures.dolp_to_rgb(dolp(gray), DOLP_HIGH)
-        return figures.aolp_to_rgb(aolp(gray), dolp(gray) / AOLP_FULL_DOLP)
+        return polarization_picture(OF_POLARIZATION[appearance.layer], view.stokes())
 
 
 def _shown(radiance: Tensor, appearance: Appearance) -> Tensor:

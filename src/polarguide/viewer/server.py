@@ -31,6 +31,7 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.results.rendering.picking import gray_world
 from polarguide.runs.families import AnyTrainer
+from polarguide.runs.model import layers_of
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import Ends, Look
 from polarguide.shading.model import ShadingModel
@@ -97,7 +98,7 @@ class Viewer:
         others = visitors.allow_host or visitors.allow_origin
         self._save = save if host in LOOPBACK and not others else None
         self._options = PanelOptions(
-            shading.layers, turns, tuple(photographs), trains, presentation, self._save is not None
+            layers_of(shading), turns, tuple(photographs), trains, presentation, self._save is not None
         )
         self._gray: Vector | None = None
         self._sessions: dict[int, Session] = {}

@@ -28,6 +28,8 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX
 FONT_SCALE = 0.6
 SMALLEST_FONT_SCALE = 0.35
 LINE_HEIGHT = 28
+READ_AT = 384
+"""Width of a tile up to which type keeps its size; a sheet of larger ones is read from farther away."""
 
 
 def contact_sheet(
@@ -74,17 +76,19 @@ def contact_sheet(
     if not pictures:
         raise ValueError("contact sheet: expected at least one picture, found none")
     width, height = _tile_size(pictures, minimum_width, maximum_width)
-    margin = max((_text_width(label, FONT_SCALE) for label in row_labels), default=0)
+    larger = max(1.0, width / READ_AT)
+    line = round(LINE_HEIGHT * larger)
+    margin = max((_text_width(label, FONT_SCALE * larger) for label in row_labels), default=0)
     left = gutter + (margin + gutter if margin else 0)
-    top = gutter + (LINE_HEIGHT if any(column_labels) else 0)
+    top = gutter + (line if any(column_labels) else 0)
     sheet: Picture = np.full(
         (top + len(rows) * (height + gutter), left + columns * (width + gutter), 3), BACKGROUND, np.uint8
     )
     for j, label in enumerate(column_labels):
-        _write(sheet, label, left + j * (width + gutter), gutter + LINE_HEIGHT // 2, width)
+        _write(sheet, label, left + j * (width + gutter), gutter + line // 2, width, larger)
     for i, (row, label) in enumerate(zip(rows, row_labels, strict=True)):
         y = top + i * (height + gutter)
-        _write(sheet, label, gutter, y + height // 2, margin)
+        _write(sheet, label, gutter, y + height // 2, margin, larger)
         for j, cell in enumerate(row):
             if cell is not None:
                 _place(sheet[y : y + height, left + j * (width + gutter) :][:, :width], cell)
@@ -92,9 +96,9 @@ def contact_sheet(
         sheet = np.concatenate((sheet, _strip(footer, sheet.shape[1], width, left, gutter)))
     if not caption:
         return sheet
-    line: Picture = np.full((LINE_HEIGHT, sheet.shape[1], 3), BACKGROUND, np.uint8)
-    _write(line, caption, gutter, LINE_HEIGHT // 2, sheet.shape[1] - 2 * gutter)
-    return np.concatenate((sheet, line))
+    strip: Picture = np.full((line, sheet.shape[1], 3), BACKGROUND, np.uint8)
+    _write(strip, caption, gutter, line // 2, sheet.shape[1] - 2 * gutter, larger)
+    return np.concatenate((sheet, strip))
 
 
 def _strip(cells: Sequence[Picture | None], across: int, width: int, left: int, gutter: int) -> Picture:
@@ -136,17 +140,21 @@ def _text_width(text: str, scale: float) -> int:
     return cv2.getTextSize(text, FONT, scale, 1)[0][0] if text else 0
 
 
-def _write(sheet: Picture, text: str, x: int, y: int, width: int) -> None:
-    """Draw text centered in ``width`` pixels from ``x``, around the line ``y``; smaller if it has to be."""
+def _write(sheet: Picture, text: str, x: int, y: int, width: int, larger: float) -> None:
+    """Draw text centered in ``width`` pixels from ``x``, around the line ``y``; smaller if it has to be.
+
+    Args:
+        larger: how many times as large as on small tiles.
+    """
     if not text:
         return
     text = text.encode("ascii", "replace").decode()
-    scale = FONT_SCALE
-    while _text_width(text, scale) > width and scale > SMALLEST_FONT_SCALE:
+    scale = FONT_SCALE * larger
+    while _text_width(text, scale) > width and scale > SMALLEST_FONT_SCALE * larger:
         scale -= 0.05
     (drawn, height), _ = cv2.getTextSize(text, FONT, scale, 1)
     origin = (x + max(0, (width - drawn) // 2), y + height // 2)
-    cv2.putText(sheet, text, origin, FONT, scale, INK, 1, cv2.LINE_AA)
+    cv2.putText(sheet, text, origin, FONT, scale, INK, round(larger), cv2.LINE_AA)
 
 
 COLOR_MAPS = {
@@ -263,37 +271,88 @@ def aolp_wheel() -> str:
     return f'<svg class="wheel" viewBox="-4 0 140 70" role="img" aria-label="AoLP by color">{drawing}</svg>'
 
 
-def error_to_rgb(pred_linear: Tensor, true_linear: Tensor, high: float = 0.25) -> Picture:
+LARGE_ERROR = 0.25
+"""Difference of shown pictures that is brightest."""
+
+
+def error_to_rgb(pred_linear: Tensor, true_linear: Tensor, high: float = LARGE_ERROR) -> Picture:
     """Absolute difference of two shown pictures, averaged over channels: black at 0 to bright at ``high``."""
     true = shown(true_linear.detach().cpu())
     return scalar_to_rgb((shown(pred_linear.detach().cpu()) - true).abs().mean(-1), 0.0, high, "inferno")
 
 
-def scale_bar(low: float, high: float, colormap: str, unit: str = "") -> Picture:
-    """The colors of ``scalar_to_rgb`` from ``low`` to ``high``, with both numbers below: uint8 RGB [44, 256, 3]."""
+def scale_bar(low: float, high: float, colormap: str, unit: str = "", *, middle: str = "") -> Picture:
+    """The colors of ``scalar_to_rgb`` from ``low`` to ``high``, with both numbers below: uint8 RGB [44, 256, 3].
+
+    Args:
+        unit: behind the last number. middle: what stands at the middle of the bar.
+    """
     ramp = torch.linspace(low, high, 256).expand(22, -1)
-    return _bar(scalar_to_rgb(ramp, low, high, colormap), f"{low:g}", f"{high:g}{unit and ' '}{unit}")
+    texts = f"{low:g}", middle, f"{high:g}{unit and ' '}{unit}"
+    return _bar(scalar_to_rgb(ramp, low, high, colormap), *texts)
 
 
-def angle_bar() -> Picture:
-    """The colors of ``aolp_to_rgb`` from 0 to 180 degrees, darker downwards as with less DoLP: [44, 256, 3]."""
-    angles = torch.linspace(0.0, math.pi, 256).expand(22, -1)
-    return _bar(aolp_to_rgb(angles, torch.linspace(1.0, 0.0, 22)[:, None].expand(-1, 256)), "0", "180 deg")
+def angle_wheel() -> Picture:
+    """The colors of ``aolp_to_rgb`` by the direction of the field, darker inward as with less DoLP: [110, 256, 3]."""
+    drawn: Picture = np.full((110, 256, 3), BACKGROUND, np.uint8)
+    center_x, center_y, radius = 128, 100, 74
+    y, x = np.mgrid[0:110, 0:256]
+    angle, distance = np.arctan2(center_y - y, x - center_x), np.hypot(center_y - y, x - center_x)
+    inside = (distance <= radius) & (y <= center_y)
+    colors = aolp_to_rgb(torch.from_numpy(angle), torch.from_numpy(distance / radius))
+    drawn[inside] = colors[inside]
+    for degrees in (0, 45, 90, 135, 180):
+        text = f"{degrees}" if degrees else "0 deg"
+        (width, height), _ = cv2.getTextSize(text, FONT, 0.45, 1)
+        cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        left = center_x + (radius + 6) * cosine - width * (1 - cosine) / 2
+        low = center_y - (radius + 6) * sine + (0 if sine > 0.5 else height / 2)
+        cv2.putText(drawn, text, (round(left), round(low)), FONT, 0.45, INK, 1, cv2.LINE_AA)
+    return drawn
+
+
+def normal_ball() -> Picture:
+    """A ball seen from the camera, in the colors of ``normal_to_rgb``: [64, 256, 3]."""
+    drawn: Picture = np.full((64, 256, 3), BACKGROUND, np.uint8)
+    y, x = np.mgrid[0:64, 0:256]
+    right, down = (x - 128) / 30, (y - 32) / 30
+    squared = right**2 + down**2
+    normals = np.stack((right, -down, np.sqrt(np.maximum(1 - squared, 0))), axis=-1)
+    inside = squared <= 1
+    drawn[inside] = _to_uint8(torch.from_numpy((normals + 1) / 2))[inside]
+    return drawn
+
+
+def shares_to_rgb(shares: Tensor) -> Picture:
+    """Red, green and blue [H, W, 3] from 0 to 1 as they are, without a transfer; mid gray where not finite."""
+    return _to_uint8(shares.detach().nan_to_num(0.5, 0.5, 0.5))
+
+
+def with_key(picture: Picture, key: Picture, width: int) -> Picture:
+    """A picture with a key to its colors over its lower left corner, ``width`` pixels wide on a white border."""
+    height = max(1, round(width * key.shape[0] / key.shape[1]))
+    way = cv2.INTER_AREA if width < key.shape[1] else cv2.INTER_LINEAR
+    small = cv2.resize(key, (width, height), interpolation=way)
+    edge = max(2, width // 40)
+    framed = np.pad(small, ((edge, edge), (edge, edge), (0, 0)), constant_values=BACKGROUND)
+    framed = framed[: picture.shape[0], : picture.shape[1]]
+    drawn = picture.copy()
+    drawn[picture.shape[0] - framed.shape[0] :, : framed.shape[1]] = framed
+    return drawn
 
 
 def color_patch(color: int, text: str) -> Picture:
     """A patch of a gray from 0 to 255, and below it what it means: uint8 RGB [44, 256, 3]."""
-    return _bar(np.full((22, 256, 3), color, np.uint8), text, "")
+    return _bar(np.full((22, 256, 3), color, np.uint8), text)
 
 
-def _bar(colors: Picture, left: str, right: str) -> Picture:
-    """Colors [22, 256, 3], and below them what stands at their two ends."""
+def _bar(colors: Picture, left: str, middle: str = "", right: str = "") -> Picture:
+    """Colors [22, 256, 3], and below them what stands at their two ends and between."""
     drawn: Picture = np.full((44, 256, 3), 255, np.uint8)
     drawn[:22] = colors
-    for text, last in ((left, False), (right, True)):
-        (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
-        origin = (256 - width if last else 0, 39)
-        cv2.putText(drawn, text, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (32, 32, 32), 1, cv2.LINE_AA)
+    for text, share in ((left, 0.0), (middle, 0.5), (right, 1.0)):
+        (width, _), _ = cv2.getTextSize(text, FONT, 0.5, 1)
+        cv2.putText(drawn, text, (round((256 - width) * share), 39), FONT, 0.5, INK, 1, cv2.LINE_AA)
     return drawn
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 
+import torch
 from torch import Tensor
 
+from polarguide import optics
 from polarguide.capture import View
 from polarguide.capture.presentation import balanced
 from polarguide.geometry.camera import Camera
-from polarguide.shading.result import RenderResult
+from polarguide.shading.result import POLARIZED, RenderResult
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
 
@@ -17,11 +19,22 @@ RADIANCE = frozenset(("final", "base", "reflection", "specular", "diffuse"))
 """Layers that are linear radiance."""
 
 
+DOLP_HIGH = 0.5
+"""DoLP that is brightest: dielectrics at Brewster's angle have more, most of what is seen has less."""
+AOLP_FULL_DOLP = 0.1
+"""DoLP from which the AoLP is shown at full brightness; below it, noise turns the angle."""
+STOKES_HIGH = 0.5
+"""S1 and S2, as shares of S0, at which the picture of Stokes vectors is fully colored."""
+_SHARES = ("strength", "roughness", "metalness", "alpha")
+Depths = tuple[float, float]
+"""Nearest and farthest depth of a scale of colors."""
+
+
 def layer_picture(
     result: RenderResult,
     name: str,
     camera: Camera,
-    depths: tuple[float, float] | None = None,
+    depths: Depths | None = None,
     *,
     exposed: bool = False,
     gains: Tensor | None = None,
@@ -33,6 +46,8 @@ def layer_picture(
         exposed: show radiance darker where more than 1 % of the pixels would clip.
         gains: [3] of a white balance, of layers of radiance.
     """
+    if name in POLARIZED:
+        return None if result.predicted is None else polarization_picture(name, result.predicted)
     values: Tensor | None = getattr(result, name)
     if values is None:
         return None
@@ -40,18 +55,52 @@ def layer_picture(
         values = balanced(values, gains)
     if exposed:
         values = values * clipping_exposure(values)
-    near, far = depths or (0.0, 1.0)
-    if name == "depth" and depths is None:
-        near, far = depth_range(values, result.alpha > 0.5)
-    draw: dict[str, Callable[[Tensor], Picture]] = {
-        "normal": lambda v: figures.normal_to_rgb(v, camera),
-        "depth": lambda v: figures.scalar_to_rgb(v, near, far),
-        "strength": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
-        "roughness": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
-        "metalness": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
-        "alpha": lambda v: figures.scalar_to_rgb(v, 0.0, 1.0),
-    }
-    return draw.get(name, figures.radiance_to_rgb)(values)
+    if name == "depth":
+        there = result.alpha > 0.5
+        return depth_picture(torch.where(there, values, 0.0), depths or depth_range(values, there))
+    if name == "normal":
+        return figures.normal_to_rgb(values, camera)
+    return figures.scalar_to_rgb(values, 0.0, 1.0) if name in _SHARES else figures.radiance_to_rgb(values)
+
+
+def polarization_picture(name: str, stokes: Tensor) -> Picture:
+    """Stokes vectors [3, H, W, C], predicted or measured, as one of ``POLARIZED``; of their luminance.
+
+    ``stokes``: S1 / S0 in red and S2 / S0 in green, mid gray at 0.
+    """
+    gray = optics.luminance(stokes)
+    degree = optics.dolp(gray)
+    if name == "dolp":
+        return figures.dolp_to_rgb(degree, DOLP_HIGH)
+    if name == "aolp":
+        return figures.aolp_to_rgb(optics.aolp(gray), degree / AOLP_FULL_DOLP)
+    shares = gray[1:] / gray[0].clamp(min=1e-6)
+    red, green = (0.5 + shares / (2 * STOKES_HIGH)).unbind(0)
+    return figures.shares_to_rgb(torch.stack((red, green, torch.full_like(red, 0.5)), dim=-1))
+
+
+def depth_picture(depth: Tensor, depths: Depths) -> Picture:
+    """Depths [H, W] in colors, even steps of which are equal ratios: what is near and what is far has both detail.
+    Black where there is none.
+    """
+    near, far = (math.log(end) for end in depths)
+    logs = torch.where(depth > 0, depth.double().clamp(min=1e-12).log(), math.nan)
+    return figures.scalar_to_rgb(logs, near, far)
+
+
+def layer_scale(name: str, depths: Depths | None = None) -> Picture | None:
+    """What the colors of a layer mean, 256 pixels wide; None of radiance, and of depth without a range."""
+    name = name.partition(",")[0]
+    if name in _SHARES:
+        return figures.scale_bar(0.0, 1.0, "viridis")
+    if name == "depth" and depths is not None:
+        near, far = (float(f"{end:.3g}") for end in depths)
+        return figures.scale_bar(near, far, "viridis", "units", middle=f"{math.sqrt(near * far):.3g}")
+    if name == "dolp":
+        return figures.scale_bar(0.0, DOLP_HIGH, "inferno")
+    if name == "stokes":
+        return figures.color_patch(128, f"0; red S1, green S2, to {STOKES_HIGH:g} S0")
+    return {"aolp": figures.angle_wheel, "normal": figures.normal_ball}.get(name, lambda: None)()
 
 
 def clipping_exposure(values: Tensor) -> float:
@@ -61,25 +110,50 @@ def clipping_exposure(values: Tensor) -> float:
     return min(1.0, 1.0 / limit) if limit > 0 else 1.0
 
 
-def depth_range(depth: Tensor, mask: Tensor) -> tuple[float, float]:
-    """Nearest and farthest depth [H, W] worth a color where ``mask`` [H, W]."""
-    values = depth[mask]
+_SAMPLES = 1_000_000
+"""Depths that are sorted; PyTorch takes no more than 16 millions."""
+
+
+def depth_range(depth: Tensor, mask: Tensor) -> Depths:
+    """Nearest and farthest depth worth a color where ``mask``, of one shape: those of all but 2 % on either side."""
+    values = depth[mask & (depth > 0)]
     if values.numel() == 0:
-        return 0.0, 1.0
-    near, far = float(values.quantile(0.02)), float(values.quantile(0.9))
-    return near, max(far, near + 1e-6)
+        return 1.0, 2.0
+    values = values[:: max(1, values.numel() // _SAMPLES)]
+    near, far = max(float(values.quantile(0.02)), 1e-6), float(values.quantile(0.98))
+    return near, max(far, 1.001 * near)
 
 
-def true_depth_range(view: View) -> tuple[float, float] | None:
-    """The range of the true depths, so that rendered and true pictures share their colors; None if it is unknown."""
-    ground_truth = view.ground_truth
-    if ground_truth is None or ground_truth.depth is None or ground_truth.mask is None:
-        return None
-    return depth_range(ground_truth.depth, ground_truth.mask)
+def true_depths(view: View) -> Tensor | None:
+    """The true depths of a view's surfaces, 0 where there is none; None if they are unknown."""
+    truth = view.ground_truth
+    return None if truth is None or truth.depth is None else truth.depth
 
 
-def ground_truth_pictures(view: View, gains: Tensor | None = None) -> dict[str, Picture]:
-    """The photograph as ``final``, and the ground truth of the other layers, as 8-bit pictures; ``gains`` as above."""
+def reference_pictures(
+    view: View, gains: Tensor | None = None, depths: Depths | None = None
+) -> dict[str, Picture]:
+    """What a view knows of layers, by ``NAME, true`` and ``NAME, measured``: the photograph as ``final``, ground truth,
+    and the polarization that its pictures measure, as 8-bit pictures.
+
+    Args:
+        gains, depths: as for ``layer_picture``.
+    """
+    pictures = {
+        f"{name}, true": picture for name, picture in ground_truth_pictures(view, gains, depths).items()
+    }
+    if view.is_determined:
+        stokes = view.stokes()
+        pictures |= {f"{name}, measured": polarization_picture(name, stokes) for name in POLARIZED}
+    return pictures
+
+
+def ground_truth_pictures(
+    view: View, gains: Tensor | None = None, depths: Depths | None = None
+) -> dict[str, Picture]:
+    """The photograph as ``final``, and the ground truth of the other layers, as 8-bit pictures; of the depth where
+    ``depths`` are given.
+    """
     pictures = {"final": figures.radiance_to_rgb(balanced(view.photograph(), gains))}
     ground_truth = view.ground_truth
     if ground_truth is None:
@@ -89,7 +163,6 @@ def ground_truth_pictures(view: View, gains: Tensor | None = None) -> dict[str, 
     for name, layer in (("specular", ground_truth.specular), ("diffuse", ground_truth.diffuse)):
         if layer is not None:
             pictures[name] = figures.radiance_to_rgb(balanced(layer / 2, gains))
-    depths = true_depth_range(view)
     if ground_truth.depth is not None and depths is not None:
-        pictures["depth"] = figures.scalar_to_rgb(ground_truth.depth, *depths)
+        pictures["depth"] = depth_picture(ground_truth.depth, depths)
     return pictures

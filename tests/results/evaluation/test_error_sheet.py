@@ -81,11 +81,7 @@ def test_a_key_to_its_colors_stands_below_every_column(monkeypatch, tmp_path):
     assert len(keys) == len(COLUMNS)
     assert (keys["photograph"][:22] == error_sheet.NOT_COUNTED).all()
     for name in ("AoLP x DoLP / 0.5", "predicted"):
-        # Full DoLP on top, none at the bottom; 0, 60 and 120 degrees are red, green and blue.
-        top = keys[name][0]
-        assert [int(top[x].argmax()) for x in (0, 85, 170, 255)] == [0, 1, 2, 0]
-        assert top.max() == 255
-        assert not keys[name][21].any()
+        assert np.array_equal(keys[name], figures.angle_wheel())
     for name in ("picture error", "normal error", "specular error", "diffuse error", "S1, S2 error"):
         assert keys[name][0, -1].sum() > 600 > 60 > keys[name][0, 0].sum()
 

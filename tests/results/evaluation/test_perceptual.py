@@ -1,38 +1,29 @@
 """LPIPS with a network of random weights, and FLIP against its formulas."""
 
-import importlib.machinery
 import math
-import sys
+import shutil
 from importlib.util import find_spec
-from types import ModuleType, SimpleNamespace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-import torchmetrics.image.lpip  # noqa: F401  (before the stand-in below can be mistaken for the real torchvision)
+import torchmetrics.functional.image.lpips as reference
 from scipy.ndimage import convolve
 from skimage.color import rgb2lab, rgb2xyz, xyz2lab
 from torch import nn
 
 from polarguide.optics.color import shown
-from polarguide.results.evaluation import perceptual
+from polarguide.results.evaluation import perceptual, vgg
 from polarguide.results.evaluation.perceptual import PIXELS_PER_DEGREE, flip, load_package
-
-
-@pytest.fixture(autouse=True)
-def fresh():
-    perceptual.load_metric.cache_clear()
-    yield
-    perceptual.load_metric.cache_clear()
 
 
 def picture(seed):
     return torch.rand(40, 48, 3, generator=torch.Generator().manual_seed(seed))
 
 
-def vgg16(weights=None):
-    """The layers of VGG-16 up to its last convolution, after Simonyan and Zisserman 2015."""
-    assert weights is not None
+def vgg16():
+    """The layers of VGG-16 up to its last convolution, after Simonyan and Zisserman 2015, of random weights."""
     torch.manual_seed(0)
     layers, channels = [], 3
     for block in ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512)):
@@ -40,67 +31,49 @@ def vgg16(weights=None):
             layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
             channels = width
         layers.append(nn.MaxPool2d(2))
-    return SimpleNamespace(features=nn.Sequential(*layers))
+    return nn.Sequential(*layers)
+
+
+@pytest.fixture(scope="module")
+def network():
+    return vgg16()
 
 
 @pytest.fixture
-def torchvision(monkeypatch, tmp_path):
-    """A stand-in for torchvision whose weights are "there" once their file is; nothing may be downloaded."""
-    package, models = ModuleType("torchvision"), ModuleType("torchvision.models")
-    package.__spec__ = importlib.machinery.ModuleSpec("torchvision", None)
-    models.VGG16_Weights = SimpleNamespace(DEFAULT=SimpleNamespace(url="https://example.org/vgg16-0.pth"))
-    models.vgg16 = vgg16
-    package.models = models
-    monkeypatch.setitem(sys.modules, "torchvision", package)
-    monkeypatch.setitem(sys.modules, "torchvision.models", models)
-    monkeypatch.setattr("torchmetrics.functional.image.lpips._TORCHVISION_AVAILABLE", True)
-    monkeypatch.setattr("torchmetrics.image.lpip._TORCHVISION_AVAILABLE", True)
+def weights(network, monkeypatch, tmp_path):
+    """A folder that is torch's cache; with the network's weights. Nothing may be downloaded."""
+    monkeypatch.delenv(vgg.FOLDER, raising=False)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(torch.hub, "download_url_to_file", None)
-    (tmp_path / "checkpoints").mkdir()
-    return tmp_path / "checkpoints" / "vgg16-0.pth"
+    folder = tmp_path / "checkpoints"
+    folder.mkdir()
+    state = {f"features.{name}": values for name, values in network.state_dict().items()}
+    torch.save(state | {"classifier.0.weight": torch.zeros(2)}, folder / vgg.NETWORK)
+    return folder
 
 
-def test_without_torchvision(monkeypatch):
-    monkeypatch.setattr(perceptual, "find_spec", lambda name: None)
-    assert perceptual.lpips(picture(1), picture(2)) == (
-        None,
-        "torchvision is not installed (the extra lpips has it)",
-    )
+def test_the_same_as_torchmetrics(weights, network, monkeypatch):
+    """Its own network comes from torchvision; here, ours is put in its place."""
+    monkeypatch.setattr(reference, "_get_tv_model_features", lambda *_: network)
+    theirs = reference._LPIPS(net="vgg", pnet_rand=True)
+    for first, second in ((picture(1), picture(2)), (0.9 * picture(3), picture(3))):
+        batches = (shown(each).movedim(-1, 0)[None] for each in (first, second))
+        value, reason = perceptual.lpips(first, second)
+        assert reason is None
+        assert value == pytest.approx(float(theirs(*batches, normalize=True)), rel=1e-5)
 
 
-def test_without_weights_nothing_is_downloaded(torchvision):
-    value, reason = perceptual.lpips(picture(1), picture(2))
-    assert value is None
-    assert "vgg16-0.pth are not in torch's hub cache" in reason
-    assert perceptual.FETCH_COMMAND in reason
-
-
-def test_broken_torchvision(torchvision):
-    del sys.modules["torchvision.models"].VGG16_Weights
-    value, reason = perceptual.lpips(picture(1), picture(2))
-    assert value is None
-    assert reason.startswith("torchvision cannot be imported (ImportError: ")
-
-
-def test_small_picture():
-    value, reason = perceptual.lpips(picture(1)[:20], picture(2)[:20])
-    assert (value, reason) == (None, "the picture is smaller than 32 x 32 pixels")
-
-
-def test_distance(torchvision):
-    torchvision.touch()
+def test_distance(weights):
     true = picture(1)
     near, reason = perceptual.lpips(true * 0.98, true)
     assert reason is None
     far, _ = perceptual.lpips(picture(2), true)
     assert perceptual.lpips(true, true) == (0.0, None)
     assert 0 < near < far
-    assert perceptual.load_metric()[0] is perceptual.load_metric()[0]
+    assert vgg.load_lpips()[0] is vgg.load_lpips()[0]
 
 
-def test_left_out_pixels_have_no_influence(torchvision):
-    torchvision.touch()
+def test_left_out_pixels_have_no_influence(weights):
     pred, true = picture(1), picture(2)
     keep = torch.ones(40, 48, dtype=torch.bool)
     keep[10:30, 10:30] = False
@@ -108,6 +81,38 @@ def test_left_out_pixels_have_no_influence(torchvision):
     pred[~keep] = torch.nan
     assert perceptual.lpips(pred, true, keep) == (value, None)
     assert perceptual.lpips(pred.nan_to_num(), true)[0] != value
+
+
+def test_weights_from_a_folder(weights, monkeypatch, tmp_path):
+    expected = perceptual.lpips(picture(1), picture(2))
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    shutil.move(weights / vgg.NETWORK, folder)
+    monkeypatch.setenv(vgg.FOLDER, str(folder))
+    assert f"{vgg.CHANNELS} are not in {folder} ({vgg.FOLDER}" in perceptual.lpips(picture(1), picture(2))[1]
+    shutil.copy(Path(reference.__file__).parent / "lpips_models" / vgg.CHANNELS, folder)
+    assert perceptual.lpips(picture(1), picture(2)) == expected
+
+
+def test_without_weights_there_is_a_reason_and_nothing_is_downloaded(weights, monkeypatch):
+    file = weights / vgg.NETWORK
+    file.write_bytes(file.read_bytes()[:1000])
+    value, reason = perceptual.lpips(picture(1), picture(2))
+    assert value is None
+    assert reason.startswith(f"{file} and ")
+    file.unlink()
+    value, reason = perceptual.lpips(picture(1), picture(2))
+    assert value is None
+    assert f"{vgg.NETWORK} are not in {weights} (fetch it: {vgg.FETCH_COMMAND})" in reason
+    file.touch()
+    monkeypatch.setattr(vgg, "find_spec", lambda name: None)
+    assert reason != (reason := perceptual.lpips(picture(1), picture(2))[1])
+    assert reason.endswith("(the extra lpips brings it)")
+
+
+def test_small_picture():
+    value, reason = perceptual.lpips(picture(1)[:20], picture(2)[:20])
+    assert (value, reason) == (None, "the picture is smaller than 32 x 32 pixels")
 
 
 needs_flip = pytest.mark.skipif(find_spec("flip_evaluator") is None, reason="flip-evaluator is not installed")

@@ -63,7 +63,7 @@ def test_where_no_pixel_says_anything(made_maps) -> None:
     assert found["saturated"] == found["pixels"]
     assert found["usable_share"] == 0
     empty = [key for key in found if key.startswith(("s0_", "aolp_", "dolp_")) and key != "dolp_threshold"]
-    assert len(empty) == 7 + 8 + 3
+    assert len(empty) == 8 + 9 + 4
     assert all(found[key] is None for key in empty)
     maps.reason[:] = Reason.NOISE
     found = region_figures(maps, REGION, 0.05)

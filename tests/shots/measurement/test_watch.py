@@ -108,18 +108,18 @@ def test_a_whole_file_that_is_no_mosaic_is_not_waited_for(tmp_path: Path, readin
 def test_a_file_that_changes_while_it_is_read_is_measured_once(
     folder: Path, tmp_path: Path, reading: ShotOptions, monkeypatch
 ) -> None:
-    from polarguide.shots.measurement import line
+    from polarguide.shots.measurement import measurer
 
-    read, touched = line.read_shot, []
+    read, touched = measurer.read_shot, []
 
-    def read_and_touch(shot, options):
-        maps = read(shot, options)
+    def read_and_touch(shot, options, part):
+        maps = read(shot, options, part=part)
         if not touched:
             touched.append(shot.name)
             os.utime(shot.paths[0], ns=(1, 1))
         return maps
 
-    monkeypatch.setattr(line, "read_shot", read_and_touch)
+    monkeypatch.setattr(measurer, "read_shot", read_and_touch)
     watch_folder(folder, tmp_path / "out", reading=reading, watching=QUICK)
     assert sorted(names(tmp_path / "out")) == ["v000", "v001", "v002"]
 

@@ -218,9 +218,19 @@ def read_stack(
                 found=str(codes[-1]),
                 remedy="Keep the camera still between the shots of a view, or export them all alike.",
             )
-    stack = np.stack(pictures)
+    return stacked(np.stack(pictures), codes[0], lossy=is_lossy(paths[0]), levels=levels)
+
+
+def stacked(
+    stack: NDArray[Any], orientation: int = 1, *, lossy: bool = False, levels: Levels | None = None
+) -> Shots:
+    """The shots of a view of their stored values [K, H, W, 3].
+
+    Args:
+        orientation: EXIF's. lossy: whether they were compressed. levels: as for ``read_stack``.
+    """
     full = int(np.iinfo(stack.dtype).max)
-    full = round(_LOSSY_FULL * full) if is_lossy(paths[0]) else full
+    full = round(_LOSSY_FULL * full) if lossy else full
     if levels is not None:
         full = min(full, levels.saturation)
     # By the largest of the three colors, written out: NumPy reduces a last axis of three slowly.
@@ -228,7 +238,7 @@ def read_stack(
     clipped, lit = np.asarray(top >= full), np.asarray(top.any(axis=0))
     if levels is not None and levels.white != np.iinfo(stack.dtype).max:
         stack = rescaled(stack, levels.white)
-    return Shots(stack, codes[0], clipped, ~lit)
+    return Shots(stack, orientation, clipped, ~lit)
 
 
 def _read_shot(path: Path, gains: tuple[float, float, float]) -> tuple[NDArray[Any], int]:

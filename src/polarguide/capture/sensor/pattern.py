@@ -13,8 +13,11 @@ from polarguide.core.errors import PolarguideError
 _CELL = np.array([[90, 45], [135, 0]])
 _BAYER = np.array([[0, 1], [1, 2]])  # R G / G B, one entry a polarizer cell
 
-SENSORS = {"IMX250MYR": True, "IMX264MYR": True, "IMX250MZR": False}
+SensorName = Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"]
+SENSORS: dict[str, bool] = {"IMX250MYR": True, "IMX264MYR": True, "IMX250MZR": False}
 """Sony sensors by name, and whether they are color sensors."""
+SENSOR_NAMES = "IMX250MYR and IMX264MYR (color), IMX250MZR (monochrome)"
+"""The same for people."""
 
 SENSOR_SIZE = (2464, 2056)
 """Width and height of all of them, in pixels; cameras give 2448 x 2048."""

@@ -99,15 +99,24 @@ def read_mosaic(path: Path, raw: RawFormat, *, least: int = 1) -> NDArray[Any]:
     """
     packed = path.suffix.lower() == ".raw"
     values = _read_packed(path, read_file(path), raw) if packed else _read_plain(path, raw)
+    require_mosaic(path, values, least=least)
+    return values
+
+
+def require_mosaic(where: Path | str, values: NDArray[Any], *, least: int) -> None:
+    """Refuse values [H, W] that no sensor delivers; ``least``: pixels that the shorter side must have.
+
+    Raises:
+        PolarguideError: they are too few, or four pictures.
+    """
     if min(values.shape) < least:
         raise PolarguideError(
-            path,
+            where,
             expected=f"a mosaic of at least {least}x{least} pixels",
             found=f"{values.shape[1]}x{values.shape[0]}",
             remedy="Give the whole picture of the sensor.",
         )
-    _require_one_picture(path, values)
-    return values
+    _require_one_picture(where, values)
 
 
 def _read_plain(path: Path, raw: RawFormat) -> NDArray[Any]:
@@ -186,7 +195,7 @@ def is_tiled(values: NDArray[Any]) -> bool:
     return min(float(first @ other) for other in others) > _TILED
 
 
-def _require_one_picture(path: Path, values: NDArray[Any]) -> None:
+def _require_one_picture(path: Path | str, values: NDArray[Any]) -> None:
     """Refuse four pictures side by side in place of a mosaic: nothing later would tell.
 
     Raises:

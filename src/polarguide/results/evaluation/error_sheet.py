@@ -95,7 +95,7 @@ class ErrorSheet:
             key: figures.scale_bar(0.0, end, MAP, "deg" if key == "normal" else "")
             for key, end in ends.items()
         }
-        bars |= dict.fromkeys(("measured", "predicted"), figures.angle_bar())
+        bars |= dict.fromkeys(("measured", "predicted"), figures.angle_wheel())
         bars["photograph"] = figures.color_patch(NOT_COUNTED, "gray: not counted")
         sheet = contact_sheet(
             rows,

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import torch
 from torch import Tensor
 
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.optics.color import shown
+from polarguide.results.evaluation.vgg import load_lpips
 
-FETCH_COMMAND = "python -c \"import torchvision; torchvision.models.vgg16(weights='DEFAULT')\""
 # Five halvings: below this the last layer of the network has no pixel.
 MINIMUM_SIZE = 32
 
@@ -32,12 +29,12 @@ def lpips(
 
     Returns:
         (distance, None), the distance 0 for equal pictures and smaller for more alike ones; or (None, reason)
-        where the network is not available or a picture is smaller than 32 pixels.
+        where the weights are not there or a picture is smaller than 32 pixels.
     """
     if min(pred_linear.shape[:2]) < MINIMUM_SIZE:
         return None, f"the picture is smaller than {MINIMUM_SIZE} x {MINIMUM_SIZE} pixels"
-    metric, reason = load_metric()
-    if metric is None:
+    distance, reason = load_lpips()
+    if distance is None:
         return None, reason
     device = pred_linear.device
     true = true_linear.to(device)
@@ -45,30 +42,7 @@ def lpips(
         counts = keep.to(device)[..., None]
         true = torch.where(counts, true, true.nan_to_num())
         pred_linear = torch.where(counts, pred_linear, true)
-    batches = (shown(picture).to(torch.float32).movedim(-1, 0)[None] for picture in (pred_linear, true))
-    with torch.no_grad():
-        distance = float(metric.to(device)(*batches))
-    metric.reset()  # it would keep the score of every picture
-    return distance, None
-
-
-@lru_cache(maxsize=1)
-def load_metric() -> tuple[Any, str | None]:
-    """The LPIPS metric of torchmetrics, loaded once per process: (metric, None), or (None, reason)."""
-    for package in ("torchvision", "torchmetrics"):
-        if find_spec(package) is None:
-            return None, f"{package} is not installed (the extra lpips has it)"
-    try:
-        from torchvision.models import VGG16_Weights
-    except Exception as error:  # a torchvision built for another torch fails on import in many ways
-        return None, f"torchvision cannot be imported ({type(error).__name__}: {error})"
-    name = Path(urlsplit(VGG16_Weights.DEFAULT.url).path).name
-    if not (Path(torch.hub.get_dir()) / "checkpoints" / name).is_file():
-        return None, f"the VGG-16 weights {name} are not in torch's hub cache (fetch them: {FETCH_COMMAND})"
-    # Here, because torchmetrics takes seconds to import and most processes score nothing.
-    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
-
-    return LearnedPerceptualImagePatchSimilarity(net_type="vgg", normalize=True), None
+    return distance.to(device)(shown(pred_linear), shown(true)), None
 
 
 PIXELS_PER_DEGREE = 67.0206

@@ -13,8 +13,9 @@ import msgspec
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import write_text
 from polarguide.core.records import decode, read_record, shortened
+from polarguide.results.evaluation.metric import Metric
 from polarguide.results.evaluation.scores import ViewScores, summarize
-from polarguide.results.evaluation.table import HIGHEST_PSNR, METRICS, RUN_METRICS, VIEW_METRICS, Metric
+from polarguide.results.evaluation.table import HIGHEST_PSNR, METRICS, PLUGGED, RUN_METRICS, VIEW_METRICS
 
 METRICS_FILE = "metrics.json"
 _WRITE_AGAIN = "Score the run again with this version: polarguide eval."
@@ -37,7 +38,12 @@ _Decibels = Annotated[float, msgspec.Meta(le=HIGHEST_PSNR)] | None
 
 def _fields(metrics: tuple[Metric, ...], *reasons: str) -> list[Any]:
     """Fields of a record: the metrics, and reasons of those that may be null for another one than missing truth."""
-    values = [(metric.key, _Decibels if metric.unit == "dB" else float | None) for metric in metrics]
+    values: list[Any] = []
+    for metric in metrics:
+        kind = _Decibels if metric.unit == "dB" else float | None
+        # A record of before its package was installed has no value of a plugged metric.
+        values.append((metric.key, kind, None) if metric in PLUGGED else (metric.key, kind))
+    values.sort(key=len)  # what has a default comes last
     return [*values, *((f"{key}_reason", str | None, None) for key in reasons)]
 
 

@@ -152,8 +152,7 @@ def score_view(
 ) -> ViewScores:
     """Score one rendered view, on the device where it was rendered, which is waited for once.
 
-    (LPIPS, where its network is at hand, waits by itself: torchmetrics checks the pictures' values. FLIP is computed on
-    the CPU.)
+    (LPIPS, where its weights are at hand, waits by itself. FLIP is computed on the CPU.)
 
     Args:
         target: what it is compared with, on the same device.

@@ -1,17 +1,17 @@
 """The one table of metrics: how each is measured on a view, and how scores, console, tables and report show it.
 
-A new metric is a row here, beside the function in ``metrics.py`` that it calls.
+A new metric is a row here, beside the function in ``metrics.py`` that it calls; or comes with an installed package.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
 from torch import Tensor
 
+from polarguide.results.evaluation.metric import Layers, Measure, Metric
 from polarguide.results.evaluation.metrics import (
     beyond_share,
     coverage_error,
@@ -25,61 +25,12 @@ from polarguide.results.evaluation.metrics import (
     ssim,
     stokes_error,
 )
+from polarguide.results.evaluation.plugins import plugged_metrics
 from polarguide.results.evaluation.target import ViewTarget
 
 HIGHEST_PSNR = 100.0
 """What a PSNR above it, and the infinite one of equal pictures, is recorded as: JSON has no infinity."""
 MESH_LABEL = "mesh F-score 1 %"
-
-Layers = Mapping[str, Tensor | None]
-"""Rendered layers of a view by name: ``final``, ``normal``, ``specular``, ``diffuse``, ``depth``, ``alpha``, the
-predicted ``polarization`` and the weight ``in_front`` of the surface; None where there is none."""
-Measure = Callable[[ViewTarget, Layers], Tensor | None]
-"""A metric of one view as a tensor []; None where it is not defined. In place of decibels the mean squared error."""
-
-
-@dataclass(frozen=True)
-class Metric:
-    """One quantity of a run.
-
-    Attributes:
-        key: its name in ``metrics.json``.
-        label: what people read. unit: after the value; empty for none.
-        digits: decimal places in tables.
-        better: which direction is better; None: neither, and nothing is set in bold.
-        of: whether each view has a value, and a run their mean, or only the run.
-        measure: its value on a view; None where it is not a single tensor (LPIPS, FLIP), or not of a view.
-        shown: "tables": console, Markdown, LaTeX and the report have it; "files": only CSV and ``results.json``;
-            "record": only ``metrics.json``.
-        timed: whether it counts only when measured alone; such a value may be absent without a fault.
-        factor: what the value is multiplied by in tables.
-    """
-
-    key: str
-    label: str
-    unit: str
-    digits: int
-    better: Literal["higher", "lower"] | None
-    of: Literal["view", "run"] = "view"
-    measure: Measure | None = None
-    shown: Literal["tables", "files", "record"] = "tables"
-    timed: bool = False
-    factor: float = 1.0
-
-    @property
-    def arrow(self) -> str:
-        """Points to the better side; empty where there is none."""
-        return {"higher": "↑", "lower": "↓", None: ""}[self.better]
-
-    @property
-    def heading(self) -> str:
-        """Label, unit and arrow."""
-        return " ".join(filter(None, (self.label, f"({self.unit})" if self.unit else "", self.arrow)))
-
-    def text(self, value: float) -> str:
-        """A recorded value as the console shows it."""
-        number = f"{value:,}" if isinstance(value, int) else f"{self.factor * value:.3f}"
-        return f"{number} {self.unit}".rstrip()
 
 
 def _compared(compare: Callable[..., Tensor], layer: str, *known: str) -> Measure:
@@ -106,7 +57,7 @@ def _mesh(key: str, label: str, *, shown: Literal["tables", "files"] = "files") 
     return Metric(key, label, "%", 1, "higher", of="run", shown=shown, factor=100.0)
 
 
-METRICS: tuple[Metric, ...] = (
+OURS: tuple[Metric, ...] = (
     Metric(
         "psnr", "PSNR", "dB", 2, "higher", measure=_compared(squared_error, "final", "photograph", "valid")
     ),
@@ -255,6 +206,10 @@ METRICS: tuple[Metric, ...] = (
     Metric("steps", "steps", "", 0, None, of="run", shown="record"),
     Metric("peak_memory_mib", "peak memory", "MiB", 0, "lower", of="run", shown="record"),
 )
+PLUGGED = plugged_metrics({metric.key for metric in OURS})
+"""Metrics of installed packages."""
+METRICS = (*OURS, *PLUGGED)
+"""All of them, in the order in which they are shown."""
 OBJECT_METRICS = ("psnr", "normal_mae_deg", "specular_psnr", "diffuse_psnr", "stokes_error")
 """Keys of the metrics that are recorded by object and by material."""
 VIEW_METRICS = tuple(metric for metric in METRICS if metric.of == "view")

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.memory import require_memory
@@ -18,7 +17,9 @@ from polarguide.core.options import PathLike, check_finite
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.trajectory import interpolated, orbit, read_path
+from polarguide.results.rendering.pictures import rendered_depths
 from polarguide.runs.opened import OpenedRun, checked_layers
+from polarguide.shading.result import POLARIZED
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
 from polarguide.visualization.layers import layer_picture
@@ -167,26 +168,13 @@ def _pictures(
     run: OpenedRun, layers: list[str], cameras: list[Camera], reporter: Reporter
 ) -> Iterator[Picture]:
     """Layers side by side, a picture for each camera."""
-    depths = _depths(run, cameras) if "depth" in layers else None
+    depths = rendered_depths(run, cameras) if "depth" in layers else None
     gains, surface = run.presentation.gains, bool({"normal", "depth"} & {*layers})
+    polarized = not {*layers}.isdisjoint(POLARIZED)
     with reporter.track("rendering", len(cameras)) as advance:
         for number, camera in enumerate(cameras):
-            result = run.model.render(camera, depth="depth" in layers, surface=surface)
+            result = run.result(camera, depth="depth" in layers, surface=surface, polarized=polarized)
             run.chosen_layers(result, layers)
             pictures = [layer_picture(result, name, camera, depths, gains=gains) for name in layers]
             advance(number + 1)
             yield np.concatenate([picture for picture in pictures if picture is not None], axis=1)
-
-
-def _depths(run: OpenedRun, cameras: list[Camera]) -> tuple[float, float]:
-    """One range of depths for the whole path, so that its colors do not flicker: that of a few of its cameras."""
-    values = []
-    for camera in cameras[:: max(1, len(cameras) // 4)]:
-        result = run.model.render(camera, depth=True, surface=True)
-        assert result.depth is not None
-        values.append(result.depth[result.alpha > 0.5])
-    joined = torch.cat(values)[:1_000_000]
-    if not joined.numel():
-        return 0.0, 1.0
-    near, far = float(joined.quantile(0.02)), float(joined.quantile(0.95))
-    return near, max(far, near + 1e-6)

@@ -18,12 +18,22 @@ from polarguide.core.files import atomic, make_folder, require_inside, write_who
 from polarguide.core.options import PathLike, PictureFormat, check_choice
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import to_json
+from polarguide.geometry.camera import Camera
+from polarguide.optics import luminance
 from polarguide.results.rendering.relight import write_exr
 from polarguide.runs.opened import OpenedRun, checked_layers
-from polarguide.shading.result import RenderResult
+from polarguide.shading.result import POLARIZED, RenderResult
 from polarguide.visualization import figures
 from polarguide.visualization.figures import contact_sheet
-from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture, true_depth_range
+from polarguide.visualization.layers import (
+    Depths,
+    Picture,
+    depth_range,
+    layer_picture,
+    layer_scale,
+    reference_pictures,
+    true_depths,
+)
 
 SHEET_VIEWS = 8
 CONTACT_SHEET = "contact_sheet.png"
@@ -37,6 +47,11 @@ UNITS = {
     "normal": "world axes of the scene, x y z; blended, so up to length 1, and 0 where nothing is",
     "depth": "distance along the camera's axis, in the scene's units",
     "alpha": "coverage, 0 to 1",
+    "stokes": "predicted; npy: [3, H, W, 3] S0, S1, S2 of R G B, exr: S0 S1 S2 of their mean as R G B; S0 is twice the "
+    "photograph, lens frame of each pixel",
+    "dolp": "predicted degree of linear polarization of the mean of R G B, 0 to 1",
+    "aolp": "predicted angle of linear polarization, radians from 0 to pi, counter-clockwise from the picture's "
+    "horizontal",
 }
 """What the numbers of each layer mean."""
 
@@ -103,10 +118,11 @@ def write_pictures(
     gains = run.presentation.gains
     polarization = run.polarization
     about = {"Polarization": polarization}
+    depths = common_depths(run, chosen) if "depth" in names else None
+    polarized = not {*names}.isdisjoint(POLARIZED)
     with reporter.track("rendering", len(chosen)) as advance:
         for number, view in enumerate(chosen):
-            result = run.result(view.camera).to("cpu")
-            depths = true_depth_range(view)
+            result = run.result(view.camera, polarized=polarized).to("cpu")
             pictures = {
                 name: layer_picture(
                     result, name, view.camera, depths, exposed=name == "reflection", gains=gains
@@ -128,29 +144,65 @@ def write_pictures(
                 else:
                     _write_numbers(folder / f"{view.name}_{name}.{format}", getattr(result, name))
             if len(rows) < SHEET_VIEWS:
-                truth = ground_truth_pictures(view, gains)
                 cells = {name: picture for name, picture in pictures.items() if picture is not None}
-                rows.append(
-                    (view.name, cells | {f"{name}, true": truth[name] for name in cells if name in truth})
-                )
+                rows.append((view.name, cells | reference_pictures(view, gains, depths)))
             advance(number + 1)
     if format != "png":
         write_whole(
             folder / UNITS_FILE, to_json({name: UNITS[name] for name in names if name not in missing})
         )
     sheet = folder / CONTACT_SHEET
-    figures.write_png(sheet, _sheet(rows, names, f"polarization: {polarization}"), about=about)
+    figures.write_png(sheet, _sheet(rows, names, f"polarization: {polarization}", depths), about=about)
     if missing:
         reporter.say(f"this recipe has no layer {', '.join(sorted(missing))}")
     return sheet
 
 
-def _sheet(views: Sequence[tuple[str, dict[str, Picture]]], names: Sequence[str], caption: str) -> Picture:
-    """A row a view, and beside each layer what is true of it. A column that some view has not is left out."""
-    titles = [column for name in names for column in (name, f"{name}, true")]
+def common_depths(run: OpenedRun, views: Sequence[View]) -> Depths:
+    """One range of depths for some views, so that their colors mean the same: of the true depths where all have them,
+    else of the rendered ones of a few.
+    """
+    true = [true_depths(view) for view in views]
+    known = [depth for depth in true if depth is not None]
+    if len(known) == len(views):
+        joined = torch.cat([depth.flatten() for depth in known])
+        return depth_range(joined, joined > 0)
+    return rendered_depths(run, [view.camera for view in views])
+
+
+def rendered_depths(run: OpenedRun, cameras: Sequence[Camera]) -> Depths:
+    """The range of the rendered depths of a few of some cameras."""
+    values = []
+    for camera in cameras[:: max(1, len(cameras) // 4)]:
+        result = run.result(camera)
+        assert result.depth is not None
+        values.append(result.depth[result.alpha > 0.5].flatten().cpu())
+    joined = torch.cat(values)
+    return depth_range(joined, joined > 0)
+
+
+def _sheet(
+    views: Sequence[tuple[str, dict[str, Picture]]], names: Sequence[str], caption: str, depths: Depths | None
+) -> Picture:
+    """A row a view; beside each layer what is true of it or measured; below, what its colors mean.
+
+    Left out are columns that some view has not, and layers of one color in all views, such as metalness where there is
+    no metal: the caption names these.
+    """
+    titles = [column for name in names for column in (name, f"{name}, true", f"{name}, measured")]
     columns = [column for column in titles if all(column in cells for _, cells in views)]
+    even = [column for column in columns if all(_is_even(cells[column]) for _, cells in views)]
+    columns = [column for column in columns if column not in even] or columns
+    if even and columns != even:
+        caption = f"{caption}; left out, the same everywhere: {', '.join(even)}"
     rows = [[cells[column] for column in columns] for _, cells in views]
-    return contact_sheet(rows, [name for name, _ in views], columns, caption=caption)
+    scales = [layer_scale(column, depths) for column in columns]
+    return contact_sheet(rows, [name for name, _ in views], columns, footer=scales, caption=caption)
+
+
+def _is_even(picture: Picture) -> bool:
+    """Whether all pixels are one color, but for rounding."""
+    return int(np.ptp(picture.reshape(-1, 3), axis=0).max()) <= 1
 
 
 def _unblended(result: RenderResult) -> RenderResult:
@@ -161,9 +213,10 @@ def _unblended(result: RenderResult) -> RenderResult:
 
 
 def _write_numbers(path: Path, values: Tensor) -> None:
-    """Linear numbers of a layer, [H, W] or [H, W, 3], float32."""
+    """Linear numbers of a layer, [H, W], [H, W, 3] or of Stokes vectors [3, H, W, 3], float32."""
     numbers = values.detach().cpu().float().contiguous()
     if path.suffix == ".exr":
+        numbers = numbers if numbers.ndim < 4 else luminance(numbers).movedim(0, -1).contiguous()
         write_exr(path, numbers if numbers.ndim == 3 else numbers[..., None].expand(-1, -1, 3))
         return
     with atomic(path) as temporary, open(temporary, "wb") as file:

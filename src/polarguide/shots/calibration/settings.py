@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from polarguide.capture.calibration import Sense
-from polarguide.capture.sensor.pattern import Packing, sensor_pattern
+from polarguide.capture.sensor.pattern import Packing, SensorName, sensor_pattern
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options
 from polarguide.core.text import decimal
@@ -30,7 +30,7 @@ class CalibrateSettings:
     """How the shots of a polarizer were taken, and what is estimated from them.
 
     Attributes:
-        sensor: Sensor of the mosaics: MYR are color, MZR is monochrome.
+        sensor: Sensor of the mosaics: IMX250MYR and IMX264MYR are color, IMX250MZR is monochrome.
         lens: Name of the lens, for the file; its own polarization is part of what is calibrated.
         angles: Angles of the polarizer in degrees, in the order of the files' names, such as 0,15,30; names if the
             files' names end in them, after _ or a space; without it they are estimated.
@@ -52,7 +52,7 @@ class CalibrateSettings:
             of 32, or single pixels where these differ by more than their noise.
     """
 
-    sensor: Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"]
+    sensor: SensorName
     lens: Annotated[str, Meta(max_length=200)] = ""
     angles: str | None = None
     sense: Sense = "ccw"

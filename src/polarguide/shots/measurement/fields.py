@@ -12,7 +12,7 @@ import msgspec
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import read_record
 
-FORMAT = 1
+FORMAT = 2
 """Version of the table. It grows whenever a field changes its name, place or meaning, or is added."""
 PERCENTILES = (1, 5, 50, 95, 99)
 DIFFERENCE_PERCENTILE = 99
@@ -39,6 +39,7 @@ class Field:
 def _spread(key: str, unit: str, what: str) -> tuple[Field, ...]:
     return (
         Field(f"{key}_mean", unit, f"mean of {what}"),
+        Field(f"{key}_error", unit, f"standard error of {key}_mean by the sensor's noise"),
         Field(f"{key}_deviation", unit, f"standard deviation of {what}"),
         *(Field(f"{key}_p{p}", unit, f"{p}th percentile of {what}") for p in PERCENTILES),
     )
@@ -59,7 +60,7 @@ def _difference(key: str, unit: str, what: str, mean: str, more: str = "") -> tu
 FIELDS = (
     Field("shot", "", "name of the shot", False),
     Field("files", "", "paths of its files, separated by semicolons", False),
-    Field("taken", "", "when the last of its files was written, UTC", False),
+    Field("taken", "", "when the last of its files was written, UTC; empty of a shot without files", False),
     Field("region", "", "name of the region; empty where the shot could not be read", False),
     Field("x", "pixels", "left column of the region", False),
     Field("y", "pixels", "top row of the region", False),
@@ -79,6 +80,7 @@ FIELDS = (
     Field("dolp_threshold", "", "the option --threshold", False),
     Field("dolp_share", "", "share of the same pixels whose debiased DoLP is over the threshold"),
     Field("aolp_mean", "degrees", "circular mean of the AoLP over usable pixels, 0 to 180"),
+    Field("aolp_error", "degrees", "standard error of aolp_mean by the sensor's noise"),
     Field("aolp_deviation", "degrees", "circular standard deviation of the AoLP over usable pixels"),
     Field(
         "aolp_concentration", "", "mean resultant length of the doubled angles: 1 all alike, 0 no direction"

@@ -4,36 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import msgspec
-
+from polarguide.capture.exposures import Angle
+from polarguide.capture.given_arrays import Array
+from polarguide.capture.view import ANGLES
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, require_inside
 from polarguide.core.options import PathLike
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.shots.develop import check_files
 from polarguide.shots.exposures import ExposureSet, find_shots, require_elsewhere
-from polarguide.shots.maps import ShotMaps
-from polarguide.shots.measurement.fields import FORMAT, NO_LIMITS, Value, faults, read_limits
+from polarguide.shots.given import NAME, array_shot, is_array, stacked_array
+from polarguide.shots.measurement.fields import KEYS, Value
+from polarguide.shots.measurement.measurer import Measured, Measurer, unread_entry
 from polarguide.shots.measurement.options import MeasureOptions
 from polarguide.shots.measurement.pictures import difference_picture, regions_picture
-from polarguide.shots.measurement.regions import (
-    WHOLE,
-    Differences,
-    Reference,
-    Region,
-    difference_figures,
-    parse_regions,
-    placed,
-    region_figures,
-)
 from polarguide.shots.measurement.table import Entry, FileStamp, Status, Table, stamps
 from polarguide.shots.options import ShotOptions
-from polarguide.shots.read import UNREADABLE, fault_of, read_shot
+from polarguide.shots.read import UNREADABLE
 from polarguide.visualization.figures import write_png
 
 BEYOND, DIFFERENCES = "beyond", "differences"
@@ -50,19 +41,26 @@ class Outcome:
     """What a command has done.
 
     Attributes:
-        folder: of the table.
+        folder: of the table; None where nothing was written.
         counts: shots by status. Of ``measure_shots`` these are all it was given, those included that were in the table
             before; of ``watch_folder`` those that came while it watched.
         earlier: how many were in the table before; 0 of ``watch_folder``.
         waiting: shots of a watched folder that were not complete when it stopped.
         trouble: why no shot was found in a watched folder in the end, though it is not empty; else "".
+        entries: lines of the table, where nothing was written.
     """
 
-    folder: Path
+    folder: Path | None
     counts: Counter[str]
     earlier: int = 0
     waiting: tuple[str, ...] = ()
     trouble: str = ""
+    entries: tuple[Entry, ...] = ()
+
+    @property
+    def rows(self) -> list[dict[str, Value]]:
+        """The ``entries`` as records, one a region, with the fields of the table; ``pandas.DataFrame`` takes them."""
+        return [dict(zip(KEYS, row, strict=True)) for entry in self.entries for row in entry.rows()]
 
     @property
     def exit_status(self) -> int:
@@ -77,7 +75,7 @@ class ChangedWhileRead(PolarguideError):
 
 
 class Line:
-    """Everything that stays the same from shot to shot. Use it as a context: it holds the table open."""
+    """A ``Measurer`` and the table that it writes into. Use it as a context: it holds the table open."""
 
     def __init__(self, out: Path, options: MeasureOptions, reading: ShotOptions) -> None:
         """Check the options, read limits and reference, open the table.
@@ -85,21 +83,10 @@ class Line:
         Raises:
             PolarguideError: one of them is wrong.
         """
-        self._reading = reading.checked()
-        check_files(self._reading)
-        self._options = options
-        self._regions = parse_regions(options.roi)
-        names = [region.name for region in self._regions] or [WHOLE]
-        self._limits = NO_LIMITS
-        if options.limits is not None:
-            self._limits = read_limits(options.limits, names, reference=options.reference is not None)
-        self._reference = None
-        if options.reference is not None:
-            self._reference = Reference.read(options.reference, self._reading)
-            placed(self._regions, self._reference.size, options.reference)
+        self.measurer = Measurer(options, reading)
         self.out = out
         require_inside(out, out / BEYOND, out / DIFFERENCES)
-        self.table = Table(out, self._settings(), overwrite=options.overwrite)
+        self.table = Table(out, self.measurer.settings(), overwrite=options.overwrite)
 
     def __enter__(self) -> Line:
         return self
@@ -110,7 +97,7 @@ class Line:
     @property
     def reference_files(self) -> tuple[Path, ...]:
         """Files that are compared with, and not measured where they lie in a watched folder."""
-        return () if self._reference is None else self._reference.shot.paths
+        return self.measurer.reference_files
 
     def measure(self, shot: ExposureSet, files: tuple[FileStamp, ...]) -> Entry:
         """Measure a shot, draw what is to be drawn, and write its line.
@@ -122,134 +109,154 @@ class Line:
             ChangedWhileRead: they have become others meanwhile; nothing was written.
             PolarguideError, OSError, MemoryError: it cannot be read, or does not fit the regions or the reference.
         """
-        maps = read_shot(shot, self._reading)
+        maps = self.measurer.read(shot)
         if stamps(shot.paths) != files:
             raise ChangedWhileRead(
-                shot.paths[0],
+                shot.where,
                 expected="a file that stays as it is",
                 found="that it was written to meanwhile",
                 remedy="Repeat the command when it is complete; --watch waits for that.",
             )
-        regions = placed(self._regions, maps.size, shot.paths[0])
-        differences = None if self._reference is None else self._reference.differences(maps)
-        found = [self._region(maps, region, differences) for region in regions]
-        statuses = [str(figures["status"]) for _, figures, _ in found]
-        status: Status = (
-            "beyond" if "beyond" in statuses else "within" if "within" in statuses else "measured"
-        )
-        beyond = [(region, which) for region, _, which in found] if status == "beyond" else []
-        picture = self._draw(maps, differences, beyond)
-        measured = tuple(figures for _, figures, _ in found)
-        entry = Entry(FORMAT, shot.name, files, status, "", maps.notes, measured, picture)
+        measured = self.measurer.measured(shot, maps)
+        entry = measured.entry(files, self._draw(shot, measured))
         self.table.add(entry)
         return entry
 
     def unread(self, shot: ExposureSet, files: tuple[FileStamp, ...], error: BaseException) -> Entry:
         """Write the line of a shot that cannot be measured."""
-        entry = Entry(FORMAT, shot.name, files, "unread", str(fault_of(shot, error)), (), ())
+        entry = unread_entry(shot, files, error)
         self.table.add(entry)
         return entry
 
-    def _region(
-        self, maps: ShotMaps, region: Region, differences: Differences | None
-    ) -> tuple[Region, dict[str, Value], list[str]]:
-        figures = {
-            **region_figures(maps, region, self._options.threshold),
-            **difference_figures(differences, region),
-        }
-        bounds = self._limits.of(region.name)
-        beyond = faults(figures, bounds)
-        status = "beyond" if beyond else "within" if bounds else "measured"
-        head: dict[str, Value] = {
-            "region": region.name,
-            "x": region.x,
-            "y": region.y,
-            "width": region.width,
-            "height": region.height,
-            "status": status,
-            "why": ", ".join(beyond),
-        }
-        return region, {**head, **figures}, beyond
-
-    def _draw(
-        self,
-        maps: ShotMaps,
-        differences: Differences | None,
-        beyond: Sequence[tuple[Region, Sequence[str]]],
-    ) -> str:
+    def _draw(self, shot: ExposureSet, measured: Measured) -> str:
         """Write pictures before the line of the table: where that is, they are. Their name, "" if there are none."""
-        if not beyond and differences is None:
+        maps, differences = measured.maps, measured.differences
+        if not measured.beyond and differences is None:
             return ""
         name = self.table.picture_name(maps.name)
-        if beyond:
+        if measured.beyond:
+            maps = maps if maps.whole is None else self.measurer.read(shot, whole=True)
             make_folder(self.out / BEYOND)
-            write_png(self.out / BEYOND / f"{name}.png", regions_picture(maps, beyond))
-        if differences is not None and self._reference is not None:
+            write_png(self.out / BEYOND / f"{name}.png", regions_picture(maps, measured.beyond))
+        if differences is not None:
             make_folder(self.out / DIFFERENCES)
-            picture = difference_picture(differences, maps.name, self._reference.name)
+            picture = difference_picture(differences, maps.name, self.measurer.reference_name)
             write_png(self.out / DIFFERENCES / f"{name}.png", picture)
         return name
 
-    def _settings(self) -> dict[str, Any]:
-        """What the figures depend on, as JSON."""
-        reading = {f.name: getattr(self._reading, f.name) for f in dataclasses.fields(self._reading)}
-        named = [value for value in reading.values() if isinstance(value, Path)]
-        made: dict[str, Any] = msgspec.to_builtins(
-            {
-                "reading": reading,
-                "read_files": stamps(tuple(named)),
-                "regions": self._regions,
-                "threshold": self._options.threshold,
-                "limits": self._limits,
-                "reference": stamps(self.reference_files),
-            },
-            enc_hook=str,
-        )
-        return made
+
+Source = PathLike | ExposureSet | Array | Sequence[Array]
+"""What a shot is measured of: files or folders, or the array of one shot as ``read_shot`` takes it."""
 
 
 def measure_shots(
-    paths: Sequence[PathLike],
-    out: PathLike,
+    paths: Iterable[Source] | Mapping[str, Array],
+    out: PathLike | None = None,
     options: MeasureOptions = MeasureOptions(),
     reading: ShotOptions = ShotOptions(),
     *,
+    angles: Sequence[Angle] = ANGLES,
     heard: Heard = ignore,
     reporter: Reporter = SILENT,
 ) -> Outcome:
-    """Measure shots into the table of a folder; those that are in it already are not measured again.
+    """Measure shots: into the table of a folder, where those that are in it already are not measured again, or without
+    any file.
 
     Args:
-        paths: files and folders, as ``shots.exposures.find_shots`` takes them.
-        out: folder of ``table.csv``, ``table.jsonl`` and pictures.
-        options: what is measured. reading: how shots are read.
-        heard: is called with each shot when its line is on disk.
+        paths: files and folders, as ``shots.exposures.find_shots`` takes them; or shots in memory, one array each, as
+            ``read_shot`` takes them, called array-1, array-2, ... or by their names in a mapping. An iterator of arrays
+            is measured as it delivers them.
+        out: folder of ``table.csv``, ``table.jsonl`` and pictures; None: nothing is written.
+        options: what is measured. reading: how shots are read. angles: of arrays that are pictures through a filter.
+        heard: is called with each shot when its line is on disk, or without a folder when it is measured.
         reporter: takes progress.
 
+    Returns:
+        What was done; without a folder, its ``entries`` are the lines of the table, and ``rows`` the same as records.
+
+    Example:
+        >>> regions = polarguide.MeasureOptions(roi=("pin=120,80,40,40",))              # doctest: +SKIP
+        >>> sensor = polarguide.ShotOptions(sensor="IMX250MZR")                         # doctest: +SKIP
+        >>> polarguide.measure([frame], options=regions, reading=sensor).rows[0]["dolp_mean"]   # doctest: +SKIP
+        0.213
+
     Raises:
-        PolarguideError: there is no shot, an option is wrong, or the table cannot be written. A shot that cannot be
-            read raises nothing: its line says why.
+        PolarguideError: there is no shot, an option is wrong, an array is none of a shot, or the table cannot be
+            written. A shot that cannot be read raises nothing: its line says why.
     """
-    require_elsewhere(paths, Path(out))
-    shots = find_shots(paths, reading)
+    shots, total = _shots_of(paths, out, reading, angles)
     counts: Counter[str] = Counter()
+    entries: list[Entry] = []
     earlier = 0
-    with Line(Path(out), options, reading) as line, reporter.track("measure", len(shots)) as advance:
+    with contextlib.ExitStack() as stack:
+        line = stack.enter_context(Line(Path(out), options, reading)) if out is not None else None
+        measurer = line.measurer if line is not None else Measurer(options, reading)
+        advance = stack.enter_context(reporter.track("measure", total))
         for number, shot in enumerate(shots, 1):
-            files: tuple[FileStamp, ...] = ()
-            with contextlib.suppress(OSError):
-                files = stamps(shot.paths)
-            status = line.table.status_of(files) if files else None
-            if status is not None:
-                earlier += 1
-            else:
-                try:
-                    entry = line.measure(shot, files)
-                except UNREADABLE as error:
-                    entry = line.unread(shot, files, error)
-                status = entry.status
+            if line is None:
+                entry = measurer.entry(shot)
+                entries.append(entry)
+                status: Status = entry.status
                 heard(entry)
+            else:
+                known, status = _measured_into(line, shot, heard)
+                earlier += known
             counts[status] += 1
             advance(number)
-        line.table.require_there()
-    return Outcome(Path(out), counts, earlier)
+        if line is not None:
+            line.table.require_there()
+    return Outcome(None if out is None else Path(out), counts, earlier, entries=tuple(entries))
+
+
+def _measured_into(line: Line, shot: ExposureSet, heard: Heard) -> tuple[bool, Status]:
+    """Measure a shot into a table that does not have it; whether it had, and the status."""
+    files: tuple[FileStamp, ...] = ()
+    with contextlib.suppress(OSError):
+        files = stamps(shot.paths)
+    status = line.table.status_of(files) if files else None
+    if status is not None:
+        return True, status
+    try:
+        entry = line.measure(shot, files)
+    except UNREADABLE as error:
+        entry = line.unread(shot, files, error)
+    heard(entry)
+    return False, entry.status
+
+
+def _shots_of(
+    paths: Iterable[Source] | Mapping[str, Array],
+    out: PathLike | None,
+    reading: ShotOptions,
+    angles: Sequence[Angle],
+) -> tuple[Iterable[ExposureSet], int | None]:
+    """The shots, and how many there are where that is known."""
+    if isinstance(paths, Mapping):
+        return [array_shot(stacked_array(a, name), reading, angles, name) for name, a in paths.items()], len(
+            paths
+        )
+    if is_array(paths) and not isinstance(paths, list | tuple):
+        remedy = "Put it into a list: measure([array])."
+        raise PolarguideError("paths", expected="several shots", found="one array", remedy=remedy)
+    if not isinstance(paths, Sequence):
+        return (_given(shot, number, reading, angles) for number, shot in enumerate(paths, 1)), None
+    if paths and all(isinstance(shot, ExposureSet) or is_array(shot) for shot in paths):
+        return [_given(shot, number, reading, angles) for number, shot in enumerate(paths, 1)], len(paths)
+    files = [path for path in paths if isinstance(path, str | os.PathLike)]
+    if len(files) < len(paths):
+        remedy = "Measure files and arrays by calls of their own."
+        raise PolarguideError("paths", expected="files, or arrays", found="both, or neither", remedy=remedy)
+    if out is not None:
+        require_elsewhere(files, Path(out))
+    found = find_shots(files, reading)
+    return found, len(found)
+
+
+def _given(shot: Source, number: int, reading: ShotOptions, angles: Sequence[Angle]) -> ExposureSet:
+    if isinstance(shot, ExposureSet):
+        return shot
+    name = f"{NAME}-{number}"
+    if not is_array(shot):
+        remedy = "An iterator delivers arrays; give paths as a list."
+        raise PolarguideError(name, expected="an array", found=type(shot).__name__, remedy=remedy)
+    return array_shot(stacked_array(shot, name), reading, angles, name)

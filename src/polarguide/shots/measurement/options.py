@@ -16,8 +16,8 @@ class MeasureOptions:
     """What is measured, and what it has to be.
 
     Attributes:
-        roi: Region x,y,width,height in pixels of the maps, or name=x,y,width,height; repeat it for several. Without
-            any, the whole picture is one.
+        roi: Region x,y,width,height in pixels of the maps, or the corners of a polygon, x,y;x,y;x,y (in quotes), each
+            also as name=...; repeat it for several. Without any, the whole picture is one.
         limits: JSON file with a bound per field; shots beyond make the exit status 3 and are drawn.
         reference: A golden part from the same camera at the same place: difference maps and their figures.
         threshold: DoLP over which pixels count in dolp_share.

@@ -33,19 +33,16 @@ def regions_picture(maps: ShotMaps, found: Sequence[tuple[Region, Sequence[str]]
     photograph, scale = _photograph(maps)
     thick = max(1, round(photograph.shape[1] / 500))
     for region, beyond in sorted(found, key=lambda pair: bool(pair[1])):
-        corners = [
-            (round(scale * x), round(scale * y))
-            for x, y in (
-                (region.x, region.y),
-                (region.x + region.width, region.y + region.height),
-            )
-        ]
-        (x0, y0), (x1, y1) = corners
-        color = _BEYOND if beyond else _WITHIN
-        cv2.rectangle(
-            photograph, (x0, y0), (max(x0, x1 - 1), max(y0, y1 - 1)), color, 2 * thick if beyond else thick
-        )
-        _name(photograph, region.name, x0, y0, color)
+        color, width = _BEYOND if beyond else _WITHIN, 2 * thick if beyond else thick
+        right, low = region.width, region.height
+        corners = region.corners or ((0, 0), (right, 0), (right, low), (0, low))
+        places = np.rint(scale * (np.array(corners) + (region.x, region.y))).astype(np.int32)
+        # What lies beyond the last pixel is drawn on it.
+        ends = np.rint(scale * np.array((region.x + right, region.y + low))).astype(np.int32) - 1
+        places = np.maximum(np.minimum(places, ends), places.min(axis=0))
+        cv2.polylines(photograph, [places], True, color, width)
+        left, top = places.min(axis=0).tolist()
+        _name(photograph, region.name, left, top, color)
     lines = [
         (f"{maps.name}: photograph (S0 / 2), red: beyond a limit", INK),
         *((f"{region.name}: {', '.join(beyond)}", (176, 0, 0)) for region, beyond in found if beyond),

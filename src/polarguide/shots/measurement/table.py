@@ -88,8 +88,10 @@ class Entry(msgspec.Struct, frozen=True):
 
     def rows(self) -> Iterator[list[Value]]:
         """The lines of the CSV table."""
-        newest = max((file.modified for file in self.files), default=0) / 1e9
-        taken = datetime.fromtimestamp(newest, timezone.utc).isoformat(timespec="milliseconds")
+        taken = ""
+        if self.files:
+            newest = max(file.modified for file in self.files) / 1e9
+            taken = datetime.fromtimestamp(newest, timezone.utc).isoformat(timespec="milliseconds")
         shared: dict[str, Value] = {
             "shot": self.shot,
             "files": ";".join(file.path for file in self.files),

@@ -1,0 +1,304 @@
+"""The scene: posed views, sparse points and their origin; read from a folder, or made of arrays."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from polarguide.capture.exposures import Angle
+from polarguide.capture.formats.pictures import TRANSFERS
+from polarguide.capture.given_arrays import (
+    Array,
+    as_numpy,
+    by_name,
+    exposures_of,
+    in_order,
+    kind_of,
+    stored_pictures,
+)
+from polarguide.capture.ground_truth import SceneObject
+from polarguide.capture.split import chosen_views
+from polarguide.capture.stored import StoredViews
+from polarguide.capture.thumbnails import figure, table
+from polarguide.capture.view import ANGLES, View, listed, unknown_view
+from polarguide.capture.view_reader import ViewData, require_factor, view_data
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import Split, check_choice, check_count
+from polarguide.geometry.camera import Camera
+from polarguide.optics import Mount
+
+IN_MEMORY = Path("(arrays)")
+"""The folder of a scene that was made of arrays: there is no such folder."""
+_PICTURED = 6
+"""Views that a notebook shows of a scene."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A capture: posed views, sparse points and their origin.
+
+    Attributes:
+        root: the folder that was read; ``IN_MEMORY`` of ``from_arrays``.
+        name: its name.
+        views: all views, sorted by name.
+        test_names: names of the views held out for evaluation, sorted.
+        points: sparse points in the world, [M, 3] float32.
+        point_colors: their colors as the COLMAP model gives them (display-encoded), [M, 3] uint8.
+        refractive_index: the one index that ``scene.json`` gives, or None if it gives none or several.
+        downscale: side of the pixel boxes that were averaged; 1 is full size.
+        transfer: the assumed encoding of the files, "linear" or "srgb". The views are always linear.
+        digest: SHA-256 over the names and contents of all files that were read, as hexadecimal digits.
+        warnings: about possible faults that do not prevent the use of the scene.
+        objects: the objects that ``scene.json`` lists, if the ground truth of some view tells objects apart.
+        indices: refractive indices of the dielectrics that ``materials/`` names by numbers from 3 on.
+    """
+
+    root: Path
+    name: str
+    views: tuple[View, ...]
+    test_names: tuple[str, ...]
+    points: Tensor
+    point_colors: Tensor
+    refractive_index: float | None
+    downscale: int
+    transfer: str
+    digest: str
+    warnings: tuple[str, ...]
+    objects: tuple[SceneObject, ...] = ()
+    indices: Mapping[int, float] = field(default_factory=dict)
+
+    @property
+    def train_views(self) -> tuple[View, ...]:
+        """The training views, sorted by name."""
+        return tuple(view for view in self.views if view.name not in self.test_names)
+
+    @property
+    def test_views(self) -> tuple[View, ...]:
+        """The views held out for evaluation, sorted by name."""
+        return tuple(view for view in self.views if view.name in self.test_names)
+
+    def view(self, name: str) -> View:
+        """The view called ``name``.
+
+        Raises:
+            PolarguideError: there is none; the message lists the names nearest to it.
+        """
+        for view in self.views:
+            if view.name == name:
+                return view
+        raise unknown_view(self.root, name, [view.name for view in self.views])
+
+    @staticmethod
+    def from_arrays(
+        pictures: Mapping[str, Array] | Sequence[Array] | Array,
+        cameras: Mapping[str, Camera] | Sequence[Camera],
+        angles: Sequence[Angle] | Mapping[str, Sequence[Angle]] = ANGLES,
+        *,
+        points: ArrayLike | Tensor,
+        point_colors: ArrayLike | Tensor | None = None,
+        masks: Mapping[str, Array] | Sequence[Array] | Array | None = None,
+        invalid: Mapping[str, Array] | Sequence[Array] | Array | None = None,
+        test_views: Sequence[str] | None = None,
+        split: Split = "directions",
+        mount: Mount = "sensor",
+        transfer: str = "linear",
+        downscale: int = 1,
+        refractive_index: float | None = None,
+        name: str = "arrays",
+    ) -> Scene:
+        """A scene of arrays, in memory: it is trained to the same bits as the same pictures in a folder.
+
+        Args:
+            pictures: of each view, [K, H, W, 3] RGB or [K, H, W] gray: uint8 or uint16 as a camera stores them, or
+                linear floats from 0 to 1, where 1 is full scale. By name, or in an order (then called v000, v001,
+                ...); views may differ in size.
+            cameras: of each view, at the size of its pictures; ``Camera.from_matrices`` makes one of matrices.
+            angles: of the K pictures: degrees counter-clockwise as displayed, ``unknown`` or ``none`` (no filter); of
+                all views, or by name.
+            points: [M, 3] sparse points of the surfaces in the world, such as those of structure from motion.
+            point_colors: [M, 3] uint8, as displayed; None: gray.
+            masks: of the foreground, [H, W] bool a view. invalid: pixels without use, [H, W] bool a view.
+            test_views: names of the views to score on; None: as ``split`` chooses them.
+            split, transfer, downscale: as ``load_scene`` takes them. mount: where the polarizer was.
+            refractive_index: of the surfaces, None if it is not known. name: of the scene.
+
+        Example:
+            >>> scene = polarguide.Scene.from_arrays(stack, cameras, points=points)    # doctest: +SKIP
+            >>> polarguide.train(scene, "runs/mine")                                    # doctest: +SKIP
+
+        Raises:
+            PolarguideError: an array has another shape or type, or they do not fit each other.
+        """
+        check_count("downscale", downscale)
+        check_choice("transfer", transfer, TRANSFERS)
+        check_choice("split", split, get_args(Split))
+        check_choice("mount", mount, get_args(Mount))
+        given = by_name(pictures, "pictures")
+        names = list(given)
+        posed, told = by_name(cameras, "cameras", names), _angles_by_name(angles, names)
+        beside = {
+            what: {} if arrays is None else by_name(arrays, what, names)
+            for what, arrays in (("masks", masks), ("invalid", invalid))
+        }
+        data = [
+            _view_of(each, given[each], posed[each], told[each], beside, transfer, downscale)
+            for each in sorted(names)
+        ]
+        ready = {each: posed[each] if downscale == 1 else posed[each].downscaled(downscale) for each in names}
+        stored = StoredViews.of(data, [ready[item.name] for item in data])
+        places = _rows(points, "points", np.float32)
+        colors = np.full(places.shape, 128, np.uint8) if point_colors is None else point_colors
+        shades = _rows(colors, "point_colors", np.uint8)
+        if len(shades) != len(places):
+            raise _unlike("point_colors", f"{len(places)} rows, one a point", str(len(shades)))
+        tests = chosen_views(posed, split) if test_views is None else tuple(sorted(test_views))
+        for each in tests:
+            if each not in given:
+                raise unknown_view("test_views", each, names)
+        return Scene(
+            root=IN_MEMORY,
+            name=name,
+            views=tuple(item.view(ready[item.name], stored.full_scale, mount) for item in data),
+            test_names=tests,
+            points=torch.from_numpy(places),
+            point_colors=torch.from_numpy(shades),
+            refractive_index=refractive_index,
+            downscale=downscale,
+            transfer=transfer,
+            digest=_digest(data, posed, (places, shades), (mount, transfer, downscale)),
+            warnings=tuple(stored.picture_warnings(transfer)),
+        )
+
+    def __repr__(self) -> str:
+        held_out = listed(list(self.test_names)) or "none"
+        first = (
+            f"<Scene {self.name}: {len(self.views)} views of {_sizes(self.views)} pixels, "
+            f"{len(self.points):,} points, from {self.root}"
+        )
+        return f"{first}\n held out: {held_out}; {len(self.warnings)} warnings>"
+
+    def _repr_html_(self) -> str:
+        step = max(1, -(-len(self.views) // _PICTURED))
+        pictures = "".join(
+            figure(view.photograph().cpu().numpy(), f"{view.name}, {_role(self, view)}")
+            for view in self.views[::step]
+        )
+        facts = {
+            "folder": str(self.root),
+            "views": f"{len(self.views)} of {_sizes(self.views)} pixels, {len(self.test_names)} held out",
+            "points": f"{len(self.points):,}",
+            "warnings": "\n".join(self.warnings) or "none",
+        }
+        return f"{pictures}{table(self.name, facts)}"
+
+
+def _role(scene: Scene, view: View) -> str:
+    return "held out" if view.name in scene.test_names else "training"
+
+
+def _sizes(views: Sequence[View]) -> str:
+    """The sizes of views, for people."""
+    sizes = sorted({(view.camera.width, view.camera.height) for view in views})
+    words = [f"{width}x{height}" for width, height in (sizes[0], sizes[-1])] if sizes else ["no"]
+    return " to ".join(dict.fromkeys(words))
+
+
+def _angles_by_name(
+    angles: Sequence[Angle] | Mapping[str, Sequence[Angle]], names: Sequence[str]
+) -> dict[str, Sequence[Angle]]:
+    if isinstance(angles, Mapping):
+        return by_name(angles, "angles", names)
+    return dict.fromkeys(names, tuple(angles))
+
+
+def _view_of(
+    name: str,
+    pictures: Array,
+    camera: Camera,
+    angles: Sequence[Angle],
+    beside: Mapping[str, Mapping[str, Array]],
+    transfer: str,
+    factor: int,
+) -> ViewData:
+    """One view, checked.
+
+    Raises:
+        PolarguideError: its arrays, its angles and its camera do not fit each other.
+    """
+    where = f"pictures ({name})"
+    floats = np.issubdtype(as_numpy(pictures).dtype, np.floating)
+    if floats and transfer != "linear":
+        raise _unlike(where, f"whole numbers, which transfer {transfer} decodes", "floats, which are linear")
+    stored, exposures = (
+        stored_pictures(pictures, where),
+        exposures_of(angles, len(pictures), f"angles ({name})"),
+    )
+    stored, exposures = in_order(stored, exposures)
+    height, width = stored.shape[1:3]
+    require_factor(factor, height, width)
+    if not isinstance(camera, Camera):
+        raise _unlike(f"cameras ({name})", "a polarguide.Camera", type(camera).__name__)
+    if (camera.width, camera.height) != (width, height):
+        found = f"{camera.width}x{camera.height}"
+        raise _unlike(f"cameras ({name})", f"the size of the pictures, {width}x{height}", found)
+    masks = {
+        what: _mask(of_view.get(name), f"{what} ({name})", (height, width))
+        for what, of_view in beside.items()
+    }
+    return view_data(
+        name,
+        list(stored),
+        exposures,
+        factor=factor,
+        transfer=transfer,
+        mask=masks["masks"],
+        invalid=masks["invalid"],
+    )
+
+
+def _mask(given: Array | None, where: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+    if given is None:
+        return None
+    mask = as_numpy(given)
+    if mask.shape != size or mask.dtype != bool:
+        raise _unlike(where, f"bool of shape {list(size)}", kind_of(mask))
+    return np.ascontiguousarray(mask)
+
+
+def _rows(given: Any, where: str, kind: type[np.generic]) -> NDArray[Any]:
+    """Rows of three finite numbers."""
+    array = as_numpy(given)
+    if array.ndim != 2 or array.shape[1] != 3 or not len(array) or not np.isfinite(array).all():
+        raise _unlike(where, "finite numbers of shape [M, 3], at least one row", kind_of(array))
+    if kind is np.uint8 and array.dtype != np.uint8:
+        raise _unlike(where, "uint8 of shape [M, 3]", kind_of(array))
+    return np.array(array, kind)
+
+
+def _unlike(where: str, expected: str, found: str) -> PolarguideError:
+    return PolarguideError(where, expected=expected, found=found, remedy="Correct the array.")
+
+
+def _digest(
+    data: Sequence[ViewData], cameras: Mapping[str, Camera], more: Sequence[NDArray[Any]], how: object
+) -> str:
+    """SHA-256 over all that a scene was made of."""
+    found = hashlib.sha256(repr(how).encode())
+    for item in data:
+        camera = cameras[item.name]
+        lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        found.update(repr((item.name, item.exposures, item.codes.shape, lens)).encode())
+        found.update(camera.world_to_camera.numpy().tobytes())
+        for array in (item.codes, item.invalid, item.mask):
+            found.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
+    for array in more:
+        found.update(array.tobytes())
+    return found.hexdigest()
