@@ -131,6 +131,8 @@ class MetalSearch:
             )
         centers = torch.stack([view.camera.center for view in self._scene.train_views])
         near = ~far_away(gaussians["means"].detach().cpu(), self._scene.points, centers, self._limits.reach)
+        if not any(view.is_determined for view in views):  # then nothing tells how far a label reaches
+            near = torch.zeros_like(near)
         metal = decide(measured, gaussians, near.to(measured.ratio.device), self._rules).float()
         reflectance = measured.reflectance
         for values in (metal, reflectance):
