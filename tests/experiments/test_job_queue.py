@@ -20,7 +20,7 @@ from polarguide.core.records import decode
 from polarguide.core.system import interrupt
 from polarguide.experiments import children, worker
 from polarguide.experiments.cluster import Workers, workers
-from polarguide.experiments.job_queue import MOST_LOSSES, Job, last_row, run_jobs
+from polarguide.experiments.job_queue import MOST_LOSSES, Job, last_row, run_job, run_jobs
 from polarguide.experiments.options import ClusterOptions
 from polarguide.experiments.tasks import COMMAND, Message, Scoring, Training, encoded
 from polarguide.runs.folder import CHECKPOINT, LOG
@@ -70,7 +70,7 @@ def job(tmp_path: Path) -> Callable[..., Job]:
     def make(name: str, *verbs: str) -> Job:
         folder = tmp_path / name
         tasks = [Scoring(folder=str(folder), speed=False, compute=ComputeOptions(3, verb)) for verb in verbs]  # type: ignore[arg-type]
-        return Job(name, folder, lambda: tuple(tasks), 10)
+        return run_job(name, folder, lambda: tuple(tasks), 10)
 
     return make
 
@@ -115,7 +115,7 @@ def test_a_failure_takes_no_other_job_down(two: Workers, job: Callable[..., Job]
     assert set(watch.said) == {"done  a", "failed  b: b is broken.", f"failed  c: {watch.ended['c']}"}
     assert watch.most == 2
     assert watch.open == set()
-    assert watch.overall[-1] == (30, "3/3 runs")
+    assert watch.overall[-1] == (30, "3 of 3 ended")
     did = [(j.folder / "did").read_text().split("\n")[:-1] for j in todo]
     assert did == [["train 3 3", "eval 3 3"], ["fail 3 3"], ["quiet 3 3"]]
 

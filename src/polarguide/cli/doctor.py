@@ -23,6 +23,7 @@ EXTRAS = {
     "cuda": "train and render on an NVIDIA GPU",
     "lpips": "the metric lpips",
     "heic": "HEIC photographs",
+    "cluster": "compare, ablate, bench and batch on SLURM or PBS",
     "synth": "synth and bench: scenes with ground truth",
 }
 """The extras that users need, and what for; docs and test are for those who change polarguide."""

@@ -23,7 +23,7 @@ from polarguide.core.system import only_writer
 from polarguide.experiments.charts import exposure_svg, read_study, study_svg
 from polarguide.experiments.children import STDERR
 from polarguide.experiments.cluster import workers
-from polarguide.experiments.job_queue import Job, run_jobs
+from polarguide.experiments.job_queue import Job, run_job, run_jobs
 from polarguide.experiments.options import MOST_SEEDS, CompareOptions
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
 from polarguide.experiments.record import FORMAT, REMEDY, Record
@@ -259,7 +259,7 @@ def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
             write_text(run.folder / BESIDE_OTHERS, "Trained beside other runs: its seconds do not count.\n")
         return (training, scoring)
 
-    return Job(run.label, run.folder, tasks, run.steps)
+    return run_job(run.label, run.folder, tasks, run.steps)
 
 
 def _compute(comparison: Comparison) -> ComputeOptions:
@@ -285,16 +285,19 @@ def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter
 def _timing(comparison: Comparison, run: PlannedRun) -> Job:
     """Score a run again, with its speed."""
     scoring = Scoring(str(run.folder.absolute()), True, _compute(comparison))
-    return Job(run.label, run.folder, lambda: (scoring,), run.steps)
+    return run_job(run.label, run.folder, lambda: (scoring,), run.steps)
 
 
 @contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keep two comparisons out of an existing folder. Children inherit the lock and hold it if the parent is killed."""
+def locked(folder: Path, what: str = "comparison") -> Iterator[None]:
+    """Keep two comparisons (or two of something else) out of an existing folder.
+
+    Children on this machine inherit the lock and hold it if the parent is killed, until they have saved their state.
+    """
     with only_writer(
         folder / LOCK,
         expected="a folder that nobody is writing to",
-        found="another comparison at work in it",
+        found=f"another {what} at work in it",
     ):
         yield
 

@@ -17,7 +17,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import Advance, Reporter
 from polarguide.experiments.children import POLL_SECONDS, count_at_work, kill, perform
 from polarguide.experiments.cluster import Workers
-from polarguide.experiments.tasks import Outcome, Task, Training
+from polarguide.experiments.tasks import Outcome, Task
 from polarguide.results.evaluation.sources import code_digest
 from polarguide.runs.folder import CHECKPOINT, LOG
 
@@ -28,7 +28,7 @@ ASK_SECONDS = 1.0
 """Between two questions to the scheduler, who may be far away."""
 TAIL_BYTES = 4096
 MOST_LOSSES = 10
-"""Times in a row that a job may be lost without a new checkpoint: it takes more memory than there is, for example."""
+"""Times in a row that a job may be lost without having saved anything: it takes more memory than there is, perhaps."""
 
 
 @dataclass(frozen=True)
@@ -37,37 +37,51 @@ class Job:
 
     Attributes:
         label: what messages call it.
-        folder: of the run; made if need be. Its ``stderr.txt`` takes what the processes write.
+        folder: made if need be. Its ``stderr.txt`` takes what the processes write.
         tasks: what is still to do, by what the folder holds: called whenever the job is begun or gone on with.
-        steps: the number of training steps at its end.
+        total: how much there is to do, as ``progress`` counts it.
+        progress: how much is done, and a few words on that.
+        saved: files that are written anew whenever there is something new to go on from.
     """
 
     label: str
     folder: Path
     tasks: Callable[[], Sequence[Task]]
-    steps: int
+    total: int
+    progress: Callable[[], tuple[int, str]]
+    saved: tuple[Path, ...]
 
-    def step(self) -> int:
-        """How many steps of the training are done, as its log says."""
-        row = last_row(self.folder / LOG)
-        return 0 if row is None else min(self.steps, row.step + 1)
+
+def run_job(label: str, run: Path, tasks: Callable[[], Sequence[Task]], steps: int) -> Job:
+    """The job that trains and scores a run of so many steps; see ``Job``."""
+
+    def progress() -> tuple[int, str]:
+        step, note = training_progress(run, steps)
+        return step, note if step < steps else "scoring"
+
+    return Job(label, run, tasks, steps, progress, (run / CHECKPOINT,))
+
+
+def training_progress(run: Path, steps: int) -> tuple[int, str]:
+    """How many steps of a training are done, as its log says, and what it says of the last."""
+    row = last_row(run / LOG)
+    if row is None or row.psnr is None:
+        return 0, ""
+    count = "" if row.gaussians is None else f"  {row.gaussians:,} Gaussians"
+    return min(steps, row.step + 1), f"PSNR {row.psnr:.1f} dB{count}"
 
 
 class _Active:
     """A job that was handed to a worker."""
 
-    def __init__(self, job: Job, tasks: Sequence[Task], future: Future, advance: Advance) -> None:
+    def __init__(self, job: Job, future: Future, advance: Advance) -> None:
         self.job, self.future, self._advance = job, future, advance
-        self._trains = any(isinstance(task, Training) for task in tasks)
 
-    def report(self) -> None:
-        """Pass on how far it is."""
-        step, row = self.job.step(), last_row(self.job.folder / LOG)
-        note = "" if self._trains and step < self.job.steps else "scoring"
-        if not note and row is not None and row.psnr is not None:
-            count = "" if row.gaussians is None else f"  {row.gaussians:,} Gaussians"
-            note = f"PSNR {row.psnr:.1f} dB{count}"
-        self._advance(step, note=note)
+    def report(self) -> int:
+        """Pass on how far it is; returns how much is done."""
+        done, note = self.job.progress()
+        self._advance(done, note=note)
+        return done
 
     def outcome(self) -> Outcome:
         """After the end: what became of it.
@@ -98,49 +112,45 @@ class _Progress:
 
     def __init__(self, jobs: Sequence[Job], reporter: Reporter, stack: contextlib.ExitStack) -> None:
         self._reporter, self._total, self._ended = reporter, len(jobs), 0
-        self._steps = {job.folder: job.step() for job in jobs}
-        self._all = stack.enter_context(reporter.track("all", sum(job.steps for job in jobs)))
+        self._done = {job.folder: job.progress()[0] for job in jobs}
+        self._all = stack.enter_context(reporter.track("all", sum(job.total for job in jobs)))
         self._stack = stack
         self._open: dict[Path, contextlib.ExitStack] = {}
 
     def begin(self, job: Job) -> Advance:
         """A job starts, or goes on."""
         self._open[job.folder] = self._stack.enter_context(contextlib.ExitStack())
-        return self._open[job.folder].enter_context(self._reporter.track(job.label, job.steps))
+        return self._open[job.folder].enter_context(self._reporter.track(job.label, job.total))
 
     def report(self, active: Sequence[_Active], slots: int) -> None:
         """How far all and each of them are."""
         for each in active:
-            each.report()
-            self._steps[each.job.folder] = each.job.step()
+            self._done[each.job.folder] = each.report()
         waits = "" if slots else "  waiting for a worker"
-        self._all(sum(self._steps.values()), note=f"{self._ended}/{self._total} runs{waits}")
+        self._all(sum(self._done.values()), note=f"{self._ended} of {self._total} ended{waits}")
 
     def pause(self, job: Job, why: str) -> None:
         """A job was lost, and will go on."""
         self._open.pop(job.folder).close()
-        self._reporter.say(f"lost  {job.label}: {why}; it goes on from its last checkpoint")
+        self._reporter.say(f"lost  {job.label}: {why}; it goes on from what it has saved")
 
     def end(self, job: Job, error: str | None) -> None:
         """A job has ended."""
         self._ended += 1
-        self._steps[job.folder] = job.steps
+        self._done[job.folder] = job.total
         self._open.pop(job.folder).close()
         self._reporter.say(f"done  {job.label}" if error is None else f"failed  {job.label}: {error}")
 
 
 class _Losses:
-    """How often jobs were lost without a new checkpoint between."""
+    """How often jobs were lost without anything new to go on from."""
 
     def __init__(self) -> None:
-        self._counts: dict[Path, tuple[int, int]] = {}  # modification time of the checkpoint, losses since
+        self._counts: dict[Path, tuple[int, int]] = {}  # when anything was saved, losses since
 
     def give_up(self, job: Job) -> bool:
         """Count one more loss; whether it is the last."""
-        try:
-            saved = (job.folder / CHECKPOINT).stat().st_mtime_ns
-        except OSError:
-            saved = 0
+        saved = max((path.stat().st_mtime_ns for path in job.saved if path.exists()), default=0)
         before, count = self._counts.get(job.folder, (saved, 0))
         count = count + 1 if before == saved else 1
         self._counts[job.folder] = saved, count
@@ -195,17 +205,16 @@ def run_jobs(
 
 
 def _handed_out(job: Job, workers: Workers, progress: _Progress) -> _Active:
-    tasks = tuple(job.tasks())
     future = workers.client.submit(
         perform,
-        tasks,
+        tuple(job.tasks()),
         str(job.folder.absolute()),
         code=code_digest(),
         gpus=workers.gpus,
         key=f"{job.label} {time.monotonic_ns()}",
         pure=False,
     )
-    return _Active(job, tasks, future, progress.begin(job))
+    return _Active(job, future, progress.begin(job))
 
 
 def _stop(active: Sequence[_Active], workers: Workers) -> None:

@@ -11,6 +11,7 @@ from polarguide.core.options import (
     EXPOSURES,
     MOST_THREADS,
     DeviceName,
+    ExportFormat,
     Exposures,
     SceneOptions,
     check_choice,
@@ -111,6 +112,19 @@ class CompareOptions(ClusterOptions, SceneOptions):
     def own_device(self) -> DeviceName:
         """What this machine draws the report on, if others train."""
         return self.device if self.local else "auto"
+
+
+@dataclass(frozen=True)
+class BatchOptions(ClusterOptions):
+    """How captures are processed.
+
+    Attributes:
+        formats: What to export of each: ply, spz, sog, mesh, points, environment or cameras.
+        device: The device of trainings and renderings.
+    """
+
+    formats: tuple[ExportFormat, ...] = ("ply",)
+    device: DeviceName = "auto"
 
 
 Half = Literal["development", "held-back"]

@@ -10,6 +10,7 @@ from typing import Literal
 import msgspec
 
 from polarguide.core.options import ComputeOptions, SceneOptions
+from polarguide.experiments.collection import Processing
 from polarguide.training.settings import TrainSettings
 
 PACKAGE = Path(__file__).parents[1]
@@ -41,7 +42,7 @@ class Scoring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="scor
     compute: ComputeOptions
 
 
-Task = Training | Scoring
+Task = Training | Scoring | Processing
 
 
 class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -16,6 +16,8 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.options import SessionOptions
 from polarguide.core.records import decode
 from polarguide.core.system import StopSignals, keep_freed_memory
+from polarguide.experiments.capture_steps import process
+from polarguide.experiments.collection import RUN, Processing
 from polarguide.experiments.tasks import Message, Scoring, Task
 from polarguide.raster import use_threads
 from polarguide.results.evaluation.evaluate import evaluate
@@ -94,13 +96,17 @@ def check_code(code: str) -> None:
 
 
 def do(task: Task) -> None:
-    """Train or score.
+    """Train, score, or process a capture.
 
     Raises:
         PolarguideError: the input is wrong, or the training has diverged.
         KeyboardInterrupt: stopped; a training has saved its state.
     """
     use_threads(task.compute.threads)
+    if isinstance(task, Processing):
+        _wait_for_others(Path(task.folder) / RUN)
+        process(task)
+        return
     if isinstance(task, Scoring):
         evaluate(OpenedRun.open(task.folder, device=task.compute.device), speed=task.speed)
         return

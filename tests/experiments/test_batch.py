@@ -1,0 +1,177 @@
+"""A collection: what is a capture, what fails alone, what goes on, what excludes what, and the page over all."""
+
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from faults import Fault
+from heard import Heard
+
+from polarguide.cli import batch as verb
+from polarguide.cli.app import run as polarguide
+from polarguide.core.options import SceneOptions
+from polarguide.core.records import decode
+from polarguide.experiments import batch as batches
+from polarguide.experiments import job_queue
+from polarguide.experiments.batch import Capture, _task, run_batch
+from polarguide.experiments.collection import STEPS, CaptureRecord, prepare_settings
+from polarguide.experiments.compare import locked
+from polarguide.experiments.options import BatchOptions
+from polarguide.experiments.tasks import Message, encoded
+from polarguide.preparation.settings import PrepareSettings
+from polarguide.training.settings import TrainSettings
+
+OPTIONS = BatchOptions(jobs=1, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def collection(demo_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Capture]:
+    """Three captures, of which two are broken: one has a picture that is cut short, the other nothing to read."""
+    root = tmp_path_factory.mktemp("collection")
+    cut, empty = root / "cut", root / "empty <b>"
+    shutil.copytree(demo_scene, cut)
+    picture = next((cut / "polar").iterdir())
+    picture.write_bytes(picture.read_bytes()[:50])
+    empty.mkdir()
+    how: dict[str, Any] = {"recipe": "3dgs", "settings": TrainSettings(20), "reading": SceneOptions(4)}
+    return [Capture(path.name, path, **how) for path in (cut, demo_scene, empty)]
+
+
+def stop_when(done: Callable[[], bool], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C as soon as the condition is true."""
+    whole = job_queue._Progress.report
+
+    def report(self: Any, *arguments: Any) -> None:
+        whole(self, *arguments)
+        if done():
+            monkeypatch.undo()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(job_queue._Progress, "report", report)
+
+
+@pytest.mark.slow
+def test_broken_captures_are_rows_and_the_others_go_on_also_after_a_stop(
+    collection: list[Capture], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = tmp_path / "captures" / collection[1].name
+
+    def inspected() -> bool:
+        record = CaptureRecord.load(good)
+        return record is not None and "inspect" in record.done
+
+    stop_when(inspected, monkeypatch)
+    with pytest.raises(KeyboardInterrupt):
+        run_batch(collection, tmp_path, OPTIONS)
+    with locked(tmp_path, "batch"):  # nothing is left at work
+        page = (good / "inspection" / "inspection.html").stat().st_mtime_ns
+
+    heard = Heard()
+    rows = run_batch(collection, tmp_path, OPTIONS, reporter=heard)
+    assert (good / "inspection" / "inspection.html").stat().st_mtime_ns == page
+    assert [row.state for row in rows] == ["failed", "done", "failed"]
+    assert "cut short" in rows[0].error
+    assert "nothing to read" in rows[2].error
+    assert rows[1].record is not None
+    assert rows[1].record.done == STEPS
+
+    html = (tmp_path / "index.html").read_text()
+    assert "<b>" not in html.partition("<tbody>")[2]
+    assert all(row.error in unescape(html) for row in rows)
+    links = re.findall(r'href="([^"]+)"', html)
+    assert [Path(link).name for link in links] == [
+        "inspection.html", "errors.png", "share.html", "point_cloud.ply",
+    ]  # fmt: skip
+    assert all((tmp_path / link).exists() for link in links)
+    table = pd.read_csv(tmp_path / "results.csv")
+    assert table["state"].tolist() == ["failed", "done", "failed"]
+    assert table["psnr"].notna().tolist() == [False, True, False]
+
+    # Finished captures are not repeated; other options for them, or other files, are refused by name.
+    run_batch(collection[1:2], tmp_path, OPTIONS, reporter=heard)
+    assert heard.said[-1] == "captures: 1, of them finished before: 1"
+    other = [replace(collection[1], settings=TrainSettings(30))]
+    (row,) = run_batch(other, tmp_path, OPTIONS)
+    assert (row.state, "(settings)" in row.error) == ("failed", True)
+    assert rows[1].record.done == STEPS
+
+
+def test_two_in_one_folder_exclude_each_other(collection: list[Capture], tmp_path: Path) -> None:
+    with locked(tmp_path, "batch"):
+        Fault("", "nobody", "another batch").raised_by(run_batch, collection, tmp_path, OPTIONS)
+    Fault("recipe").raised_by(run_batch, [replace(collection[0], recipe="magic")], tmp_path / "new", OPTIONS)
+    assert not (tmp_path / "new").exists()
+
+
+def test_settings_survive_their_way(tmp_path: Path) -> None:
+    settings = PrepareSettings(sensor="IMX250MYR", dark_frame=tmp_path / "dark.png", poses="sfm").checked()
+    task = _task(Capture("a", tmp_path, settings), tmp_path, OPTIONS)
+    assert task.request.prepare is not None
+    assert prepare_settings(task.request.prepare) == settings
+    message = decode(encoded(task), Message, "task")
+    assert message.task == task
+
+
+HEAD = "name,path,sensor,options\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("name,where\n", Fault("first line", "name and path", "where")),
+        ("", Fault("first line", found="nothing")),
+        (HEAD, Fault("list.csv", found="no capture")),
+        (HEAD + "cup,a\n", Fault("line 2", "4 values", "fewer")),
+        (HEAD + "cup,a,,,,\n", Fault("line 2", "4 values", "more")),
+        (HEAD + "../cup,a,,\n", Fault("line 2", "name")),
+        (HEAD + "cup,,,\n", Fault("line 2", "path")),
+        (HEAD + "cup,a,,\n\nCup,b,,\n", Fault("line 4", "names of their own", "line 2")),
+        (HEAD + "cup,a,IMX,\n", Fault("line 2", "prepare and train", "IMX")),
+        (HEAD + "cup,a,,--stepz 3\n", Fault("line 2", "prepare and train", "--stepz")),
+        (HEAD + 'cup,a,,"--steps ""3"\n', Fault("line 2", "command line")),
+        (HEAD + "cup,a,,--steps 0\n", Fault("steps", "1 or more", "0")),
+        (HEAD + "cup,a,,--white-balance red\n", Fault("--white-balance", found="red")),
+    ],
+)
+def test_a_wrong_table_is_refused_before_anything_is_written(tmp_path: Path, text: str, fault: Fault) -> None:
+    (tmp_path / "list.csv").write_text(text)
+    fault.raised_by(verb.batch, tmp_path / "list.csv", out=tmp_path / "out", settings=OPTIONS)
+    assert not (tmp_path / "out").exists()
+
+
+def test_tables_and_folders_name_captures(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Options are those of prepare and of train, common ones first; a scene with poses takes those of train alone."""
+    asked: list[list[Capture]] = []
+
+    def instead(captures: list[Capture], out: Path, *_: Any, **__: Any) -> list[Any]:
+        asked.append(captures)
+        return []
+
+    monkeypatch.setattr(batches, "run_batch", instead)
+    (tmp_path / "list.csv").write_text(
+        "\ufeffName; path; sensor; options\n"
+        "cup; shots/cup; IMX250MYR; --poses none --steps 40 --zero 12\n"
+        f"demo; {demo_scene}; ; --recipe 3dgs --downscale 2\n",
+        encoding="utf-8",
+    )
+    out = str(tmp_path / "out")
+    assert polarguide(["batch", str(tmp_path / "list.csv"), "--out", out, "--options=--steps 7"]) == 0
+    cup, demo = asked.pop()
+    assert (cup.name, cup.path) == ("cup", tmp_path / "shots" / "cup")
+    assert (cup.prepare.sensor, cup.prepare.poses, cup.prepare.calibration.zero) == ("IMX250MYR", "none", 12)
+    assert (cup.settings.steps, cup.recipe) == (40, "polarguide-stokes")
+    assert (demo.path, demo.recipe, demo.settings.steps, demo.reading.downscale) == (demo_scene, "3dgs", 7, 2)
+
+    for name in ("b", "a", ".hidden", "out"):
+        (tmp_path / "all" / name).mkdir(parents=True)
+    (tmp_path / "all" / "notes.txt").touch()
+    assert polarguide(["batch", str(tmp_path / "all"), "--out", str(tmp_path / "all" / "out")]) == 0
+    assert [capture.name for capture in asked.pop()] == ["a", "b"]
