@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -136,6 +137,9 @@ def _queued(manager: str, count: int, threads: int, memory: int) -> Iterator[Any
     """
     import dask
 
+    submit = {"slurm": "sbatch", "pbs": "qsub"}[manager]
+    if shutil.which(submit) is None:
+        raise _no_cluster(manager, f"no command {submit}")
     jobqueue = optional_import("dask_jobqueue", f"--{manager}", extra="cluster")
     of = f"jobqueue.{manager}"
     extra: dict[str, dict[str, Any]] = {
@@ -145,6 +149,7 @@ def _queued(manager: str, count: int, threads: int, memory: int) -> Iterator[Any
     kind = {"slurm": "SLURMCluster", "pbs": "PBSCluster"}[manager]
     try:
         cluster = getattr(jobqueue, kind)(
+            n_workers=count,  # waits until the jobs are accepted
             cores=1,
             processes=1,
             memory=f"{_mib(memory)} MiB",
@@ -160,16 +165,20 @@ def _queued(manager: str, count: int, threads: int, memory: int) -> Iterator[Any
             silence_logs=logging.CRITICAL,
             **extra[manager],
         )
-        cluster.scale(count)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise PolarguideError(
-            f"--{manager}",
-            expected="a cluster that takes jobs from this machine",
-            found=(str(error).splitlines() or [type(error).__name__])[-1],
-            remedy="Run it where jobs are submitted; docs/how-to/cluster.md says what to configure.",
-        ) from None
+    except (OSError, ValueError, RuntimeError, AssertionError) as error:
+        reasons = [line for line in str(error.__context__ or error).splitlines() if line.strip()]
+        raise _no_cluster(manager, reasons[-1] if reasons else type(error).__name__) from None
     with cluster:
         yield cluster
+
+
+def _no_cluster(manager: str, found: str) -> PolarguideError:
+    return PolarguideError(
+        f"--{manager}",
+        expected="a cluster that takes jobs from this machine",
+        found=found,
+        remedy="Run it where jobs are submitted; docs/how-to/cluster.md says what to configure.",
+    )
 
 
 def _mib(memory: int) -> int:

@@ -17,8 +17,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import Advance, Reporter
 from polarguide.experiments.children import POLL_SECONDS, count_at_work, kill, perform
 from polarguide.experiments.cluster import Workers
-from polarguide.experiments.tasks import Outcome, Task
-from polarguide.results.evaluation.sources import code_digest
+from polarguide.experiments.tasks import Outcome, Task, files_digest
 from polarguide.runs.folder import CHECKPOINT, LOG
 
 if TYPE_CHECKING:
@@ -209,7 +208,7 @@ def _handed_out(job: Job, workers: Workers, progress: _Progress) -> _Active:
         perform,
         tuple(job.tasks()),
         str(job.folder.absolute()),
-        code=code_digest(),
+        code=files_digest(),
         gpus=workers.gpus,
         key=f"{job.label} {time.monotonic_ns()}",
         pure=False,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sys
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +23,18 @@ PROLOGUE = (
 )
 """What a child runs: it imports this package from where it is here, and nothing from the current folder."""
 COMMAND = (sys.executable, "-c", PROLOGUE, str(PACKAGE.parent))
+
+
+@cache
+def files_digest() -> str:
+    """Sixteen hexadecimal digits that change with any byte of this package's code; quick, unlike ``code_digest``."""
+    digest = hashlib.sha256()
+    for path in sorted(
+        (*PACKAGE.rglob("*.py"), *PACKAGE.glob("_native.*.so"), *PACKAGE.glob("_native.*.pyd"))
+    ):
+        digest.update(f"{path.relative_to(PACKAGE).as_posix()} {path.stat().st_size}\n".encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="train"):
@@ -46,7 +60,7 @@ Task = Training | Scoring | Processing
 
 
 class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a child reads, on one line: its task, and the ``code_digest`` of who gives it (empty: any will do)."""
+    """What a child reads, on one line: its task, and the ``files_digest`` of who gives it (empty: any will do)."""
 
     task: Task
     code: str = ""

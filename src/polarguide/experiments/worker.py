@@ -18,10 +18,9 @@ from polarguide.core.records import decode
 from polarguide.core.system import StopSignals, keep_freed_memory
 from polarguide.experiments.capture_steps import process
 from polarguide.experiments.collection import RUN, Processing
-from polarguide.experiments.tasks import Message, Scoring, Task
+from polarguide.experiments.tasks import Message, Scoring, Task, files_digest
 from polarguide.raster import use_threads
 from polarguide.results.evaluation.evaluate import evaluate
-from polarguide.results.evaluation.sources import code_digest
 from polarguide.runs.folder import CONFIGURATION, writing_to
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import train
@@ -86,11 +85,11 @@ def check_code(code: str) -> None:
     Raises:
         PolarguideError: this installation differs.
     """
-    if code and code != code_digest():
+    if code and code != files_digest():
         raise PolarguideError(
             "worker",
             expected=f"the code of the command (digest {code})",
-            found=f"polarguide {__version__} with digest {code_digest()} in {Path(__file__).parents[1]}",
+            found=f"polarguide {__version__} with digest {files_digest()} in {Path(__file__).parents[1]}",
             remedy="Install the same version on all machines.",
         )
 
