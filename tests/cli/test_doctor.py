@@ -22,6 +22,7 @@ METADATA = [
     "numpy; extra == 'lpips'",
     "no-such-package==1.*; python_version >= '3' and extra == 'synth'",
     "pillow-heif>=0.18; extra == 'heic'",
+    "dask-jobqueue>=0.9; extra == 'cluster'",
     "furo; extra == 'docs'",
 ]
 

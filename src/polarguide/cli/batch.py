@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 import tyro
 
 from polarguide.cli.console import JobReporter, say, use_threads
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.files import read_file
-from polarguide.core.options import SceneOptions
+from polarguide.core.options import EXPORT_PACKAGES, SceneOptions
 from polarguide.experiments.options import BatchOptions
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 from polarguide.training.settings import TrainSettings
@@ -54,6 +54,9 @@ def batch(
             a line of the CSV file go before them.
     """
     use_threads(settings.threads)
+    for kind in settings.formats:
+        for package in EXPORT_PACKAGES.get(kind, ()):
+            require_package(package, f"--formats {kind}")
     running = importlib.import_module("polarguide.experiments.batch")
     captures = [
         _capture(running.Capture, line, running.is_scene(line.path), options)

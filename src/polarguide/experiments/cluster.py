@@ -36,6 +36,8 @@ SETTINGS = {
     "distributed.worker.memory.pause": False,
     # Nobody measures, and nothing is reported to anyone.
     "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "10s",
 }
 
 

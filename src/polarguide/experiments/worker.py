@@ -38,6 +38,8 @@ def main() -> int:
     keep_freed_memory()
     try:
         line = _read_line()
+        if not line.endswith(b"\n"):  # nobody has sent a whole one
+            return obey(line)
         threading.Thread(target=_stop_at_end_of_input, daemon=True).start()
         return obey(line)
     except KeyboardInterrupt:
