@@ -50,8 +50,8 @@ def batch(
         collection: A folder of which each folder is a capture; or a CSV file with the columns name, path (from the
             file's folder), and, if need be, sensor and options.
         out: Folder to write.
-        options: Options of prepare and train for all captures, in quotes, such as "--poses sfm --steps 3000". Those of
-            a line of the CSV file go before them.
+        options: Options of prepare and train for all captures: --options="--poses sfm --steps 3000". Those of a line of
+            the CSV file go before them.
     """
     use_threads(settings.threads)
     for kind in settings.formats:
