@@ -1,4 +1,4 @@
-"""A collection: what is a capture, what fails alone, what goes on, what excludes what, and the page over all."""
+"""A batch: what fails alone, what goes on, what excludes what, and the page over all."""
 
 import re
 from collections.abc import Callable
@@ -13,11 +13,8 @@ from faults import Fault
 from heard import Heard
 from tiny_capture import ideal_intensities, write_tiny_capture
 
-from polarguide.cli import batch as verb
-from polarguide.cli.app import run as polarguide
 from polarguide.core.options import SceneOptions
 from polarguide.core.records import decode
-from polarguide.experiments import batch as batches
 from polarguide.experiments import job_queue
 from polarguide.experiments.batch import Capture, _task, run_batch
 from polarguide.experiments.collection import STEPS, CaptureRecord, prepare_settings
@@ -115,64 +112,4 @@ def test_settings_survive_their_way(tmp_path: Path) -> None:
     task = _task(Capture("a", tmp_path, settings), tmp_path, OPTIONS)
     assert task.request.prepare is not None
     assert prepare_settings(task.request.prepare) == settings
-    message = decode(encoded(task), Message, "task")
-    assert message.task == task
-
-
-HEAD = "name,path,sensor,options\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "fault"),
-    [
-        ("name,where\n", Fault("first line", "name and path", "where")),
-        ("", Fault("first line", found="nothing")),
-        (HEAD, Fault("list.csv", found="no capture")),
-        (HEAD + "cup,a\n", Fault("line 2", "4 values", "fewer")),
-        (HEAD + "cup,a,,,,\n", Fault("line 2", "4 values", "more")),
-        (HEAD + "../cup,a,,\n", Fault("line 2", "name")),
-        (HEAD + "cup,,,\n", Fault("line 2", "path")),
-        (HEAD + "cup,a,,\n\nCup,b,,\n", Fault("line 4", "names of their own", "line 2")),
-        (HEAD + "cup,a,IMX,\n", Fault("line 2", "prepare and train", "IMX")),
-        (HEAD + "cup,a,,--stepz 3\n", Fault("line 2", "prepare and train", "--stepz")),
-        (HEAD + 'cup,a,,"--steps ""3"\n', Fault("line 2", "command line")),
-        (HEAD + "cup,a,,--steps 0\n", Fault("steps", "1 or more", "0")),
-        (HEAD + "cup,a,,--white-balance red\n", Fault("--white-balance", found="red")),
-    ],
-)
-def test_a_wrong_table_is_refused_before_anything_is_written(tmp_path: Path, text: str, fault: Fault) -> None:
-    (tmp_path / "list.csv").write_text(text)
-    fault.raised_by(verb.batch, tmp_path / "list.csv", out=tmp_path / "out", settings=OPTIONS)
-    assert not (tmp_path / "out").exists()
-
-
-def test_tables_and_folders_name_captures(
-    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Options are those of prepare and of train, common ones first; a scene with poses takes those of train alone."""
-    asked: list[list[Capture]] = []
-
-    def instead(captures: list[Capture], out: Path, *_: Any, **__: Any) -> list[Any]:
-        asked.append(captures)
-        return []
-
-    monkeypatch.setattr(batches, "run_batch", instead)
-    (tmp_path / "list.csv").write_text(
-        "\ufeffName; path; sensor; options\n"
-        "cup; shots/cup; IMX250MYR; --poses none --steps 40 --zero 12\n"
-        f"demo; {demo_scene}; ; --recipe 3dgs --downscale 2\n",
-        encoding="utf-8",
-    )
-    out = str(tmp_path / "out")
-    assert polarguide(["batch", str(tmp_path / "list.csv"), "--out", out, "--options=--steps 7"]) == 0
-    cup, demo = asked.pop()
-    assert (cup.name, cup.path) == ("cup", tmp_path / "shots" / "cup")
-    assert (cup.prepare.sensor, cup.prepare.poses, cup.prepare.calibration.zero) == ("IMX250MYR", "none", 12)
-    assert (cup.settings.steps, cup.recipe) == (40, "polarguide-stokes")
-    assert (demo.path, demo.recipe, demo.settings.steps, demo.reading.downscale) == (demo_scene, "3dgs", 7, 2)
-
-    for name in ("b", "a", ".hidden", "out"):
-        (tmp_path / "all" / name).mkdir(parents=True)
-    (tmp_path / "all" / "notes.txt").touch()
-    assert polarguide(["batch", str(tmp_path / "all"), "--out", str(tmp_path / "all" / "out")]) == 0
-    assert [capture.name for capture in asked.pop()] == ["a", "b"]
+    assert decode(encoded(Message(task, "", "")), Message, "task").task == task

@@ -22,7 +22,7 @@ from polarguide.experiments import children, worker
 from polarguide.experiments.cluster import Workers, workers
 from polarguide.experiments.job_queue import MOST_LOSSES, Job, last_row, run_job, run_jobs
 from polarguide.experiments.options import ClusterOptions
-from polarguide.experiments.tasks import COMMAND, Message, Scoring, Training, encoded
+from polarguide.experiments.tasks import COMMAND, Message, Scoring, Training, encoded, files_digest
 from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide.training.settings import TrainSettings
 
@@ -266,18 +266,19 @@ def training(scene: Path, folder: Path, steps: int = 20) -> Training:
 
 
 @contextlib.contextmanager
-def child(line: bytes, folder: Path) -> Iterator["subprocess.Popen[bytes]"]:
+def child(task: Training, folder: Path) -> Iterator["subprocess.Popen[bytes]"]:
     """A child at work on a task, with its standard input open."""
     pipes = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(COMMAND, cwd=folder, **pipes) as process:  # type: ignore[call-overload]
-        process.stdin.write(line)
+        process.stdin.write(encoded(Message(task, files_digest(), "")))
         process.stdin.flush()
         yield process
 
 
 def test_a_task_survives_its_way(tmp_path: Path) -> None:
     for task in (training(tmp_path, tmp_path / "out"), Scoring("run", True, ComputeOptions(2, "cpu"))):
-        assert decode(encoded(task, "1f"), Message, "task") == Message(task, "1f")
+        message = Message(task, "1f", "2e")
+        assert decode(encoded(message), Message, "task") == message
 
 
 def test_nothing_is_imported_from_the_current_folder(demo_scene: Path, tmp_path: Path) -> None:
@@ -286,7 +287,7 @@ def test_nothing_is_imported_from_the_current_folder(demo_scene: Path, tmp_path:
         (tmp_path / f"{name}.py").write_text(
             "open('imported', 'a').write(__name__ + '\\n')\nraise SystemExit(9)"
         )
-    with child(encoded(training(demo_scene, tmp_path / "run")), tmp_path) as process:
+    with child(training(demo_scene, tmp_path / "run"), tmp_path) as process:
         assert process.wait(PATIENCE) == 0
         assert process.stderr.read() == b""  # type: ignore[union-attr]
     assert not (tmp_path / "imported").exists()
@@ -313,8 +314,8 @@ def test_a_wrong_task_is_refused_in_one_line(
     message: str,
 ) -> None:
     task = msgspec.to_builtins(training(demo_scene, tmp_path / "run")) | change
-    code = "" if change else "other"
-    assert worker.obey(json.dumps({"task": task, "code": code}).encode()) == 2
+    files = files_digest() if change else "others"
+    assert worker.obey(json.dumps({"task": task, "files": files, "code": "other"}).encode()) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
     assert not (tmp_path / "run" / "run.json").exists()
@@ -328,7 +329,7 @@ def test_a_line_that_is_no_task_is_refused(capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.slow
 def test_a_training_that_nobody_waits_for_saves_its_state(demo_scene: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    with child(encoded(training(demo_scene, run, steps=5000)), tmp_path) as process:
+    with child(training(demo_scene, run, steps=5000), tmp_path) as process:
         give_up = time.monotonic() + PATIENCE
         while not (run / LOG).exists() and time.monotonic() < give_up:
             assert process.poll() is None

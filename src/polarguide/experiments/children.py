@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from polarguide.core.files import make_folder
-from polarguide.experiments.tasks import COMMAND, Outcome, Task, encoded
+from polarguide.experiments.tasks import COMMAND, Message, Outcome, encoded
 
 if TYPE_CHECKING:
     from distributed import Worker
@@ -33,18 +33,16 @@ _lock = threading.Lock()
 
 
 def perform(
-    tasks: Sequence[Task],
+    messages: Sequence[Message],
     folder: str,
     *,
-    code: str,
     gpus: Sequence[str] = (),
 ) -> Outcome:
     """Do tasks one after the other, on a worker of dask; stop where its task is canceled.
 
     Args:
-        tasks: each is done in a process of its own.
+        messages: the tasks, each is done in a process of its own.
         folder: made if need be. Its ``stderr.txt`` takes what the children write.
-        code: digest of the code that is to compute.
         gpus: of the workers of this machine, who are called 0, 1, ... and take one each, in turn.
     """
     from distributed import get_worker
@@ -52,9 +50,9 @@ def perform(
 
     worker, key = get_worker(), thread_state.key
     device = {"CUDA_VISIBLE_DEVICES": gpus[int(worker.name) % len(gpus)]} if gpus else {}
-    for task in tasks:
+    for message in messages:
         try:
-            outcome = _watched(task, Path(folder), code, device, key, lambda: _wanted(worker, key))
+            outcome = _watched(message, Path(folder), device, key, lambda: _wanted(worker, key))
         except OSError as error:  # no room, no rights, no processes: of this machine, perhaps
             return Outcome("failed", f"{error.filename or folder}: {error.strerror or error}")
         if outcome.state != "done":
@@ -69,9 +67,8 @@ def _wanted(worker: Worker, key: object) -> bool:
 
 
 def _watched(
-    task: Task,
+    message: Message,
     folder: Path,
-    code: str,
     device: dict[str, str],
     key: str,
     wanted: Callable[[], bool],
@@ -89,7 +86,7 @@ def _watched(
             env={
                 "OMP_WAIT_POLICY": "PASSIVE",
                 **os.environ,
-                "OMP_NUM_THREADS": str(task.compute.threads),
+                "OMP_NUM_THREADS": str(message.task.compute.threads),
                 **device,
             },
             # A session of its own: Ctrl-C in the terminal reaches it through its worker alone, once. The lock of the
@@ -102,7 +99,7 @@ def _watched(
         _at_work[key] = process
     try:
         with contextlib.suppress(BrokenPipeError):
-            process.stdin.write(encoded(task, code))
+            process.stdin.write(encoded(message))
             process.stdin.flush()
         while process.poll() is None:
             if not wanted():

@@ -17,7 +17,8 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import Advance, Reporter
 from polarguide.experiments.children import POLL_SECONDS, count_at_work, kill, perform
 from polarguide.experiments.cluster import Workers
-from polarguide.experiments.tasks import Outcome, Task, files_digest
+from polarguide.experiments.tasks import Message, Outcome, Task, files_digest
+from polarguide.results.evaluation.sources import code_digest
 from polarguide.runs.folder import CHECKPOINT, LOG
 
 if TYPE_CHECKING:
@@ -206,9 +207,8 @@ def run_jobs(
 def _handed_out(job: Job, workers: Workers, progress: _Progress) -> _Active:
     future = workers.client.submit(
         perform,
-        tuple(job.tasks()),
+        tuple(Message(task, files_digest(), code_digest()) for task in job.tasks()),
         str(job.folder.absolute()),
-        code=files_digest(),
         gpus=workers.gpus,
         key=f"{job.label} {time.monotonic_ns()}",
         pure=False,

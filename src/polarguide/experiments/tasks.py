@@ -27,7 +27,7 @@ COMMAND = (sys.executable, "-c", PROLOGUE, str(PACKAGE.parent))
 
 @cache
 def files_digest() -> str:
-    """Sixteen hexadecimal digits that change with any byte of this package's code; quick, unlike ``code_digest``."""
+    """Sixteen hexadecimal digits that change with any byte of this package's code."""
     digest = hashlib.sha256()
     for path in sorted(
         (*PACKAGE.rglob("*.py"), *PACKAGE.glob("_native.*.so"), *PACKAGE.glob("_native.*.pyd"))
@@ -60,10 +60,15 @@ Task = Training | Scoring | Processing
 
 
 class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a child reads, on one line: its task, and the ``files_digest`` of who gives it (empty: any will do)."""
+    """What a child reads, on one line: its task, and the code of who gives it.
+
+    Attributes:
+        files: its ``files_digest``. code: its ``code_digest``, which takes seconds, and counts where ``files`` differs.
+    """
 
     task: Task
-    code: str = ""
+    files: str
+    code: str
 
 
 class Outcome(msgspec.Struct, frozen=True):
@@ -79,6 +84,6 @@ class Outcome(msgspec.Struct, frozen=True):
     error: str = ""
 
 
-def encoded(task: Task, code: str = "") -> bytes:
+def encoded(message: Message) -> bytes:
     """A line that a child reads; names of files that are no Unicode are escapes in it."""
-    return json.dumps(msgspec.to_builtins(Message(task, code))).encode() + b"\n"
+    return json.dumps(msgspec.to_builtins(message)).encode() + b"\n"

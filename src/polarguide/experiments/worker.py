@@ -21,6 +21,7 @@ from polarguide.experiments.collection import RUN, Processing
 from polarguide.experiments.tasks import Message, Scoring, Task, files_digest
 from polarguide.raster import use_threads
 from polarguide.results.evaluation.evaluate import evaluate
+from polarguide.results.evaluation.sources import code_digest
 from polarguide.runs.folder import CONFIGURATION, writing_to
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import train
@@ -68,7 +69,7 @@ def obey(line: bytes) -> int:
     """Do a task; returns the exit status (0 done, 130 stopped, 2 wrong input, with one line)."""
     try:
         message: Any = decode(line, Message, "task")
-        check_code(message.code)
+        check_code(message)
         do(message.task)
     except PolarguideError as error:
         print(error, file=sys.stderr)
@@ -81,18 +82,18 @@ def obey(line: bytes) -> int:
     return 0
 
 
-def check_code(code: str) -> None:
-    """Refuse to compute with other code than that of the command: results would be mixed.
+def check_code(message: Message) -> None:
+    """Refuse to compute with other code than that of the command: results would be mixed. Comments do not count.
 
     Raises:
         PolarguideError: this installation differs.
     """
-    if code and code != files_digest():
+    if message.files != files_digest() and message.code != code_digest():
         raise PolarguideError(
             "worker",
-            expected=f"the code of the command (digest {code})",
-            found=f"polarguide {__version__} with digest {files_digest()} in {Path(__file__).parents[1]}",
-            remedy="Install the same version on all machines.",
+            expected=f"the code of the command (digest {message.code})",
+            found=f"polarguide {__version__} with digest {code_digest()} in {Path(__file__).parents[1]}",
+            remedy="Install the same version on all machines, and leave it as it is while the command works.",
         )
 
 
