@@ -124,10 +124,11 @@ def test_the_package_keeps_its_order():
 def test_the_package_itself_imports_nothing_heavy():
     code = (
         "import sys, polarguide; dir(polarguide); polarguide.TrainSettings; "
-        "print('torch' in sys.modules, callable(polarguide.train), 'torch' in sys.modules)"
+        "print('torch' in sys.modules, callable(polarguide.compare), 'torch' in sys.modules); "
+        "print('distributed' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["False", "True", "True"]
+    assert done.stdout.split() == ["False", "True", "True", "False"]
 
 
 def clients_of_the_command_line(root):

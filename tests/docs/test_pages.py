@@ -37,6 +37,10 @@ FOREIGN_OPTIONS = {
         "picture",
         "opensplat",
         "gaussians",
+        "port",
+        "nthreads",
+        "gres",
+        "me",
     ),
 }
 BRITISH = re.compile(

@@ -14,8 +14,9 @@ from heard import Heard
 from polarguide.capture import Scene
 from polarguide.core.options import ComputeOptions, SceneOptions
 from polarguide.experiments import compare as comparing
+from polarguide.experiments.cluster import Workers
 from polarguide.experiments.compare import BESIDE_OTHERS, collect
-from polarguide.experiments.jobs import Job
+from polarguide.experiments.job_queue import Job
 from polarguide.experiments.options import CompareOptions
 from polarguide.experiments.plan import (
     Comparison,
@@ -26,7 +27,7 @@ from polarguide.experiments.plan import (
     scene_entries,
 )
 from polarguide.experiments.record import PartScores
-from polarguide.experiments.worker import Scoring, Training
+from polarguide.experiments.tasks import Scoring, Training
 from polarguide.experiments.writing import write_tables
 from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.evaluate import evaluate
@@ -60,19 +61,18 @@ def score(folder: Path, **changes: Any) -> None:
 
 def test_a_new_run_is_trained_and_scored(planned: Planned) -> None:
     question, _, only = planned
-    train, scoring = comparing._job(question, only, alone=True).tasks
+    train, scoring = comparing._job(question, only, alone=True).tasks()
     assert isinstance(train, Training)
     assert (train.scene, train.folder) == (str(question.scenes[0]), str(only.folder))
     asked = dataclasses.replace(question.settings, refractive_index=1.5)  # the scene names none
     assert (train.settings, train.reading) == (asked, SceneOptions(4, "linear"))
-    assert not train.resume
     assert scoring == Scoring(folder=str(only.folder), speed=True, compute=ComputeOptions(1, "cpu"))
     assert not only.folder.exists()
 
 
 def test_beside_others_no_speed_is_measured_and_that_is_remembered(planned: Planned) -> None:
     question, _, only = planned
-    _, scoring = comparing._job(question, only, alone=False).tasks
+    _, scoring = comparing._job(question, only, alone=False).tasks()
     assert isinstance(scoring, Scoring)
     assert not scoring.speed
     assert (only.folder / BESIDE_OTHERS).exists()
@@ -81,11 +81,9 @@ def test_beside_others_no_speed_is_measured_and_that_is_remembered(planned: Plan
 def test_a_run_is_gone_on_with_where_it_stopped(planned: Planned, trained: Path) -> None:
     question, _, only = planned
     shutil.copytree(trained, only.folder)
-    assert [type(task) for task in comparing._job(question, only, alone=True).tasks] == [Scoring]
+    assert [type(task) for task in comparing._job(question, only, alone=True).tasks()] == [Scoring]
     (only.folder / "point_cloud.ply").unlink()
-    train, _ = comparing._job(question, only, alone=True).tasks
-    assert isinstance(train, Training)
-    assert train.resume
+    assert [type(task) for task in comparing._job(question, only, alone=True).tasks()] == [Training, Scoring]
 
 
 def test_seconds_count_only_alone(planned: Planned, trained: Path) -> None:
@@ -145,8 +143,8 @@ def test_speed_times_what_was_not_timed(
     shutil.copytree(trained, only.folder)
     asked: list[Job] = []
 
-    def instead(jobs: Sequence[Job], *, parallel: int, **_: Any) -> None:
-        assert parallel == 1
+    def instead(jobs: Sequence[Job], at: Workers, **_: Any) -> None:
+        assert at.most == 1
         asked.extend(jobs)
 
     monkeypatch.setattr(comparing, "run_jobs", instead)
@@ -157,5 +155,5 @@ def test_speed_times_what_was_not_timed(
     score(only.folder)
     comparing._time(question, [only], reporter)
     scoring = Scoring(folder=str(only.folder), speed=True, compute=ComputeOptions(1, "cpu"))
-    assert [job.tasks for job in asked] == [(scoring,)]
+    assert [job.tasks() for job in asked] == [(scoring,)]
     assert [text.partition(":")[0] for text in reporter.said][-1:] == ["no speed for 1 runs"]

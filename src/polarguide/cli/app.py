@@ -41,6 +41,7 @@ VERBS = {
     "measure": "measure",
     "compare": "compare",
     "ablate": "ablate",
+    "batch": "batch",
     "synth": "synth",
     "bench": "bench",
     "tables": "tables",

@@ -24,6 +24,7 @@ EXTRAS = {
     "lpips": "the metric lpips",
     "heic": "HEIC photographs",
     "model": "textured models (export --format glb, obj)",
+    "cluster": "compare, ablate, bench and batch on SLURM or PBS",
     "synth": "synth and bench: scenes with ground truth",
 }
 """The extras that users need, and what for; docs and test are for those who change polarguide."""

@@ -56,7 +56,8 @@ def run_bench(
     rows = {} if options.render_only else dict(bench.rows)
     for name in rows:  # hours of rendering should not end in a wrong name
         recipe_named(name)
-    choose_backend(options.device)
+    if options.local:
+        choose_backend(options.device)
     lacking = missing_package() if rows else None
     if lacking is not None:
         reporter.warn(f"mesh scores will have no value: {lacking}")

@@ -21,13 +21,16 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import decode
 from polarguide.core.system import only_writer
 from polarguide.experiments.charts import exposure_svg, read_study, study_svg
-from polarguide.experiments.jobs import STDERR, Job, run_jobs
+from polarguide.experiments.children import STDERR
+from polarguide.experiments.cluster import workers
+from polarguide.experiments.job_queue import Job, run_job, run_jobs
 from polarguide.experiments.options import MOST_SEEDS, CompareOptions
 from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
 from polarguide.experiments.record import FORMAT, REMEDY, Record
 from polarguide.experiments.report import write_report
+from polarguide.experiments.resources import jobs_at_a_time, most_memory, own_gpus
 from polarguide.experiments.results import Results
-from polarguide.experiments.worker import Scoring, Task, Training
+from polarguide.experiments.tasks import Scoring, Task, Training
 from polarguide.experiments.writing import write_tables
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
@@ -101,7 +104,8 @@ def compare(
     refuse_scene(comparison.out)
     if options.against is not None:
         check_choice("against", options.against, [row.name for row in comparison.rows])
-    choose_backend(options.device)
+    if options.local:
+        choose_backend(options.device)
     entries = scene_entries(comparison, reporter)
     plan = plan_runs(comparison, entries)
     make_folder(comparison.out)
@@ -205,12 +209,16 @@ def _train(
 ) -> dict[Path, str]:
     """Train and score what is missing; the last words of what failed, by run folder."""
     unfinished = [run for run in plan if run.state() != "done"]
-    parallel = min(comparison.options.parallel, len(unfinished))
     reporter.say(f"runs: {len(plan)}, of them finished before: {len(plan) - len(unfinished)}")
-    jobs = [_job(comparison, run, alone=parallel == 1) for run in unfinished]
     failures: dict[Path, str] = {}
-    if not jobs:
+    if not unfinished:
         return failures
+    options = comparison.options
+    gpus = own_gpus(choose_backend(options.device)) if options.local else ()
+    memory = most_memory(unfinished)
+    parallel = jobs_at_a_time(options, len(unfinished), memory, gpus)
+    alone = options.local and parallel == 1
+    jobs = [_job(comparison, run, alone=alone) for run in unfinished]
 
     def end(job: Job, error: str | None) -> None:
         if error is None:
@@ -220,7 +228,10 @@ def _train(
         write_tables(comparison.out, collect(comparison, scenes, plan, failures))
 
     try:
-        run_jobs(jobs, parallel=parallel, reporter=reporter, on_end=end)
+        with workers(
+            options, count=parallel, threads=options.threads, memory=memory, gpus=gpus, reporter=reporter
+        ) as at:
+            run_jobs(jobs, at, reporter=reporter, on_end=end)
     except KeyboardInterrupt:
         reporter.say("The runs at work have saved their state: the same comparison goes on with them.")
         raise
@@ -229,25 +240,26 @@ def _train(
 
 def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
     """The tasks that finish a run."""
-    state, compute = run.state(), _compute(comparison)
-    tasks: list[Task] = []
-    if state in ("new", "begun"):
+    compute, folder = _compute(comparison), str(run.folder.absolute())
+    training = Training(
+        scene=str(run.scene.path.absolute()),
+        folder=folder,
+        recipe=run.recipe.name,
+        settings=run.settings,
+        reading=run.reading,
+        compute=compute,
+    )
+    scoring = Scoring(folder, alone, compute)
+
+    def tasks() -> Sequence[Task]:
+        if run.state() not in ("new", "begun"):
+            return (scoring,)
         if not alone:
             make_folder(run.folder)
             write_text(run.folder / BESIDE_OTHERS, "Trained beside other runs: its seconds do not count.\n")
-        tasks.append(
-            Training(
-                scene=str(run.scene.path),
-                folder=str(run.folder),
-                recipe=run.recipe.name,
-                settings=run.settings,
-                reading=run.reading,
-                compute=compute,
-                resume=state == "begun",
-            )
-        )
-    tasks.append(Scoring(str(run.folder), alone, compute))
-    return Job(run.label, run.folder, tuple(tasks), run.steps)
+        return (training, scoring)
+
+    return run_job(run.label, run.folder, tasks, run.steps)
 
 
 def _compute(comparison: Comparison) -> ComputeOptions:
@@ -260,23 +272,32 @@ def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter
     if not untimed:
         return
     reporter.say(f"timing the pictures of {len(untimed)} runs, one after the other")
-    jobs = [
-        Job(run.label, run.folder, (Scoring(str(run.folder), True, _compute(comparison)),), run.steps)
-        for run in untimed
-    ]
-    run_jobs(jobs, parallel=1, reporter=reporter)
+    jobs = [_timing(comparison, run) for run in untimed]
+    options = comparison.options
+    gpus = own_gpus(choose_backend(options.device))
+    with workers(options, count=1, threads=options.threads, memory=0, gpus=gpus, reporter=reporter) as at:
+        run_jobs(jobs, at, reporter=reporter)
     missed = [run for run in untimed if (record := run.metrics()) is None or record["fps"] is None]
     if missed:
         reporter.warn(f"no speed for {len(missed)} runs: they failed, or were not alone on the machine.")
 
 
+def _timing(comparison: Comparison, run: PlannedRun) -> Job:
+    """Score a run again, with its speed."""
+    scoring = Scoring(str(run.folder.absolute()), True, _compute(comparison))
+    return run_job(run.label, run.folder, lambda: (scoring,), run.steps)
+
+
 @contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keep two comparisons out of an existing folder. Children inherit the lock and hold it if the parent is killed."""
+def locked(folder: Path, what: str = "comparison") -> Iterator[None]:
+    """Keep two comparisons (or two of something else) out of an existing folder.
+
+    Children on this machine inherit the lock and hold it if the parent is killed, until they have saved their state.
+    """
     with only_writer(
         folder / LOCK,
         expected="a folder that nobody is writing to",
-        found="another comparison at work in it",
+        found=f"another {what} at work in it",
     ):
         yield
 
@@ -310,7 +331,7 @@ def collect(
             "transfer": options.transfer,
             "refractive_index": settings.refractive_index,
             "threads": options.threads,
-            "jobs": options.parallel,
+            "jobs": options.jobs,
             "against": options.against,
             "background": settings.background,
             "materials": settings.materials,

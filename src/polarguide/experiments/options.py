@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 from polarguide.core.errors import PolarguideError
@@ -12,6 +11,7 @@ from polarguide.core.options import (
     EXPOSURES,
     MOST_THREADS,
     DeviceName,
+    ExportFormat,
     Exposures,
     SceneOptions,
     check_choice,
@@ -22,16 +22,55 @@ from polarguide.training.settings import TrainSettings
 
 MOST_SEEDS = 1000
 """Each is a run of its own for every recipe and scene."""
+Manager = Literal["slurm", "pbs"]
 
 
 @dataclass(frozen=True)
-class CompareOptions(SceneOptions):
+class ClusterOptions:
+    """Where runs are trained.
+
+    Attributes:
+        jobs: Runs at a time; 0 takes as many as this machine has cores, memory and GPUs for, and with a cluster as many
+            as there are. Times are measured only with 1, on this machine.
+        threads: Threads of each run.
+        scheduler: Address of a scheduler of dask.distributed, such as tcp://10.0.0.5:8786: its workers train. They need
+            the same folders and the same version.
+        slurm: Let jobs of SLURM train; dask's jobqueue.yaml has queue, account and time.
+        pbs: The same with PBS.
+    """
+
+    jobs: int = 0
+    threads: int = 1
+    scheduler: str | None = None
+    slurm: bool = False
+    pbs: bool = False
+
+    def __post_init__(self) -> None:
+        check_count("jobs", self.jobs, 0, MOST_THREADS)
+        check_count("threads", self.threads, 1, MOST_THREADS)
+        named = [f"--{name}" for name in ("scheduler", "slurm", "pbs") if getattr(self, name)]
+        if len(named) > 1:
+            raise PolarguideError(
+                named[1], expected="one place to train at", found=" and ".join(named), remedy="Leave one out."
+            )
+
+    @property
+    def manager(self) -> Manager | None:
+        """Whose jobs train."""
+        return "slurm" if self.slurm else "pbs" if self.pbs else None
+
+    @property
+    def local(self) -> bool:
+        """Whether this machine trains."""
+        return self.scheduler is None and self.manager is None
+
+
+@dataclass(frozen=True)
+class CompareOptions(ClusterOptions, SceneOptions):
     """How runs are trained, timed and shown.
 
     Attributes:
         seeds: How many seeds: 3 trains with the seeds 0, 1 and 2, and shows mean and spread.
-        jobs: Runs at a time; 0 takes as many as there are cores for their threads. Times are measured only with 1.
-        threads: Threads of each run.
         speed: At the end time pictures, one run after the other, where that was not done alone before.
         report_views: Test views of each scene in the report; 0 leaves the pictures out.
         device: The device of trainings and renderings.
@@ -43,8 +82,6 @@ class CompareOptions(SceneOptions):
     """
 
     seeds: int = 1
-    jobs: int = 0
-    threads: int = 1
     speed: bool = False
     report_views: int = 3
     device: DeviceName = "auto"
@@ -52,10 +89,16 @@ class CompareOptions(SceneOptions):
     exposures: tuple[Exposures, ...] = ()
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        ClusterOptions.__post_init__(self)
+        SceneOptions.__post_init__(self)
         check_count("seeds", self.seeds, 1, MOST_SEEDS)
-        check_count("jobs", self.jobs, 0, MOST_THREADS)
-        check_count("threads", self.threads, 1, MOST_THREADS)
+        if self.speed and not self.local:
+            raise PolarguideError(
+                "speed",
+                expected="this machine, where nothing else runs meanwhile",
+                found="a cluster",
+                remedy="Leave it out, and repeat the command with --speed, without the cluster, when all is trained.",
+            )
         check_count("report_views", self.report_views, 0)
         for name in self.exposures:
             check_choice("exposures", name, EXPOSURES)
@@ -66,9 +109,22 @@ class CompareOptions(SceneOptions):
             )
 
     @property
-    def parallel(self) -> int:
-        """How many runs work at a time."""
-        return self.jobs or max(1, (os.cpu_count() or 1) // self.threads)
+    def own_device(self) -> DeviceName:
+        """What this machine draws the report on, if others train."""
+        return self.device if self.local else "auto"
+
+
+@dataclass(frozen=True)
+class BatchOptions(ClusterOptions):
+    """How captures are processed.
+
+    Attributes:
+        formats: What to export of each: ply, spz, sog, mesh, points, environment or cameras.
+        device: The device of trainings and renderings.
+    """
+
+    formats: tuple[ExportFormat, ...] = ("ply",)
+    device: DeviceName = "auto"
 
 
 Half = Literal["development", "held-back"]
@@ -123,24 +179,20 @@ BENCH = Bench(
 
 
 @dataclass(frozen=True)
-class BenchOptions:
+class BenchOptions(ClusterOptions):
     """Which part of the bench to run, and on what.
 
     Attributes:
         held_back: The held-back half in place of the development half: once, at the end of a change that claims
             something. Nobody tunes on it.
         render_only: Render the scenes and train nothing.
-        scenes: Some scenes of the half; all if none is given.
-        jobs: Runs at a time; 0 takes as many as there are cores for their threads.
-        threads: Threads of each run. Rendering takes those of all runs together.
+        scenes: Some scenes of the half; all if none is given. Rendering takes the threads of all runs together.
         device: The device of trainings and renderings.
     """
 
     held_back: bool = False
     render_only: bool = False
     scenes: tuple[str, ...] = ()
-    jobs: int = 0
-    threads: int = 1
     device: DeviceName = "auto"
 
     def __post_init__(self) -> None:
@@ -153,7 +205,8 @@ class BenchOptions:
 
     def comparing(self, seeds: int) -> CompareOptions:
         """The options of the comparison."""
-        return CompareOptions(seeds=seeds, jobs=self.jobs, threads=self.threads, device=self.device)
+        where = {field.name: getattr(self, field.name) for field in fields(ClusterOptions)}
+        return CompareOptions(**where, seeds=seeds, device=self.device)
 
     def chosen(self, bench: Bench) -> tuple[str, ...]:
         """The requested scenes, in the order of the bench.

@@ -33,7 +33,8 @@ class Provenance(msgspec.Struct):
 
 
 class Settings(msgspec.Struct):
-    """Settings that all runs share; ``jobs`` of them worked at a time. ``against``: what others are compared with.
+    """Settings that all runs share; ``jobs`` of them worked at a time, 0: as many as had room. ``against``: what others
+    are compared with.
 
     The first records lack the last ones: surroundings were taken to be there, and metals not sought.
     """

@@ -114,7 +114,7 @@ def _scene_views(
 ) -> Iterator[tuple[EmbeddedView | None, str | None]]:
     """The named views of one scene, as ``embed`` gives them; ``limit`` in bytes for each."""
     scene = read_scene(entry.path, comparison.options)
-    opened = [OpenedRun.open(run.folder, device=comparison.options.device) for run in runs]
+    opened = [OpenedRun.open(run.folder, device=comparison.options.own_device) for run in runs]
     scores = [(run.metrics() or {})["views"] for run in runs]
     for name in names:
         view = scene.view(name)

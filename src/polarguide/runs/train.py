@@ -6,7 +6,7 @@ import json
 import math
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -313,6 +313,21 @@ def _planned(
         pixels = pixels_of(Path(scene), reading.downscale)
     gaussians = most_gaussians(sum(pixels), recipe, settings, resumed)
     return family.plan(pixels, recipe, gaussians, reading.memory, in_memory=isinstance(scene, Scene))
+
+
+def expected_memory(
+    pixels: Sequence[int], recipe: Method, settings: TrainSettings, reading: SceneOptions
+) -> int:
+    """Bytes that the process of a training takes at most, as far as headers tell.
+
+    Args:
+        pixels: of each view, as ``forecast.pixels_of`` reads them. recipe, settings, reading: of the training.
+
+    Raises:
+        PolarguideError: the limit in ``reading`` is too small.
+    """
+    gaussians = most_gaussians(sum(pixels), recipe, settings, None)
+    return family_of(recipe).plan(pixels, recipe, gaussians, reading.memory, in_memory=False).peak
 
 
 def _store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter) -> ViewStore:

@@ -1,7 +1,6 @@
-"""Child processes: failures stay alone, Ctrl-C loses nothing, and the worker does what it is sent."""
+"""Jobs on workers: failures stay alone, lost ones go on, Ctrl-C loses nothing, and a child does what it is sent."""
 
 import contextlib
-import io
 import json
 import os
 import signal
@@ -19,41 +18,49 @@ from polarguide.core.options import ComputeOptions, SceneOptions
 from polarguide.core.progress import Advance, Reporter
 from polarguide.core.records import decode
 from polarguide.core.system import interrupt
-from polarguide.experiments import worker
-from polarguide.experiments.jobs import Job, last_row, run_jobs
-from polarguide.experiments.worker import COMMAND, Scoring, Training, encoded
+from polarguide.experiments import children, worker
+from polarguide.experiments.cluster import Workers, workers
+from polarguide.experiments.job_queue import MOST_LOSSES, Job, last_row, run_job, run_jobs
+from polarguide.experiments.options import ClusterOptions
+from polarguide.experiments.tasks import COMMAND, Message, Scoring, Training, encoded, files_digest
 from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide.training.settings import TrainSettings
 
 # Reads its task, writes down that it begins, does what the name of the device asks for, and writes down the end.
 PROGRAM = """
 import json, os, pathlib, signal, sys, time
-task = json.load(sys.stdin)
+task = json.loads(sys.stdin.readline())["task"]
 verb, folder = task["compute"]["device"], pathlib.Path(task["folder"])
 with open(folder / "did", "a") as did:
     print(verb, task["compute"]["threads"], os.environ["OMP_NUM_THREADS"], file=did)
+begun = len((folder / "did").read_text().splitlines())
 if verb == "fail":
     print("a warning\\n" + folder.name + " is broken.\\n", file=sys.stderr)
     sys.exit(2)
 if verb == "quiet":
     sys.exit(3)
+if verb == "always killed" or verb == "killed" and begun <= 4:
+    os.kill(os.getpid(), signal.SIGKILL)
+if verb == "preempted" and begun == 1:
+    sys.exit(130)
 if verb in ("wait", "deaf"):
-    count = 0
-    def asked(*_):
-        global count
-        count += 1
-        (folder / "heard").touch()
-    signal.signal(signal.SIGINT, asked)
     (folder / "ready").touch()
-    end = time.monotonic() + 30
-    while (verb == "deaf" or not count) and time.monotonic() < end:
-        time.sleep(0.02)
-    time.sleep(0.3)
-    (folder / "asked").write_text(str(count))
+    assert sys.stdin.read() == ""
+    (folder / "heard").touch()
+    time.sleep(0.3 if verb == "wait" else 30)
+    (folder / "saved").touch()
     sys.exit(130)
 time.sleep(0.2)
 """
 STAND_IN = (sys.executable, "-S", "-c", PROGRAM)
+
+
+@pytest.fixture
+def two(monkeypatch: pytest.MonkeyPatch) -> Iterator[Workers]:
+    """Two workers, whose children are the stand-in."""
+    monkeypatch.setattr(children, "COMMAND", STAND_IN)
+    with workers(ClusterOptions(), count=2, threads=1, memory=0, gpus=(), reporter=Reporter()) as at:
+        yield at
 
 
 @pytest.fixture
@@ -63,7 +70,7 @@ def job(tmp_path: Path) -> Callable[..., Job]:
     def make(name: str, *verbs: str) -> Job:
         folder = tmp_path / name
         tasks = [Scoring(folder=str(folder), speed=False, compute=ComputeOptions(3, verb)) for verb in verbs]  # type: ignore[arg-type]
-        return Job(name, folder, tuple(tasks), 10)
+        return run_job(name, folder, lambda: tuple(tasks), 10)
 
     return make
 
@@ -100,17 +107,31 @@ class Watch(Reporter):
         self.open.remove(label)
 
 
-def test_a_failure_takes_no_other_job_down(job: Callable[..., Job]) -> None:
+def test_a_failure_takes_no_other_job_down(two: Workers, job: Callable[..., Job]) -> None:
     watch = Watch()
     todo = [job("a", "train", "eval"), job("b", "fail", "eval"), job("c", "quiet")]
-    run_jobs(todo, parallel=2, reporter=watch, on_end=watch.end, command=STAND_IN)
+    run_jobs(todo, two, reporter=watch, on_end=watch.end)
     assert watch.ended == {"a": None, "b": "b is broken.", "c": "the process ended with status 3"}
     assert set(watch.said) == {"done  a", "failed  b: b is broken.", f"failed  c: {watch.ended['c']}"}
     assert watch.most == 2
     assert watch.open == set()
-    assert watch.overall[-1] == (30, "3/3 runs")
+    assert watch.overall[-1] == (30, "3 of 3 ended")
     did = [(j.folder / "did").read_text().split("\n")[:-1] for j in todo]
     assert did == [["train 3 3", "eval 3 3"], ["fail 3 3"], ["quiet 3 3"]]
+
+
+@pytest.mark.parametrize(
+    ("verb", "losses", "ends"),
+    [("killed", 4, True), ("preempted", 1, True), ("always killed", MOST_LOSSES - 1, False)],
+)
+def test_a_job_that_is_lost_goes_on(
+    two: Workers, job: Callable[..., Job], verb: str, losses: int, ends: bool
+) -> None:
+    watch = Watch()
+    run_jobs([job("a", verb), job("b", "eval")], two, reporter=watch, on_end=watch.end)
+    assert sum(line.startswith("lost  a") for line in watch.said) == losses
+    assert (watch.ended["a"] is None) == ends
+    assert watch.ended["b"] is None
 
 
 def interrupt_when(*conditions: Callable[[], bool]) -> threading.Thread:
@@ -128,29 +149,29 @@ def interrupt_when(*conditions: Callable[[], bool]) -> threading.Thread:
     return thread
 
 
-def test_ctrl_c_asks_every_child_once_and_waits(job: Callable[..., Job]) -> None:
+def test_ctrl_c_asks_every_child_and_waits(two: Workers, job: Callable[..., Job]) -> None:
     watch, todo = Watch(), [job("a", "wait"), job("b", "wait"), job("c", "wait")]
     thread = interrupt_when(lambda: all((j.folder / "ready").exists() for j in todo[:2]))
     with pytest.raises(KeyboardInterrupt):
-        run_jobs(todo, parallel=2, reporter=watch, on_end=watch.end, command=STAND_IN)
-    assert [(j.folder / "asked").read_text() for j in todo[:2]] == ["1", "1"]
+        run_jobs(todo, two, reporter=watch, on_end=watch.end)
+    assert [(j.folder / "saved").exists() for j in todo] == [True, True, False]
     assert not todo[2].folder.exists()
     assert watch.ended == {}
     thread.join()
 
 
-def test_a_second_ctrl_c_does_not_wait(job: Callable[..., Job]) -> None:
+def test_a_second_ctrl_c_does_not_wait(two: Workers, job: Callable[..., Job]) -> None:
     deaf = job("a", "deaf")
     begin = time.monotonic()
     thread = interrupt_when((deaf.folder / "ready").exists, (deaf.folder / "heard").exists)
     with pytest.raises(KeyboardInterrupt):
-        run_jobs([deaf], parallel=1, reporter=Watch(), command=STAND_IN)
+        run_jobs([deaf], two, reporter=Watch())
     assert time.monotonic() - begin < 20
-    assert not (deaf.folder / "asked").exists()
+    assert not (deaf.folder / "saved").exists()
     thread.join()
 
 
-def test_an_error_of_the_reporter_leaves_no_child_at_work(job: Callable[..., Job]) -> None:
+def test_an_error_of_the_reporter_leaves_no_child_at_work(two: Workers, job: Callable[..., Job]) -> None:
     waiting = job("a", "wait")
 
     def fail() -> None:
@@ -158,11 +179,11 @@ def test_an_error_of_the_reporter_leaves_no_child_at_work(job: Callable[..., Job
             raise RuntimeError("no display")
 
     with pytest.raises(RuntimeError, match="no display"):
-        run_jobs([waiting], parallel=1, reporter=Watch(fail), command=STAND_IN)
-    assert (waiting.folder / "asked").read_text() == "1"
+        run_jobs([waiting], two, reporter=Watch(fail))
+    assert (waiting.folder / "saved").exists()
 
 
-def test_sigterm_acts_like_ctrl_c(job: Callable[..., Job]) -> None:
+def test_sigterm_acts_like_ctrl_c(two: Workers, job: Callable[..., Job]) -> None:
     waiting = job("a", "wait")
 
     def terminate() -> None:
@@ -172,18 +193,18 @@ def test_sigterm_acts_like_ctrl_c(job: Callable[..., Job]) -> None:
     before = signal.signal(signal.SIGTERM, interrupt)
     try:
         with pytest.raises(KeyboardInterrupt):
-            run_jobs([waiting], parallel=1, reporter=Watch(terminate), command=STAND_IN)
+            run_jobs([waiting], two, reporter=Watch(terminate))
     finally:
         signal.signal(signal.SIGTERM, before)
-    assert (waiting.folder / "asked").read_text() == "1"
+    assert (waiting.folder / "saved").exists()
 
 
-def test_the_library_installs_no_signal_handlers(job: Callable[..., Job]) -> None:
+def test_the_library_installs_no_signal_handlers(two: Workers, job: Callable[..., Job]) -> None:
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = [signal.getsignal(number) for number in numbers]
     during = []
     watch = Watch(lambda: during.append([signal.getsignal(number) for number in numbers]))
-    run_jobs([job("a", "eval")], parallel=1, reporter=watch, command=STAND_IN)
+    run_jobs([job("a", "eval")], two, reporter=watch)
     assert during
     assert all(handlers == before for handlers in during)
 
@@ -210,21 +231,23 @@ def test_a_log_that_is_a_pipe(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["stderr.txt", "log.jsonl"])
-def test_nothing_is_written_through_a_link(job: Callable[..., Job], tmp_path: Path, name: str) -> None:
+def test_nothing_is_written_through_a_link(
+    two: Workers, job: Callable[..., Job], tmp_path: Path, name: str
+) -> None:
     made, victim = job("a", "eval"), tmp_path / "victim"
     victim.write_text("mine")
     made.folder.mkdir()
     (made.folder / name).symlink_to(victim)
-    run_jobs([made], parallel=1, reporter=Watch(), command=STAND_IN)
+    run_jobs([made], two, reporter=Watch())
     assert victim.read_text() == "mine"
 
 
-def test_pipes_in_a_runs_folder_end_nothing(job: Callable[..., Job]) -> None:
+def test_pipes_in_a_runs_folder_end_nothing(two: Workers, job: Callable[..., Job]) -> None:
     made = job("a", "eval")
     made.folder.mkdir()
     for name in ("stderr.txt", "log.jsonl"):
         os.mkfifo(made.folder / name)
-    run_jobs([made], parallel=1, reporter=Watch(), command=STAND_IN)
+    run_jobs([made], two, reporter=Watch())
     assert (made.folder / "did").read_text().startswith("eval")
 
 
@@ -239,17 +262,23 @@ def training(scene: Path, folder: Path, steps: int = 20) -> Training:
         settings=TrainSettings(steps, 0),
         reading=SceneOptions(8),
         compute=ComputeOptions(1, "cpu"),
-        resume=False,
     )
 
 
-def work(data: bytes, folder: Path) -> subprocess.CompletedProcess[bytes]:
-    return subprocess.run(COMMAND, input=data, cwd=folder, capture_output=True, timeout=PATIENCE)
+@contextlib.contextmanager
+def child(task: Training, folder: Path) -> Iterator["subprocess.Popen[bytes]"]:
+    """A child at work on a task, with its standard input open."""
+    pipes = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(COMMAND, cwd=folder, **pipes) as process:  # type: ignore[call-overload]
+        process.stdin.write(encoded(Message(task, files_digest(), "")))
+        process.stdin.flush()
+        yield process
 
 
 def test_a_task_survives_its_way(tmp_path: Path) -> None:
     for task in (training(tmp_path, tmp_path / "out"), Scoring("run", True, ComputeOptions(2, "cpu"))):
-        assert decode(encoded(task), Training | Scoring, "task") == task  # type: ignore[arg-type]
+        message = Message(task, "1f", "2e")
+        assert decode(encoded(message), Message, "task") == message
 
 
 def test_nothing_is_imported_from_the_current_folder(demo_scene: Path, tmp_path: Path) -> None:
@@ -258,64 +287,54 @@ def test_nothing_is_imported_from_the_current_folder(demo_scene: Path, tmp_path:
         (tmp_path / f"{name}.py").write_text(
             "open('imported', 'a').write(__name__ + '\\n')\nraise SystemExit(9)"
         )
-    done = work(encoded(training(demo_scene, tmp_path / "run")), tmp_path)
-    assert done.stderr.decode() == ""
-    assert done.returncode == 0
+    with child(training(demo_scene, tmp_path / "run"), tmp_path) as process:
+        assert process.wait(PATIENCE) == 0
+        assert process.stderr.read() == b""  # type: ignore[union-attr]
     assert not (tmp_path / "imported").exists()
     assert (tmp_path / "run" / CHECKPOINT).exists()
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
-        ({"settings": {"steps": "many", "seed": 0}}, "task (settings.steps): expected a whole number"),
-        ({"reading": {"transfer": "gamma"}}, "task (reading.transfer): expected"),
+        ({"settings": {"steps": "many", "seed": 0}}, "task (task.settings.steps): expected a whole number"),
+        ({"reading": {"transfer": "gamma"}}, "task (task.reading.transfer): expected"),
         ({"surprise": 1}, "task"),
         ({"type": "dance"}, "task"),
         ({"scene": "no-such-scene"}, "no-such-scene: expected"),
         ({"recipe": "magic"}, "recipe: expected one of"),
+        ({}, "worker: expected the code of the command (digest other)"),
     ],
 )
 def test_a_wrong_task_is_refused_in_one_line(
     demo_scene: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     change: dict[str, object],
-    said: str,
+    message: str,
 ) -> None:
-    data = msgspec.to_builtins(training(demo_scene, tmp_path / "run")) | change
-    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(json.dumps(data).encode())))
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        assert worker.main() == 2
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    task = msgspec.to_builtins(training(demo_scene, tmp_path / "run")) | change
+    files = files_digest() if change else "others"
+    assert worker.obey(json.dumps({"task": task, "files": files, "code": "other"}).encode()) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert said in line
-    assert not (tmp_path / "run").exists()
+    assert message in line
+    assert not (tmp_path / "run" / "run.json").exists()
 
 
-def test_what_is_no_task_is_refused(tmp_path: Path) -> None:
-    done = work(b"\xff{", tmp_path)
-    assert done.returncode == 2
-    assert len(done.stderr.decode().splitlines()) == 1
+def test_a_line_that_is_no_task_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert worker.obey(b"\xff{") == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 @pytest.mark.slow
-def test_a_stopped_training_saves_its_state(demo_scene: Path, tmp_path: Path) -> None:
+def test_a_training_that_nobody_waits_for_saves_its_state(demo_scene: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    process = subprocess.Popen(COMMAND, stdin=subprocess.PIPE, cwd=tmp_path, stderr=subprocess.PIPE)
-    assert process.stdin is not None
-    assert process.stderr is not None
-    with process.stdin as stdin:
-        stdin.write(encoded(training(demo_scene, run, steps=5000)))
-    give_up = time.monotonic() + PATIENCE
-    while not (run / LOG).exists() and time.monotonic() < give_up:
-        assert process.poll() is None
-        time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
-    assert process.wait(PATIENCE) == 130
-    with process.stderr as stderr:
-        assert stderr.read() == b""
+    with child(training(demo_scene, run, steps=5000), tmp_path) as process:
+        give_up = time.monotonic() + PATIENCE
+        while not (run / LOG).exists() and time.monotonic() < give_up:
+            assert process.poll() is None
+            time.sleep(0.02)
+        process.stdin.close()  # type: ignore[union-attr]
+        assert process.wait(PATIENCE) == 130
+        assert process.stderr.read() == b""  # type: ignore[union-attr]
     assert (run / CHECKPOINT).exists()

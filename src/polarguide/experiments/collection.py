@@ -1,0 +1,129 @@
+"""A collection of captures and how far each is, as the files of a batch say. Does not import torch."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import write_whole
+from polarguide.core.options import ComputeOptions, ExportFormat, SceneOptions
+from polarguide.core.records import read_record, to_json
+from polarguide.preparation.settings import PrepareSettings
+from polarguide.training.settings import TrainSettings
+
+FORMAT = 1
+RECORD = "capture.json"
+SCENE, INSPECTION, RUN, EXPORT, SHARE = "scene", "inspection", "run", "export", "share.html"
+"""In the folder of each capture."""
+Step = Literal["prepare", "inspect", "train", "eval", "share", "export"]
+STEPS: tuple[Step, ...] = ("prepare", "inspect", "train", "eval", "share", "export")
+NO_FILES = (0, 0, 0)
+"""The stamp of a folder that is empty, or not there."""
+
+
+class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a capture's results follow from.
+
+    Attributes:
+        source: absolute path of its folder. stamp: number, size and newest time of its files.
+        prepare: ``PrepareSettings.record()``; None: the source is a scene already.
+        recipe, settings, reading: of the training. formats: of the export.
+    """
+
+    source: str
+    stamp: tuple[int, int, int]
+    prepare: dict[str, Any] | None
+    recipe: str
+    settings: TrainSettings
+    reading: SceneOptions
+    formats: tuple[ExportFormat, ...]
+
+
+class Processing(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="process"):
+    """Take a capture from its files to its exports, as far as that is still to do."""
+
+    name: str
+    folder: str
+    request: Request
+    compute: ComputeOptions
+
+
+class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How far a capture is.
+
+    Attributes:
+        done: the steps that are finished. at: the one that was begun last.
+        verdict, findings: of the inspection; all but those that are ok.
+        pictures: of one view, label and data URI each. files: exported, relative to the capture's folder.
+    """
+
+    format: int
+    request: Request
+    done: tuple[Step, ...] = ()
+    at: Step | None = None
+    verdict: str = ""
+    findings: tuple[str, ...] = ()
+    pictures: tuple[tuple[str, str], ...] = ()
+    files: tuple[str, ...] = ()
+
+    def save(self, folder: Path) -> None:
+        """Write it in one step."""
+        write_whole(folder / RECORD, to_json(msgspec.to_builtins(self)))
+
+    @staticmethod
+    def load(folder: Path) -> CaptureRecord | None:
+        """That of a folder; None where there is none yet.
+
+        Raises:
+            PolarguideError: it is no such record.
+        """
+        if not os.path.lexists(folder / RECORD):
+            return None
+        record: Any = read_record(folder / RECORD, CaptureRecord, remedy="Remove the folder to begin again.")
+        return record if isinstance(record, CaptureRecord) else None
+
+    def require(self, request: Request, folder: Path) -> None:
+        """Refuse to go on with another request than it was begun with; one that is done may lose its source.
+
+        Raises:
+            PolarguideError: they differ.
+        """
+        if request.stamp == NO_FILES and set(self.done) == set(STEPS):
+            return
+        for name in Request.__struct_fields__:
+            before, now = getattr(self.request, name), getattr(request, name)
+            if before != now:
+                raise PolarguideError(
+                    folder,
+                    expected=f"the capture and options that it was begun with ({name})",
+                    found="files that have changed since" if name == "stamp" else "others",
+                    remedy="Remove this folder to begin again, or give another --out.",
+                )
+
+
+def prepare_settings(record: dict[str, Any]) -> PrepareSettings:
+    """The settings of ``PrepareSettings.record()``."""
+    return msgspec.convert(
+        record,
+        PrepareSettings,
+        strict=False,
+        dec_hook=lambda kind, value: kind(value) if kind is Path else value,
+    )
+
+
+def source_stamp(folder: Path) -> tuple[int, int, int]:
+    """Number of files below a folder, their bytes, and when the newest was changed (ns); without hidden ones."""
+    count = size = newest = 0
+    for at, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in names:
+            with contextlib.suppress(OSError):  # it has gone meanwhile
+                state = os.stat(os.path.join(at, name))
+                if not name.startswith("."):
+                    count, size, newest = count + 1, size + state.st_size, max(newest, state.st_mtime_ns)
+    return count, size, newest

@@ -1,0 +1,72 @@
+"""``polarguide batch``: what names captures, what their options mean, and which tables are refused."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from faults import Fault
+
+from polarguide.cli import batch as verb
+from polarguide.cli.app import run
+from polarguide.experiments import batch as batches
+from polarguide.experiments.batch import Capture
+from polarguide.experiments.options import BatchOptions
+
+OPTIONS = BatchOptions(jobs=1, device="cpu")
+HEAD = "name,path,sensor,options\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("name,where\n", Fault("first line", "name and path", "where")),
+        ("", Fault("first line", found="nothing")),
+        (HEAD, Fault("list.csv", found="no capture")),
+        (HEAD + "cup,a\n", Fault("line 2", "4 values", "fewer")),
+        (HEAD + "cup,a,,,,\n", Fault("line 2", "4 values", "more")),
+        (HEAD + "../cup,a,,\n", Fault("line 2", "name")),
+        (HEAD + "cup,,,\n", Fault("line 2", "path")),
+        (HEAD + "cup,a,,\n\nCup,b,,\n", Fault("line 4", "names of their own", "line 2")),
+        (HEAD + "cup,a,IMX,\n", Fault("line 2", "prepare and train", "IMX")),
+        (HEAD + "cup,a,,--stepz 3\n", Fault("line 2", "prepare and train", "--stepz")),
+        (HEAD + 'cup,a,,"--steps ""3"\n', Fault("line 2", "command line")),
+        (HEAD + "cup,a,,--steps 0\n", Fault("steps", "1 or more", "0")),
+        (HEAD + "cup,a,,--white-balance red\n", Fault("--white-balance", found="red")),
+    ],
+)
+def test_a_wrong_table_is_refused_before_anything_is_written(tmp_path: Path, text: str, fault: Fault) -> None:
+    (tmp_path / "list.csv").write_text(text)
+    fault.raised_by(verb.batch, tmp_path / "list.csv", out=tmp_path / "out", settings=OPTIONS)
+    assert not (tmp_path / "out").exists()
+
+
+def test_tables_and_folders_name_captures(
+    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Options are those of prepare and of train, common ones first; a scene with poses takes those of train alone."""
+    asked: list[list[Capture]] = []
+
+    def instead(captures: list[Capture], out: Path, *_: Any, **__: Any) -> list[Any]:
+        asked.append(captures)
+        return []
+
+    monkeypatch.setattr(batches, "run_batch", instead)
+    (tmp_path / "list.csv").write_text(
+        "\ufeffName; path; sensor; options\n"
+        "cup; shots/cup; IMX250MYR; --poses none --steps 40 --zero 12\n"
+        f"demo; {demo_scene}; ; --recipe 3dgs --downscale 2\n",
+        encoding="utf-8",
+    )
+    out = str(tmp_path / "out")
+    assert run(["batch", str(tmp_path / "list.csv"), "--out", out, "--options=--steps 7"]) == 0
+    cup, demo = asked.pop()
+    assert (cup.name, cup.path) == ("cup", tmp_path / "shots" / "cup")
+    assert (cup.prepare.sensor, cup.prepare.poses, cup.prepare.calibration.zero) == ("IMX250MYR", "none", 12)
+    assert (cup.settings.steps, cup.recipe) == (40, "polarguide-stokes")
+    assert (demo.path, demo.recipe, demo.settings.steps, demo.reading.downscale) == (demo_scene, "3dgs", 7, 2)
+
+    for name in ("b", "a", ".hidden", "out"):
+        (tmp_path / "all" / name).mkdir(parents=True)
+    (tmp_path / "all" / "notes.txt").touch()
+    assert run(["batch", str(tmp_path / "all"), "--out", str(tmp_path / "all" / "out")]) == 0
+    assert [capture.name for capture in asked.pop()] == ["a", "b"]
