@@ -89,7 +89,7 @@ def panels(keys: Sequence[str], height: float, **options: Any) -> tuple[Figure, 
     """A figure as wide as a page's text, with a panel for each metric, named by it."""
     figure, axes = pyplot.subplots(1, len(keys), figsize=(9.6, height), layout="constrained", **options)
     for axis, key in zip(axes, keys, strict=True):
-        axis.set_title(BY_KEY[key].heading, fontsize=9)
+        axis.set_title(BY_KEY[key].heading.replace(" without", "\nwithout"), fontsize=9)
     return figure, list(axes)
 
 
