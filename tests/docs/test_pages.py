@@ -16,7 +16,8 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCS, PACKAGE = ROOT / "docs", ROOT / "src" / "polarguide"
 GENERATED = (DOCS / "generated", DOCS / "reference" / "api")
 PAGES = sorted(p for p in DOCS.rglob("*.md") if not any(made in p.parents for made in GENERATED))
-TEXTS = [*PAGES, *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"))]
+BESIDE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "research/trials.md")
+TEXTS = [*PAGES, *(ROOT / name for name in BESIDE)]
 
 FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 # Folders of the repository whose files the pages name.

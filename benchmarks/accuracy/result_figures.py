@@ -1,0 +1,225 @@
+"""Figures and short tables of docs/results, from the records in benchmarks/results.
+
+    python benchmarks/accuracy/result_figures.py            # draws docs/figures/results-*.svg
+    python benchmarks/accuracy/result_figures.py --tables   # prints the same values as Markdown
+
+Quality by recipe, by material, by number of views and by polarizer angles of each view. Every point is one scene, the
+mean of its seeds. No record varies the noise of the pictures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from bench_tables import BY_KEY, Rows, Value, of_run, read_scenes, values
+from matplotlib import pyplot
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+ROOT = Path(__file__).resolve().parents[2]
+RECORDS, FIGURES = ROOT / "benchmarks" / "results", ROOT / "docs" / "figures"
+BENCH = sorted(p for p in (RECORDS / "bench").glob("*.json") if p.name != "faster-geometry.json")
+"""The eleven scenes of the bench. faster-geometry.json has other rows, of an earlier commit."""
+BASELINE = "3dgs-dr"
+RECIPES = (
+    "3dgs",
+    "3dgs-dr:consistent",
+    "ref-gs",
+    "polarguide-paper",
+    "polarguide-paper:kind",
+    "polarguide",
+    "polarguide-stokes:unpolarized",
+    "polarguide-stokes",
+)
+THREE = (BASELINE, "polarguide-stokes:unpolarized", "polarguide-stokes")
+MATERIALS = ("dielectric", "rough dielectric", "metal", "rough metal")
+ANGLES = ("four", "two", "one", "unknown", "none")
+PICTURE = ("psnr", "psnr_foreground")
+NORMALS, LAYERS = ("normal_mae_deg",), ("specular_psnr", "diffuse_psnr")
+DIELECTRIC = ("specular_psnr_dielectric", "diffuse_psnr_dielectric")
+COLORS = ("#777777", "#e69f00", "#0072b2", "#009e73")
+"""Of Okabe and Ito: told apart by color-blind readers, and in gray."""
+STYLE = {
+    "svg.fonttype": "none",  # text stays text: small files that can be searched
+    "svg.hashsalt": "polarguide",  # the same file from the same records
+    "font.family": "sans-serif",
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+}
+Scenes = Mapping[str, Rows]
+
+
+def by_scene(scenes: Scenes, recipe: str, value: Value) -> dict[str, float]:
+    """The mean over seeds of a recipe, by scene; scenes without a value are left out."""
+    means = {scene: list(values(rows.get(recipe, {}), value).values()) for scene, rows in scenes.items()}
+    return {scene: statistics.fmean(known) for scene, known in means.items() if known}
+
+
+def of_material(name: str, key: str) -> Value:
+    """A metric over the pixels of a material in a run."""
+    return lambda run: (run["materials"] or {}).get(name, {"metrics": {}})["metrics"].get(key)
+
+
+def table(
+    corner: str, keys: Sequence[str], rows: Mapping[str, Callable[[str], Mapping[str, float]]]
+) -> Iterator[str]:
+    """A Markdown table of means over scenes: a row each, its values by scene from a function of the metric."""
+    yield f"| {corner} | {' | '.join(BY_KEY[key].heading for key in keys)} |"
+    yield f"|---|{'---:|' * len(keys)}"
+    for name, value in rows.items():
+        cells = []
+        for key in keys:
+            known = list(value(key).values())
+            mean = BY_KEY[key].factor * statistics.fmean(known) if known else None
+            cells.append("n/a" if mean is None else f"{mean:.{BY_KEY[key].digits}f}")
+        yield f"| {name} | {' | '.join(cells)} |"
+
+
+def panels(keys: Sequence[str], height: float, **options: Any) -> tuple[Figure, list[Axes]]:
+    """A figure as wide as a page's text, with a panel for each metric, named by it."""
+    figure, axes = pyplot.subplots(1, len(keys), figsize=(9.6, height), layout="constrained", **options)
+    for axis, key in zip(axes, keys, strict=True):
+        axis.set_title(BY_KEY[key].heading.replace(" without", "\nwithout"), fontsize=9)
+    return figure, list(axes)
+
+
+def save(figure: Figure, name: str) -> None:
+    """Write a figure to docs/figures."""
+    figure.savefig(FIGURES / f"results-{name}.svg", metadata={"Date": None})
+    pyplot.close(figure)
+
+
+def draw_recipes(scenes: Scenes) -> None:
+    """The gain of every recipe over the baseline: a dot for each scene, a bar for their mean."""
+    keys = (*PICTURE, *NORMALS, *DIELECTRIC)
+    figure, axes = panels(keys, 3.4, sharey=True)
+    for axis, key in zip(axes, keys, strict=True):
+        base = by_scene(scenes, BASELINE, of_run(key))
+        for row, recipe in enumerate(RECIPES):
+            own = by_scene(scenes, recipe, of_run(key))
+            gains = [own[scene] - base[scene] for scene in own if scene in base]
+            if gains:
+                color = COLORS[2] if recipe == RECIPES[-1] else COLORS[0]
+                axis.plot(gains, [row] * len(gains), "o", color=color, alpha=0.45, markersize=4, mew=0)
+                axis.plot(statistics.fmean(gains), row, "|", color=color, markersize=18, markeredgewidth=2.5)
+        axis.axvline(0, color="#222222", linewidth=0.8)
+    axes[0].set_yticks(range(len(RECIPES)), RECIPES)
+    axes[0].invert_yaxis()
+    figure.supxlabel(f"difference to {BASELINE}; dots are scenes, bars their mean", fontsize=9)
+    save(figure, "recipes")
+
+
+def draw_materials(scenes: Scenes) -> None:
+    """Normals and layers over the pixels of each material, of three recipes."""
+    keys = (*NORMALS, *LAYERS)
+    figure, axes = panels(keys, 2.9)
+    for axis, key in zip(axes, keys, strict=True):
+        for index, recipe in enumerate(THREE):
+            label = recipe
+            for place, material in enumerate(MATERIALS):
+                known = list(by_scene(scenes, recipe, of_material(material, key)).values())
+                at = place + 0.24 * (index - 1)
+                axis.plot([at] * len(known), known, "o", color=COLORS[index], alpha=0.4, markersize=4, mew=0)
+                axis.plot(
+                    at, statistics.fmean(known), "_", color=COLORS[index], markersize=12, mew=3, label=label
+                )
+                label = "_"  # one entry of the legend for each recipe
+        axis.set_xticks(range(len(MATERIALS)), [name.replace(" ", "\n") for name in MATERIALS])
+        axis.grid(visible=False, axis="x")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    save(figure, "materials")
+
+
+def draw_views(scenes: Scenes, recipes: Sequence[str]) -> None:
+    """Quality over the number of training views."""
+    keys = ("psnr_foreground", *NORMALS, "specular_psnr")
+    figure, axes = panels(keys, 2.9)
+    counts = [int(scene.removeprefix("views-")) for scene in scenes]
+    for axis, key in zip(axes, keys, strict=True):
+        for color, recipe in zip((COLORS[1], COLORS[0], COLORS[3], COLORS[2]), recipes, strict=True):
+            known = list(by_scene(scenes, recipe, of_run(key)).values())
+            if known:
+                axis.plot(counts, known, "o-", color=color, label=recipe, markersize=4)
+        axis.set_xscale("log", base=2)
+        axis.set_xticks(counts, [str(count) for count in counts])
+        axis.set_xlabel("training views")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    save(figure, "views")
+
+
+def draw_angles(scenes: Scenes) -> None:
+    """Quality over the polarizer angles of each training view: a line for each scene, and their mean."""
+    keys = ("psnr_foreground", *NORMALS, *LAYERS)
+    figure, axes = panels(keys, 2.8)
+    for axis, key in zip(axes, keys, strict=True):
+        known = {words: by_scene(scenes, words, of_run(key)) for words in ANGLES}
+        for scene in scenes:
+            axis.plot(
+                [known[words][scene] for words in ANGLES], "o-", color=COLORS[0], alpha=0.45, markersize=3
+            )
+        means = [statistics.fmean(known[words].values()) for words in ANGLES]
+        axis.plot(means, "o-", color=COLORS[2], linewidth=2.2, markersize=5)
+        axis.set_xticks(range(len(ANGLES)), ANGLES, rotation=35)
+    figure.supxlabel(
+        "angles of each training view; thin lines are scenes, the thick one their mean", fontsize=9
+    )
+    save(figure, "angles")
+
+
+def tables(bench: Scenes, angles: Scenes) -> Iterator[str]:
+    """The values that the figures by recipe, material and angles show, as Markdown."""
+    keys = (*PICTURE, *NORMALS, *DIELECTRIC)
+    yield "## By recipe\n"
+    every = (BASELINE, *RECIPES)
+    yield from table(
+        "recipe", keys, {f"`{name}`": lambda k, name=name: by_scene(bench, name, of_run(k)) for name in every}
+    )
+    yield "\n## By material\n"
+    cells = {
+        f"{material}, `{name}`": lambda k, name=name, material=material: by_scene(
+            bench, name, of_material(material, k)
+        )
+        for material in MATERIALS
+        for name in THREE
+    }
+    yield from table("material, recipe", (*NORMALS, *LAYERS), cells)
+    yield "\n## By angles\n"
+    keys = (*PICTURE, *NORMALS, *LAYERS, "stokes_error")
+    yield from table(
+        "angles",
+        keys,
+        {f"`{words}`": lambda k, words=words: by_scene(angles, words, of_run(k)) for words in ANGLES},
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--tables", action="store_true", help="print the values, and draw nothing")
+    options = parser.parse_args()
+    bench, angles = read_scenes(BENCH), read_scenes([RECORDS / "exposures.json"])
+    if options.tables:
+        print(*tables(bench, angles), sep="\n")
+        return
+    views = read_scenes([RECORDS / "cup-views.json"])
+    mpl.use("svg")
+    mpl.rcParams.update(STYLE)
+    draw_recipes(bench)
+    draw_materials(bench)
+    draw_views(views, list(next(iter(views.values()))))
+    draw_angles(angles)
+
+
+if __name__ == "__main__":
+    main()
