@@ -379,7 +379,7 @@ def _check_scene(scene: Scene) -> None:
 
 
 def _first_difference(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
-    """Where two records differ first, as ``recipe_data.metal_rules.prior``, and both values (None: not recorded)."""
+    """Where two records differ first, as ``recipe_data.metal_rules.begin``, and both values (None: not recorded)."""
     if isinstance(a, dict) and isinstance(b, dict):
         key = next(key for key in {**a, **b} if a.get(key) != b.get(key))
         return _first_difference(f"{name}.{key}", a.get(key), b.get(key))
