@@ -8,6 +8,7 @@ import importlib
 import io
 import re
 import shlex
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +19,8 @@ import tyro
 from polarguide.cli.console import JobReporter, say, use_threads
 from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.files import read_file
-from polarguide.core.options import EXPORT_PACKAGES, SceneOptions
+from polarguide.core.options import EXPORT_PACKAGES, SceneOptions, check_finite
+from polarguide.experiments.collection import NO_FILES, source_stamp
 from polarguide.experiments.options import BatchOptions
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 from polarguide.training.settings import TrainSettings
@@ -38,6 +40,7 @@ def batch(
     *,
     out: Path,
     options: str = "",
+    watch: float | None = None,
     settings: Annotated[BatchOptions, tyro.conf.arg(name="")],
 ) -> None:
     """Prepare, inspect, train, score, share and export every capture of a collection, with one page over all.
@@ -52,27 +55,65 @@ def batch(
         out: Folder to write.
         options: Options of prepare and train for all captures: --options="--poses sfm --steps 3000". Those of a line of
             the CSV file go before them.
+        watch: Look for new captures every so many seconds, until Ctrl-C, as at a capture station. A capture begins once
+            nothing in its folder has changed from one look to the next.
     """
     use_threads(settings.threads)
     for kind in settings.formats:
         for package in EXPORT_PACKAGES.get(kind, ()):
             require_package(package, f"--formats {kind}")
-    running = importlib.import_module("polarguide.experiments.batch")
-    captures = [
-        _capture(running.Capture, line, running.is_scene(line.path), options)
-        for line in _lines(collection, out)
-    ]
-    rows = running.run_batch(captures, out, settings, reporter=JobReporter())
-    say(f"page: {out / 'index.html'}   table: {out / 'results.csv'}")
-    failed = [row for row in rows if row.state == "failed"]
-    if failed:
-        errors = "; ".join(f"{row.name}: {row.error}" for row in failed)
-        raise PolarguideError(
-            out,
-            expected=f"{len(rows)} finished captures",
-            found=f"that {len(failed)} failed ({errors})",
-            remedy="The others are finished. Remove the cause and give the same command again.",
-        )
+
+    def process(lines: Sequence[_Line]) -> None:
+        running = importlib.import_module("polarguide.experiments.batch")
+        captures = [_capture(running.Capture, line, running.is_scene(line.path), options) for line in lines]
+        rows = running.run_batch(captures, out, settings, reporter=JobReporter())
+        say(f"page: {out / 'index.html'}   table: {out / 'results.csv'}")
+        failed = [row for row in rows if row.state == "failed"]
+        if failed:
+            errors = "; ".join(f"{row.name}: {row.error}" for row in failed)
+            raise PolarguideError(
+                out,
+                expected=f"{len(rows)} finished captures",
+                found=f"that {len(failed)} failed ({errors})",
+                remedy="The others are finished. Remove the cause and give the same command again.",
+            )
+
+    if watch is None:
+        process(_lines(collection, out))
+    else:
+        check_finite("watch", watch, 1, 86_400)
+        if not collection.is_file():
+            _folders(collection, out)  # there may be none yet, but a place for them
+        _watched(lambda: _lines(collection, out), process, watch)
+
+
+def _watched(
+    look: Callable[[], Sequence[_Line]], process: Callable[[Sequence[_Line]], None], seconds: float
+) -> None:
+    """Process captures as they come, until KeyboardInterrupt; what is wrong with one is printed, and the next awaited.
+
+    Args:
+        look: the captures that are there. process: those that are complete, whenever one is new or has changed.
+    """
+    say(f"looking for captures every {seconds:g} seconds; Ctrl-C ends it")
+    earlier: dict[str, tuple[int, int, int]] = {}
+    processed: dict[str, tuple[int, int, int]] = {}
+    told = ""
+    while True:
+        try:
+            lines = look()
+            now = {line.name: source_stamp(line.path) for line in lines}
+            complete = [line for line in lines if NO_FILES != now[line.name] == earlier.get(line.name)]
+            earlier = now
+            stamps = {line.name: now[line.name] for line in complete}
+            if not stamps.items() <= processed.items():
+                processed |= stamps
+                process(complete)
+        except PolarguideError as error:
+            if str(error) != told:
+                say(str(error))
+            told = str(error)
+        time.sleep(seconds)
 
 
 @dataclass(frozen=True)
