@@ -39,7 +39,7 @@ SHOWN = re.compile(
 CHOICES = re.compile(r"# (\w+(?: \| \w+)+)")
 
 EXCLUDED = {
-    "polarguide batch captures --out results": "trains as often as there are captures: tests/experiments/test_batch.py",
+    "polarguide batch captures --out results": "trains several captures: tests/experiments/test_collections.py",
     "make demo": "makes .venv, and runs polarguide demo there",
     "make test": "runs this test",
     "make docs": "CI runs it",

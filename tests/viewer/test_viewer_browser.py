@@ -24,7 +24,8 @@ from polarguide.visualization import figures
 
 pytestmark = pytest.mark.slow
 WIDTH, HEIGHT = 960, 600
-FREE = np.s_[200:, : WIDTH - 350]  # neither under the panel nor under what viser says of software rendering
+# Not under the panel, what viser says of software rendering, or the key of normals.
+FREE = np.s_[200:520, : WIDTH - 350]
 HOSTILE = '<img src=x onerror="window.hurt=1">{window.hurt=1}'
 
 
