@@ -104,5 +104,6 @@ def test_a_watched_folder_is_taken_once_nothing_in_it_changes(
         verb.batch(tmp_path / "all", out=tmp_path / "out", watch=5, settings=OPTIONS)
     printed = capsys.readouterr()
     assert (printed.out + printed.err).count("broken") == 1
+    assert "no capture" not in printed.out + printed.err  # an empty station waits
     nowhere = tmp_path / "nowhere"
     Fault("nowhere", found="no such").raised_by(verb.batch, nowhere, out=tmp_path, watch=5, settings=OPTIONS)

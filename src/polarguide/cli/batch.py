@@ -79,7 +79,15 @@ def batch(
             )
 
     if watch is None:
-        process(_lines(collection, out))
+        lines = _lines(collection, out)
+        if not lines:
+            raise PolarguideError(
+                collection,
+                expected="a folder of captures, or a table of them",
+                found="no capture",
+                remedy="Put each capture into a folder of its own, or write a CSV file with the columns name and path.",
+            )
+        process(lines)
     else:
         check_finite("watch", watch, 1, 86_400)
         if not collection.is_file():
@@ -134,13 +142,6 @@ def _lines(collection: Path, out: Path) -> list[_Line]:
         PolarguideError: it is neither a folder of folders nor such a table.
     """
     lines = _table(collection) if collection.is_file() else _folders(collection, out)
-    if not lines:
-        raise PolarguideError(
-            collection,
-            expected="a folder of captures, or a table of them",
-            found="no capture",
-            remedy="Put each capture into a folder of its own, or write a CSV file with the columns name and path.",
-        )
     taken: dict[str, str] = {}
     for line in lines:
         if not _NAME.fullmatch(line.name):
