@@ -5,6 +5,7 @@ import json
 import math
 import shlex
 import shutil
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -115,3 +116,11 @@ def test_the_default_is_silent(capsys: pytest.CaptureFixture[str]) -> None:
     with SILENT.track("c", None) as advance:
         advance(1, total=2, note="d")
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_library_that_takes_ctrl_c_gives_it_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "takes_ctrl_c.py").write_text("import signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    before = signal.getsignal(signal.SIGINT)
+    assert errors.optional_import("takes_ctrl_c", "a test").__name__ == "takes_ctrl_c"
+    assert signal.getsignal(signal.SIGINT) is before

@@ -1,5 +1,6 @@
 """Workers elsewhere: one that is killed changes nothing, and a cluster that cannot be reached is one line."""
 
+import importlib.util
 import os
 import signal
 import threading
@@ -13,6 +14,7 @@ from faults import Fault
 from heard import Heard
 from trainings import different
 
+from polarguide.core.errors import optional_import
 from polarguide.core.progress import SILENT
 from polarguide.experiments import cluster as clusters
 from polarguide.experiments.cluster import workers
@@ -99,7 +101,9 @@ def test_a_cluster_that_is_not_there_is_one_line(
 
 
 def test_the_script_of_a_job_asks_for_what_a_run_takes(monkeypatch: pytest.MonkeyPatch) -> None:
-    jobqueue = pytest.importorskip("dask_jobqueue", reason="no dask-jobqueue -> pip install '.[cluster]'")
+    if importlib.util.find_spec("dask_jobqueue") is None:
+        pytest.skip("no dask-jobqueue -> pip install '.[cluster]'")
+    jobqueue = optional_import("dask_jobqueue", "--slurm")
     monkeypatch.setattr("shutil.which", str)
     made: list[dict[str, Any]] = []
 

@@ -9,6 +9,7 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -148,6 +149,8 @@ def require_package(module: str, what: str, *, extra: str = "") -> None:
 def optional_import(module: str, what: str, *, extra: str = "") -> Any:
     """Import a library that most verbs do without: then it costs them no time, and may be missing.
 
+    Ctrl-C does what it did: dask_jobqueue, for one, would make every later one end the process at once.
+
     Args:
         module: its name. what: what it is needed for, as the message says. extra: the extra of polarguide that
             brings it; empty: it comes with polarguide.
@@ -155,10 +158,14 @@ def optional_import(module: str, what: str, *, extra: str = "") -> Any:
     Raises:
         PolarguideError: it is not installed.
     """
+    before = signal.getsignal(signal.SIGINT)
     try:
         return importlib.import_module(module)
     except ImportError:
         raise _missing(module, what, extra) from None
+    finally:
+        if before is not None and signal.getsignal(signal.SIGINT) is not before:
+            signal.signal(signal.SIGINT, before)
 
 
 def _missing(module: str, what: str, extra: str = "") -> PolarguideError:
