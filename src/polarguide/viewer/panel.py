@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from polarguide.capture.presentation import Crop, Presentation, Vector
+from polarguide.capture.presentation import STOPS, Crop, Presentation, Vector
 from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
 from polarguide.viewer.presenting import PresentingControls
 from polarguide.viewer.scenery import MEASURED, Appearance
@@ -16,7 +16,7 @@ STEPS = ("previous", "next")
 NOTHING = Presentation()
 # Ranges of the controls.
 SIDES = ("Left, right", "Down, up", "Front, back")
-EXPOSURE, STRENGTH, TURN, SECONDS, CROP = (-4.0, 4.0), (0.0, 2.0), (-180, 180), (0.5, 10.0), (-150, 150)
+EXPOSURE, STRENGTH, TURN, SECONDS, CROP = (-STOPS, STOPS), (0.0, 2.0), (-180, 180), (0.5, 10.0), (-150, 150)
 WIPE = 0, 100
 
 
@@ -66,7 +66,9 @@ class Panel:
             (*layers, *MEASURED),
             hint=f"From {MEASURED[0]} on, a photograph's pose is needed; stokes, dolp and aolp are predicted",
         )
-        self.exposure = gui.add_slider("Exposure", *EXPOSURE, 0.1, 0.0, hint="In stops")
+        self.exposure = gui.add_slider(
+            "Exposure", *EXPOSURE, 0.1, options.presentation.exposure or 0.0, hint="In stops"
+        )
         self.strength = gui.add_slider("Reflection", *STRENGTH, 0.05, 1.0, visible="specular" in layers)
         hint = "Rotates the environment light, in degrees; the scene stays"
         self.turn = gui.add_slider("Environment", *TURN, 1, 0, hint=hint, visible=options.turns)
@@ -152,6 +154,7 @@ class Panel:
             turn=float(self.turn.value),
             crop=self.crop(chosen.up_axis),
             white_balance=chosen.white_balance,
+            chart=chosen.chart,
             up_axis=chosen.up_axis,
             wipe=float(self.wipe.value) / 100,
         )

@@ -213,7 +213,11 @@ class Session:
         if self._soon_again("presentation"):
             return "Saved just now"
         chosen = self._presenting.chosen
-        chosen = msgspec.structs.replace(chosen, crop=self.panel.crop(chosen.up_axis))
+        chosen = msgspec.structs.replace(
+            chosen,
+            crop=self.panel.crop(chosen.up_axis),
+            exposure=float(self.panel.exposure.value) or None,
+        )
         if self._save is not None:
             return self._save(chosen)
         content = to_json(chosen.to_record())
