@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,14 +52,31 @@ class Panel:
         gui: viser's handle of the session's controls.
         options: the controls to show.
         changed: called after every change that affects the picture.
+        folded: whether the controls begin folded, behind the one word that opens them. On a phone viser's panel begins
+            open and covers half of the picture, and nothing that a server sends can fold it.
     """
 
-    def __init__(self, gui: Any, options: PanelOptions, changed: Callable[[], None]) -> None:
+    def __init__(
+        self, gui: Any, options: PanelOptions, changed: Callable[[], None], *, folded: bool = False
+    ) -> None:
         self._crop: list[Any] = []
         # The box as it was saved, until a slider is moved; its sides are more exact than the sliders' steps.
         self._saved_crop = options.presentation.crop
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._status, self._lines, self._note = gui.add_markdown(""), tuple[str, ...](), ""
+        with gui.add_folder("Controls", expand_by_default=False) if folded else nullcontext():
+            self._add_controls(gui, options)
+        self.accepts = self._accepted([*options.layers, *MEASURED], options.views)
+        controls = (
+            *(self.layer, self.exposure, self.strength, self.turn, self.wipe),
+            *(self._use_crop, *self._crop),
+        )
+        for control in self._crop:
+            control.on_update(lambda _: self._forget_saved())
+        for control in controls:
+            control.on_update(lambda _: changed())
+
+    def _add_controls(self, gui: Any, options: PanelOptions) -> None:
         self.pause = gui.add_checkbox("Pause training", False, visible=options.trains)
         layers = options.layers
         self.layer = gui.add_dropdown(
@@ -92,15 +110,6 @@ class Panel:
             self.seconds = gui.add_slider("Seconds per segment", *SECONDS, 0.5, 2.0)
             self.play = gui.add_button("Play")
             self.save_path = gui.add_button("Save path")
-        self.accepts = self._accepted([*layers, *MEASURED], options.views)
-        controls = (
-            *(self.layer, self.exposure, self.strength, self.turn, self.wipe),
-            *(self._use_crop, *self._crop),
-        )
-        for control in self._crop:
-            control.on_update(lambda _: self._forget_saved())
-        for control in controls:
-            control.on_update(lambda _: changed())
 
     def _forget_saved(self) -> None:
         self._saved_crop = None

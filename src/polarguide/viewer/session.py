@@ -135,7 +135,8 @@ class Session:
         first = next(iter(photographs.values())).view.camera
         self._size = first.width, first.height
         self._keyframes = Keyframes(self._size)
-        self.panel = Panel(client.gui, options, lambda: self._caught(self._changed)(None))
+        upright = client.camera.image_width < client.camera.image_height  # as phones are held
+        self.panel = Panel(client.gui, options, lambda: self._caught(self._changed)(None), folded=upright)
         self._save = save
         self._presenting = Presenting(
             client,
