@@ -12,6 +12,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from polarguide.capture.presentation import colored
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import refit_sh_to_display, write_ply
 from polarguide.geometry.camera import Camera
@@ -165,10 +166,12 @@ def gaussian_colors(gaussians: Parameters, light: Light, shading: ShadingModel, 
 
 
 @torch.no_grad()
-def shown_colors(state: TrainingState, shading: ShadingModel, directions: Tensor) -> Tensor:
-    """``gaussian_colors`` of a training for display, [N, K, 3] in [0, 1]."""
+def shown_colors(
+    state: TrainingState, shading: ShadingModel, directions: Tensor, color: Tensor | None = None
+) -> Tensor:
+    """``gaussian_colors`` of a training for display, [N, K, 3] in [0, 1]; ``color`` of a presentation."""
     linear = _toward(state.gaussians, state.light, shading, directions)
-    return torch.stack([srgb_encode(color.clamp(0, 1)) for color in linear], dim=1)
+    return torch.stack([srgb_encode(colored(each, color).clamp(0, 1)) for each in linear], dim=1)
 
 
 def _toward(gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor) -> list[Tensor]:
@@ -206,12 +209,19 @@ def learned_normals(gaussians: Parameters, centers: Tensor | None) -> Tensor:
 
 @torch.no_grad()
 def write_run_ply(
-    path: Path, state: TrainingState, shading: ShadingModel, centers: Tensor | None = None
+    path: Path,
+    state: TrainingState,
+    shading: ShadingModel,
+    centers: Tensor | None = None,
+    color: Tensor | None = None,
 ) -> None:
-    """Write the trained Gaussians; see the module's text, and ``learned_normals`` for the centers of the cameras."""
+    """Write the trained Gaussians; see the module's text, and ``learned_normals`` for the centers of the cameras.
+
+    ``color`` of a presentation holds for the harmonics that other programs show, never for our own linear fields.
+    """
     gaussians = state.gaussians
     dc, rest = refit_sh_to_display(
-        lambda directions: shown_colors(state, shading, directions).cpu(), len(gaussians)
+        lambda directions: shown_colors(state, shading, directions, color).cpu(), len(gaussians)
     )
     plain = {
         name: gaussians[name].detach().cpu()

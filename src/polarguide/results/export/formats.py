@@ -13,7 +13,7 @@ from torch import Tensor
 
 from polarguide.capture import read_model
 from polarguide.capture.layout import refuse_scene
-from polarguide.capture.presentation import balanced
+from polarguide.capture.presentation import colored
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import holds_files, make_folder, require_inside, temporary_folder, write_text
 from polarguide.core.options import ExportFormat, ModelOptions, PathLike, check_choice, check_finite
@@ -62,7 +62,7 @@ def export(
     model: ModelOptions = ModelOptions(),
     reporter: Reporter = SILENT,
 ) -> list[Path]:
-    """Write a run as the files of other programs, as it is presented: cropped, in meters, upright (see ``Placement``).
+    """Write a run as the files of other programs, as it is presented: in its color, cropped, in meters, upright.
 
     Args:
         run: the run; its scene is read for all but ply, spz and sog.
@@ -201,7 +201,8 @@ def _ply(run: OpenedRun, presented: _Presented, path: Path, placement: Placement
     with temporary_folder(path.with_suffix(".whole")) as folder:
         whole = folder / path.name
         model = run.gaussian_model("format ply")
-        write_run_ply(whole, model.state, model.shading, _camera_centers(run))
+        color = presented.presentation.color
+        write_run_ply(whole, model.state, model.shading, _camera_centers(run), color)
         selected = None if presented.kept is None else presented.kept.cpu()
         rewrite_splats(path, whole, placement or presented.placement, selected, presented.comments)
     return path
@@ -252,6 +253,8 @@ def _mesh(
     if (crop := presented.presentation.crop) is not None:
         inside = crop.inside(torch.from_numpy(mesh.surface.vertices), run.camera_frame).numpy()
         mesh = mesh.within(inside)
+    shown = colored(torch.from_numpy(mesh.colors), presented.presentation.color).clamp(max=1)
+    mesh = replace(mesh, colors=shown.numpy())
     paths = [folder / "mesh.glb", folder / "mesh.ply"]
     for path in paths:
         write_mesh(path, mesh, run.frame, presented.placement, presented.origin)
@@ -308,19 +311,21 @@ def _points(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
     path, model, placement = folder / "points.ply", run.gaussian_model("format points"), presented.placement
     assert presented.gaussians is not None
     views, rasterize = run.scene.views, model.backend.rasterize
-    places, normals, colors = surface_points(presented.gaussians, model.shading, views, rasterize)
+    color = presented.presentation.color
+    places, normals, colors = surface_points(presented.gaussians, model.shading, views, rasterize, color)
     write_points(path, placement.points(places), placement.directions(normals), colors, presented.comments)
     return [path]
 
 
 def _environment(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
     cubemap = needs_radiance(run.model.shading, what="format")
-    picture = panorama(run.light[cubemap.name], cubemap, run.frame, PANORAMA_HEIGHT)
+    learned = panorama(run.light[cubemap.name], cubemap, run.frame, PANORAMA_HEIGHT)
+    picture = colored(learned, presented.presentation.color)
     paths = [folder / f"environment.{kind}" for kind in ("exr", "hdr", "png")]
     credit = presented.presentation.credit
     write_exr(paths[0], picture, {"owner": credit} if credit else {})
     write_hdr(paths[1], picture)
-    figures.write_png(paths[2], figures.radiance_to_rgb(balanced(picture, presented.presentation.gains)))
+    figures.write_png(paths[2], figures.radiance_to_rgb(picture))
     return paths
 
 
