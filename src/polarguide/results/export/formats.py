@@ -20,6 +20,7 @@ from polarguide.core.options import ExportFormat, ModelOptions, PathLike, check_
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.fields.model import FieldModel
 from polarguide.geometry.camera import Camera
+from polarguide.optics.color import srgb_encode
 from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
 from polarguide.results.evaluation.table import shown_metrics
 from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
@@ -35,6 +36,7 @@ from polarguide.results.export.placement import (
     write_transforms,
 )
 from polarguide.results.export.share import share_page
+from polarguide.results.export.splat_glb import COLOR_SPACES, Encoding, write_splat_glb
 from polarguide.results.export.splats import write_sog, write_spz
 from polarguide.results.rendering.mesh import RESOLUTION, implicit_mesh, scene_mesh
 from polarguide.results.rendering.relight import needs_radiance, panorama, write_exr, write_hdr
@@ -48,7 +50,7 @@ from polarguide.visualization import figures
 TRANSFORMS = "transforms.json"
 
 PANORAMA_HEIGHT = 512
-SPLATS = ("ply", "spz", "sog", "points")
+SPLATS = ("ply", "spz", "sog", "splat-glb", "points")
 """Formats of Gaussians."""
 
 
@@ -66,10 +68,10 @@ def export(
 
     Args:
         run: the run; its scene is read for all but ply, spz and sog.
-        format: ply, spz and sog are ordinary splats, with reflections baked as far as harmonics carry them; mesh (GLB
-            and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb and obj are a
-            textured model; points are opaque Gaussians with normals; environment is the learned light as a panorama
-            (EXR, HDR and PNG); cameras are a COLMAP model and transforms.json.
+        format: ply, spz, sog and splat-glb are ordinary splats, with reflections baked as far as harmonics carry
+            them; mesh (GLB and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb and
+            obj are a textured model; points are opaque Gaussians with normals; environment is the learned light as a
+            panorama (EXR, HDR and PNG); cameras are a COLMAP model and transforms.json.
         out: folder to write; ``export`` in the run's folder by default.
         resolution: voxels of the mesh along its longest side, 16 to 1024.
         spz_version: of the SPZ file, 3 or 4; readers are split between them.
@@ -90,6 +92,7 @@ def export(
         "ply": lambda: [_ply(run, presented, folder / "splats.ply")],
         "spz": lambda: [_spz(run, presented, folder / "splats.spz", spz_version)],
         "sog": lambda: [_sog(run, presented, folder / "splats.sog")],
+        "splat-glb": lambda: _splat_glb(run, presented, folder),
         "mesh": lambda: _mesh(run, presented, folder, resolution, reporter),
         "glb": lambda: _model(run, presented, folder, resolution, model, reporter, "glb"),
         "obj": lambda: _model(run, presented, folder, resolution, model, reporter, "obj"),
@@ -191,18 +194,30 @@ class _Presented:
         )
         self.origin = Origin(self.presentation, made_of)
 
+    def upright(self, run: OpenedRun) -> Placement:
+        """The placement in formats whose up is +y."""
+        axes = run.frame.panorama_axes()
+        return replace(self.placement, rotation=axes.T, upright=True)
+
     @property
     def comments(self) -> list[str]:
         """For the head of a file."""
         return comments(self.origin, self.placement)
 
 
-def _ply(run: OpenedRun, presented: _Presented, path: Path, placement: Placement | None = None) -> Path:
+def _ply(
+    run: OpenedRun,
+    presented: _Presented,
+    path: Path,
+    placement: Placement | None = None,
+    *,
+    linear: bool = False,
+) -> Path:
     with temporary_folder(path.with_suffix(".whole")) as folder:
         whole = folder / path.name
         model = run.gaussian_model("format ply")
         color = presented.presentation.color
-        write_run_ply(whole, model.state, model.shading, _camera_centers(run), color)
+        write_run_ply(whole, model.state, model.shading, _camera_centers(run), color=color, linear=linear)
         selected = None if presented.kept is None else presented.kept.cpu()
         rewrite_splats(path, whole, placement or presented.placement, selected, presented.comments)
     return path
@@ -241,6 +256,17 @@ def _sog(run: OpenedRun, presented: _Presented, path: Path) -> Path:
         ply = _ply(run, presented, place / "splats.ply")
         write_sog(path, ply, {**({"copyright": credit} if credit else {}), **about})
     return path
+
+
+def _splat_glb(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
+    """From PLY files that are gone afterwards, one for each kind of reader."""
+    place = presented.upright(run)
+    paths: dict[Encoding, Path] = {kind: folder / f"splats-{kind}.glb" for kind in COLOR_SPACES}
+    with temporary_folder(folder / "splats.ply") as parts:
+        for kind, path in paths.items():
+            ply = _ply(run, presented, parts / f"{kind}.ply", place, linear=kind == "linear")
+            write_splat_glb(path, ply, asset_record(place, presented.origin), kind)
+    return [*paths.values()]
 
 
 def _mesh(
@@ -311,8 +337,8 @@ def _points(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
     path, model, placement = folder / "points.ply", run.gaussian_model("format points"), presented.placement
     assert presented.gaussians is not None
     views, rasterize = run.scene.views, model.backend.rasterize
-    color = presented.presentation.color
-    places, normals, colors = surface_points(presented.gaussians, model.shading, views, rasterize, color)
+    places, normals, linear = surface_points(presented.gaussians, model.shading, views, rasterize)
+    colors = srgb_encode(colored(linear, presented.presentation.color).clamp(0, 1))
     write_points(path, placement.points(places), placement.directions(normals), colors, presented.comments)
     return [path]
 

@@ -12,7 +12,6 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from polarguide.capture import View
-from polarguide.capture.presentation import colored
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import atomic, write_whole
 from polarguide.gaussians.gaussians import CORE_SHAPES
@@ -105,11 +104,8 @@ def surface_points(
     shading: ShadingModel,
     views: Iterable[View],
     rasterize: Rasterize,
-    color: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Positions, outward unit normals and display colors, each [M, 3], of opaque Gaussians that a view sees.
-
-    ``color`` is that of a presentation.
+    """Positions, outward unit normals and linear diffuse colors, each [M, 3], of opaque Gaussians that a view sees.
 
     Raises:
         PolarguideError: there are none.
@@ -130,9 +126,7 @@ def surface_points(
     )
     normals = torch.where((normals * side).sum(dim=1, keepdim=True) < 0, -normals, normals)
     few = {name: gaussians[name][indices] for name in (*CORE_SHAPES, *shading.parameters)}
-    linear = shading.diffuse_colors(few, -normals.contiguous())
-    colors = srgb_encode(colored(linear, color).clamp(0, 1))
-    return means, normals, colors
+    return means, normals, shading.diffuse_colors(few, -normals.contiguous())
 
 
 def write_points(

@@ -18,12 +18,11 @@ from torch.nn.functional import normalize, pad
 from polarguide import __version__
 from polarguide.capture.presentation import STOPS, Presentation
 from polarguide.gaussians.geometry import shortest_axis_normals
-from polarguide.gaussians.ply import refit_sh_to_display
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.trajectory import camera_record
 from polarguide.raster.interface import MINIMUM_ALPHA
-from polarguide.runs.model import gaussian_colors
+from polarguide.runs.model import baked_harmonics
 from polarguide.shading.cubemap import ringed_texels
 from polarguide.shading.model import PLAIN_LAYERS, Light, PageShading, Parameters, ShadingModel
 from polarguide.visualization.pages import page, page_part
@@ -288,10 +287,7 @@ def share_page(
 
 def baked_page(gaussians: Parameters, light: Light, shading: ShadingModel) -> PageShading:
     """The page of a model for which there are no shaders: linear harmonics of its Gaussians' own colors, and a note."""
-    count = len(gaussians["means"])
-    dc, rest = refit_sh_to_display(
-        lambda directions: gaussian_colors(gaussians, light, shading, directions).cpu(), count
-    )
+    dc, rest = baked_harmonics(gaussians, light, shading, shown=lambda colors: colors, linear=True)
     return PageShading("plain", {"color": dc[:, 0], "harmonics": rest}, notes=[BAKED])
 
 
