@@ -7,11 +7,11 @@ import json
 from pathlib import Path
 
 import pytest
+from faults import Fault
 from single_shots import single_shots
 
 import polarguide
 from polarguide.capture.exposures import Exposure
-from polarguide.core.errors import PolarguideError
 from polarguide.inspection.settings import InspectSettings
 from polarguide.inspection.shots import ShotFindings, shot_checks
 from polarguide.inspection.verdict import Check
@@ -138,8 +138,7 @@ def test_a_folder_of_single_shots(whole_demo: Path, tmp_path: Path) -> None:
 def test_a_calibration_needs_four_pictures(demo_scene: Path, tmp_path: Path) -> None:
     scene = single_shots(demo_scene, tmp_path / "shots")
     settings = InspectSettings(calibration=tmp_path / "none.json")
-    with pytest.raises(PolarguideError, match="--calibration"):
-        polarguide.inspect(scene, tmp_path / "out", settings=settings)
+    Fault("--calibration").raised_by(polarguide.inspect, scene, tmp_path / "out", settings=settings)
 
 
 def test_ordinary_photographs_are_not_wrong(demo_scene: Path, tmp_path: Path) -> None:
