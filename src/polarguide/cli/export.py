@@ -34,8 +34,8 @@ def export(
     ply, spz, sog and splat-glb are ordinary splats, with reflections baked as far as harmonics carry them; mesh (GLB
     and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb (or obj) is a textured model
     for Blender, game engines and viewers of glTF, whose base color has neither highlights nor shading; points are
-    opaque Gaussians with normals; environment is the learned light as a panorama (EXR, HDR and PNG); cameras are a COLMAP model and
-    transforms.json.
+    opaque Gaussians with normals; environment is the learned light as a panorama (EXR, HDR and PNG); cameras are a
+    COLMAP model and transforms.json.
 
     Args:
         run: Run folder.

@@ -13,11 +13,13 @@ import pytest
 import torch
 from random_runs import random_state
 
+from polarguide import open_run
 from polarguide.capture.presentation import Presentation, write_presentation
-from polarguide.cli.app import run
+from polarguide.core.options import ModelOptions
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.ply import read_ply
 from polarguide.optics.color import srgb_decode_array
+from polarguide.results.export.formats import export
 from polarguide.results.export.splat_glb import COLOR_SPACES, EXTENSION, write_splat_glb
 from polarguide.runs.model import write_run_ply
 
@@ -82,9 +84,11 @@ def test_both_variants_show_the_same_upright_and_balanced(trained: Path, tmp_pat
     read = {}
     for name, gains in (("as it is", None), ("balanced", (1.0, 0.5, 1.0))):
         if gains:
-            write_presentation(copy, Presentation((*gains,), (0.0, 0.3, 1.0), 0.5))
+            write_presentation(
+                copy, Presentation(white_balance=gains, up_axis=(0.0, 0.3, 1.0), meters_per_unit=0.5)
+            )
         out = tmp_path / name
-        assert run(["export", str(copy), "--format", "splat-glb", "--out", str(out), "--threads", "1"]) == 0
+        export(open_run(copy), "splat-glb", out)
         assert sorted(path.name for path in out.iterdir()) == ["splats-linear.glb", "splats-srgb.glb"]
         read[name] = {kind: read_glb(out / f"splats-{kind}.glb")[1] for kind in COLOR_SPACES}
     place = read_ply(copy / "point_cloud.ply")["means"].double().numpy()
@@ -110,13 +114,12 @@ def test_both_variants_show_the_same_upright_and_balanced(trained: Path, tmp_pat
     reason="no gltf-validator -> apt-get install nodejs npm; make test",
 )
 @pytest.mark.parametrize("kind", ["mesh", "glb", "splat-glb"])
-def test_the_validator_has_nothing_to_say(kind: str, trained: Path, tmp_path: Path) -> None:
+def test_the_validator_has_nothing_to_say(kind: Any, trained: Path, tmp_path: Path) -> None:
     """No error and no warning; of splats none but that it does not know their extension."""
-    more = ["--triangles", "500", "--texture", "128", "--resolution", "32"] if kind == "glb" else []
     assert NODE is not None
-    for options in ([*more], [*more, "--unlit"])[: 2 if more else 1]:
-        command = ["export", str(trained), "--format", kind, "--out", str(tmp_path), "--threads", "1"]
-        assert run([*command, *options]) == 0
+    for unlit in (False, True) if kind == "glb" else (False,):
+        options = ModelOptions(triangles=500, texture=128, unlit=unlit)
+        export(open_run(trained), kind, tmp_path, resolution=32, model=options)
     files = sorted(tmp_path.glob("*.glb"))
     assert len(files) == (1 if kind == "mesh" else 2)
     for path in files:
