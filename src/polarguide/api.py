@@ -14,7 +14,7 @@ from typing import Any
 from polarguide.capture import Scene
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.metadata import refractive_index_of
-from polarguide.capture.thumbnails import figure, table
+from polarguide.capture.view import figure, table
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file, require_folder
 from polarguide.core.options import (
@@ -27,7 +27,7 @@ from polarguide.core.options import (
 )
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.inspection.inspect import Inspection, inspect_scene, inspection_folder
-from polarguide.inspection.record import write_inspection
+from polarguide.inspection.report import write_inspection
 from polarguide.inspection.settings import InspectSettings
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.raster import choose_backend

@@ -15,7 +15,7 @@ from heard import Heard
 from tiny_capture import NAMES, TinyCapture
 
 from polarguide.capture import load_scene
-from polarguide.capture.split import TEST_EVERY, chosen_views, far_from_training, held_out_band
+from polarguide.capture.scene import TEST_EVERY, chosen_views, far_from_training, held_out_band
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.camera import Camera, look_at
 

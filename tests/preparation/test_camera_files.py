@@ -11,17 +11,17 @@ from camera_files import pack
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
+from polarguide.capture.checks import measured_gains, pair_moments
 from polarguide.capture.filter.develop import (
     align_shots,
     decide_transfer,
     estimate_shifts,
     require_known_encoding,
 )
+from polarguide.capture.filter.exif import stated_exponent
 from polarguide.capture.filter.shots import Shots
-from polarguide.capture.formats.icc import stated_exponent
 from polarguide.capture.formats.pictures import decode_mask, decode_picture
-from polarguide.capture.pair_sums import measured_gains, pair_moments
-from polarguide.capture.sensor.defects import defects
+from polarguide.capture.sensor.demosaic import defects
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
 from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
 from polarguide.core.errors import PolarguideError

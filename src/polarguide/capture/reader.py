@@ -17,14 +17,11 @@ from polarguide.capture import checks
 from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unseen_points, unused_poses
 from polarguide.capture.formats.pictures import TRANSFERS
 from polarguide.capture.ground_truth import GroundTruth, objects_of
-from polarguide.capture.layout import Layout, find_layout, select_views
-from polarguide.capture.memory import check_memory, stated_size
+from polarguide.capture.layout import Layout, check_memory, find_layout, select_views, stated_size
 from polarguide.capture.metadata import held_out, indices_of, mount_of, refractive_index_of
-from polarguide.capture.scene import Scene
-from polarguide.capture.split import chosen_views, far_from_training, held_out_band
-from polarguide.capture.stored import StoredViews
+from polarguide.capture.scene import Scene, chosen_views, far_from_training, held_out_band
 from polarguide.capture.view import listed
-from polarguide.capture.view_reader import Files, ViewData, ViewFiles, check_materials, read_view
+from polarguide.capture.view_reader import Files, StoredViews, ViewData, ViewFiles, check_materials, read_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import Split, check_choice
 from polarguide.core.progress import SILENT, Reporter

@@ -49,7 +49,7 @@ from polarguide.capture.filter.shots import (
     require_four_shots,
 )
 from polarguide.capture.formats.pictures import is_lossy, read_picture, stated_size
-from polarguide.capture.memory import require_memory_of_each
+from polarguide.capture.layout import require_memory_of_each
 from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.write import EXACT, Rounding
@@ -60,9 +60,9 @@ from polarguide.preparation.shot_exposures import (
     ShotExposures,
     exposure_notes,
     exposures_of_view,
+    levels_of_shots,
     stated_exposures,
 )
-from polarguide.preparation.shot_levels import levels_of_shots
 from polarguide.preparation.source import DevelopedView, Source, Stored
 
 _JUDGED_VIEWS = 8

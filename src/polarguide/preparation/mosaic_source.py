@@ -16,12 +16,10 @@ from polarguide.capture.calibration import UNIDENTIFIED, UNIT_GAINS, balancing_g
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.datasets.dataset import Dataset, resized_mask
 from polarguide.capture.formats.pictures import stated_size
-from polarguide.capture.layout import index_files
-from polarguide.capture.memory import require_memory, require_memory_of_each
+from polarguide.capture.layout import index_files, require_memory, require_memory_of_each
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import spread_to_cells
-from polarguide.capture.sensor.defects import defects, defects_note
-from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
+from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic
 from polarguide.capture.sensor.pattern import (
     FULL_16,
     SENSOR_NAMES,

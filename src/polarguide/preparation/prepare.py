@@ -26,8 +26,13 @@ from polarguide.core.progress import Reporter
 from polarguide.core.records import option_name
 from polarguide.preparation.exposure_table import write_exposure_table
 from polarguide.preparation.folder import PARTIAL, PHOTOGRAPHS, SCENE, SFM, SceneFolder, Workshop
-from polarguide.preparation.open_source import known_poses, open_source, origin_of_poses, poses_beside
-from polarguide.preparation.pose_frames import settle_pose_frames
+from polarguide.preparation.open_source import (
+    known_poses,
+    open_source,
+    origin_of_poses,
+    poses_beside,
+    settle_pose_frames,
+)
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Source
 

@@ -21,7 +21,7 @@ from polarguide.capture.datasets.sense import RimAgreement, rim_agreement, sense
 from polarguide.capture.exposures import Angle
 from polarguide.capture.filter.exif import INVERSE, QUARTER_TURNS, apply_orientation
 from polarguide.capture.formats.pictures import SUFFIXES, stated_size
-from polarguide.capture.memory import require_memory_of_each
+from polarguide.capture.layout import require_memory_of_each
 from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.progress import Advance

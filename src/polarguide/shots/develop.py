@@ -21,17 +21,15 @@ from polarguide.capture.filter.develop import (
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import Shots, read_shots, require_four_shots, stacked
 from polarguide.capture.formats.pictures import is_lossy
-from polarguide.capture.layout import find_layout, select_views
-from polarguide.capture.memory import KEPT, READ, require_memory_of_each
+from polarguide.capture.layout import KEPT, READ, find_layout, require_memory_of_each, select_views
 from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.view import ANGLES, FULL_CODE, View
 from polarguide.capture.view_reader import ViewData, read_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_file
 from polarguide.preparation.shot_exposures import corrected_note, exposures_of_view, stated_exposures
-from polarguide.shots.developed import Developed, Mask, Part, gains_of
 from polarguide.shots.exposures import ExposureSet
-from polarguide.shots.maps import Map, estimated_noise, given_noise
+from polarguide.shots.maps import Developed, Map, Mask, Part, estimated_noise, gains_of, given_noise
 from polarguide.shots.mosaic import calibration_of, develop_mosaic
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.samples import (

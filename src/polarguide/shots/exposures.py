@@ -28,8 +28,7 @@ from polarguide.capture.view import ANGLES
 from polarguide.core.errors import PolarguideError
 from polarguide.shots import sets
 from polarguide.shots.options import Kind, ShotOptions
-from polarguide.shots.sets import known_places
-from polarguide.shots.video import VIDEO_SUFFIXES
+from polarguide.shots.sets import VIDEO_SUFFIXES, known_places
 
 _EXPECTED = "raw mosaics with --sensor, or shots with angles in their names"
 _REMEDY = (

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented, pair_ratio
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
-from polarguide.capture.sensor.defects import defects, defects_note
-from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
+from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic
 from polarguide.capture.sensor.pattern import (
     SENSOR_SIZE,
     SIDE,
@@ -28,13 +27,16 @@ from polarguide.capture.view import ANGLES
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_file
 from polarguide.preparation.mosaic_source import MosaicFiles, block_intensities, sample_blocks
-from polarguide.shots.developed import Developed, Mask, Part, gains_of
 from polarguide.shots.exposures import ExposureSet
 from polarguide.shots.maps import (
+    Developed,
     Map,
+    Mask,
     NoiseModel,
+    Part,
     averaged_factor,
     estimated_noise,
+    gains_of,
     given_noise,
     interpolation_factors,
 )

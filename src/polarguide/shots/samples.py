@@ -18,15 +18,14 @@ from polarguide.capture.filter.develop import kind_of_file, require_known_encodi
 from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import Shots, read_stack, stacked
 from polarguide.capture.formats.pictures import linear_codes, rescaled
-from polarguide.capture.memory import require_memory
+from polarguide.capture.layout import require_memory
 from polarguide.capture.sensor.pattern import FULL_16, Levels, clipping_bits, estimate_levels
 from polarguide.capture.view import FULL_CODE, View
 from polarguide.capture.view_reader import ViewData, require_alike
 from polarguide.core.errors import PolarguideError
 from polarguide.preparation.shot_exposures import corrected_note, stated_exposures
 from polarguide.shots.options import ShotOptions
-from polarguide.shots.sets import SetPicture, known_places
-from polarguide.shots.video import read_frames
+from polarguide.shots.sets import SetPicture, known_places, read_frames
 
 Mask = NDArray[np.bool_]
 # Compression smears the edge of clipped areas over a few values.

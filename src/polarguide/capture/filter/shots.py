@@ -17,8 +17,14 @@ from polarguide.capture.filter.camera_raw import CAMERA_RAW, is_camera_raw, read
 from polarguide.capture.filter.exif import orientation
 from polarguide.capture.filter.names import NAMING, angles_of_names, folders_of_angles
 from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, is_lossy, read_picture, rescaled
-from polarguide.capture.layout import ambiguous, angle_folders, index_files, list_files, require_angle_folders
-from polarguide.capture.memory import require_memory_of_each
+from polarguide.capture.layout import (
+    ambiguous,
+    angle_folders,
+    index_files,
+    list_files,
+    require_angle_folders,
+    require_memory_of_each,
+)
 from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed

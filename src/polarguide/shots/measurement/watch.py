@@ -19,9 +19,8 @@ from polarguide.core.options import PathLike
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.shots.exposures import ExposureSet, list_shots, mosaics, require_elsewhere
 from polarguide.shots.measurement.line import ChangedWhileRead, Heard, Line, Outcome, ignore
-from polarguide.shots.measurement.options import MeasureOptions, WatchOptions
 from polarguide.shots.measurement.table import Entry, FileStamp, stamps
-from polarguide.shots.options import ShotOptions
+from polarguide.shots.options import MeasureOptions, ShotOptions, WatchOptions
 from polarguide.shots.read import UNREADABLE
 
 _POLL = (0.05, 0.5)
