@@ -27,7 +27,7 @@ from polarguide.raster import Backend, choose_backend
 from polarguide.raster.cuda import has_gsplat
 from polarguide.recipes import RECIPES
 from polarguide.results.evaluation.metrics import psnr
-from polarguide.runs.defaults import resolve
+from polarguide.runs.folder import resolve
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
 from polarguide.shading.gbuffer import render
 from polarguide.training.settings import TrainSettings

@@ -12,13 +12,13 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from polarguide.capture.checks import measured_gains, pair_moments
+from polarguide.capture.filter.camera_files import stated_exponent
 from polarguide.capture.filter.develop import (
     align_shots,
     decide_transfer,
     estimate_shifts,
     require_known_encoding,
 )
-from polarguide.capture.filter.exif import stated_exponent
 from polarguide.capture.filter.shots import Shots
 from polarguide.capture.formats.pictures import decode_mask, decode_picture
 from polarguide.capture.sensor.demosaic import defects

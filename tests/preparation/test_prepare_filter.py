@@ -13,8 +13,8 @@ import pytest
 from camera_files import ANGLES, behind, busy_light, read_invalid, read_polar, smooth_light, write_shots
 from tiny_capture import encode_srgb, write_picture
 
+from polarguide.capture.filter.camera_files import apply_orientation, orientation
 from polarguide.capture.filter.develop import Shift, estimate_shifts
-from polarguide.capture.filter.exif import apply_orientation, orientation
 from polarguide.capture.filter.shots import find_shots
 from polarguide.core.errors import PolarguideError
 from polarguide.preparation.prepare import prepare_scene

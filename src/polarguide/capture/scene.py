@@ -248,7 +248,12 @@ class Scene:
         check_choice("mount", mount, get_args(Mount))
         given = by_name(pictures, "pictures")
         names = list(given)
-        posed, told = by_name(cameras, "cameras", names), _angles_by_name(angles, names)
+        posed = by_name(cameras, "cameras", names)
+        told = (
+            by_name(angles, "angles", names)
+            if isinstance(angles, Mapping)
+            else dict.fromkeys(names, tuple(angles))
+        )
         beside = {
             what: {} if arrays is None else by_name(arrays, what, names)
             for what, arrays in (("masks", masks), ("invalid", invalid))
@@ -293,7 +298,10 @@ class Scene:
     def _repr_html_(self) -> str:
         step = max(1, -(-len(self.views) // _PICTURED))
         pictures = "".join(
-            figure(view.photograph().cpu().numpy(), f"{view.name}, {_role(self, view)}")
+            figure(
+                view.photograph().cpu().numpy(),
+                f"{view.name}, {'held out' if view.name in self.test_names else 'training'}",
+            )
             for view in self.views[::step]
         )
         facts = {
@@ -305,23 +313,11 @@ class Scene:
         return f"{pictures}{table(self.name, facts)}"
 
 
-def _role(scene: Scene, view: View) -> str:
-    return "held out" if view.name in scene.test_names else "training"
-
-
 def _sizes(views: Sequence[View]) -> str:
     """The sizes of views, for people."""
     sizes = sorted({(view.camera.width, view.camera.height) for view in views})
     words = [f"{width}x{height}" for width, height in (sizes[0], sizes[-1])] if sizes else ["no"]
     return " to ".join(dict.fromkeys(words))
-
-
-def _angles_by_name(
-    angles: Sequence[Angle] | Mapping[str, Sequence[Angle]], names: Sequence[str]
-) -> dict[str, Sequence[Angle]]:
-    if isinstance(angles, Mapping):
-        return by_name(angles, "angles", names)
-    return dict.fromkeys(names, tuple(angles))
 
 
 def _view_of(

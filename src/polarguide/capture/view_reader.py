@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -36,6 +36,8 @@ from polarguide.core.records import LARGEST_RECORD
 from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 
+T = TypeVar("T")
+
 
 class Files:
     """Reads files and records the SHA-256 of each."""
@@ -62,10 +64,10 @@ class Files:
         )
         return hashlib.sha256("".join(lines).encode()).hexdigest()
 
-    def read_if_there(self, path: Path) -> bytes | None:
-        """The bytes of a JSON file, or None if there is no such file."""
+    def read_if_there(self, path: Path, otherwise: T) -> bytes | T:
+        """The bytes of a JSON file; ``otherwise`` if there is no such file."""
         there = os.path.lexists(path)  # a link to nowhere is no absence
-        return self.read(path, LARGEST_RECORD) if there else None
+        return self.read(path, LARGEST_RECORD) if there else otherwise
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,8 +37,7 @@ from polarguide.inspection.angles import DEGREES, PAIRINGS, SENSES, Evidence, sp
 from polarguide.inspection.capture import InspectedView
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
-from polarguide.runs.defaults import resolve
-from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
+from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.losses import depth_normals

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from polarguide import __version__, optics
 from polarguide.core.files import make_folder, write_text, write_whole
@@ -74,35 +74,26 @@ SHOT_LAYERS: tuple[Layer, ...] = (
 
 def layer_uris(view: InspectedView, layers: Sequence[Layer]) -> dict[str, str]:
     """Layers of a view as data URIs, by key."""
-    return {layer.key: data_uri(picture, layer.key, SIDE) for layer, picture in _drawn(view, layers)}
-
-
-def _drawn(view: InspectedView, layers: Sequence[Layer]) -> Iterator[tuple[Layer, Picture]]:
-    pictures = _shot_pictures(view) if layers is SHOT_LAYERS else _pictures(view)
-    return ((layer, pictures[layer.key]) for layer in layers)
-
-
-def _shot_pictures(view: InspectedView) -> dict[str, Picture]:
     shown = _shown(view.intensities().mean(dim=0))
-    return {"s0": shown, "saturation": _marked(shown, view)}
+    pictures = {"s0": shown, "saturation": _marked(shown, view)}
+    if layers is LAYERS:
+        pictures |= _of_four(view)
+    return {layer.key: data_uri(pictures[layer.key], layer.key, SIDE) for layer in layers}
 
 
 def _shown(photograph: Tensor) -> Picture:
     return figures.radiance_to_rgb(photograph / max(quantile(photograph, 0.99), 1e-6))
 
 
-def _pictures(view: InspectedView) -> dict[str, Picture]:
-    intensities = view.intensities()
-    gray = intensities.mean(dim=-1)
+def _of_four(view: InspectedView) -> dict[str, Picture]:
+    """What only pictures at four angles show."""
+    gray = view.intensities().mean(dim=-1)
     stokes = optics.stokes(gray)
     s0, degree = stokes[0].clamp(min=1e-6), optics.dolp(stokes)
-    shown = _shown(intensities.mean(dim=0))
     excess = (gray[0] + gray[2] - gray[1] - gray[3]).abs() / s0
     return {
-        "s0": shown,
         "dolp": figures.dolp_to_rgb(degree, DOLP_HIGH),
         "aolp": figures.aolp_to_rgb(optics.aolp(stokes), degree / AOLP_FULL_DOLP),
-        "saturation": _marked(shown, view),
         "noise": figures.scalar_to_rgb(optics.intensity_noise(gray) / (s0 / 2), 0.0, NOISE_HIGH),
         "consistency": figures.scalar_to_rgb(excess, 0.0, EXCESS_HIGH, "magma"),
     }
@@ -115,13 +106,9 @@ def _marked(shown: Picture, view: InspectedView) -> Picture:
         (view.black | view.invalid, INVALID_COLOR),
         (view.saturated & ~view.black, SATURATED_COLOR),
     ):
-        dim[_dilated(mask).numpy()] = color
+        # Dilated by a pixel, so that single ones stay visible after downscaling.
+        dim[(max_pool2d(mask[None].float(), 3, 1, 1)[0] > 0).numpy()] = color
     return dim
-
-
-def _dilated(mask: Tensor) -> Tensor:
-    """A mask [H, W] dilated by a pixel, so that single pixels stay visible after downscaling."""
-    return torch.nn.functional.max_pool2d(mask[None, None].float(), 3, 1, 1)[0, 0] > 0
 
 
 FILE = "inspection.html"

@@ -7,15 +7,17 @@ from __future__ import annotations
 import os
 import shlex
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from polarguide.capture.colmap.model import view_of_name
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
-from polarguide.capture.exposures import TABLE
-from polarguide.capture.filter.exif import QUARTER_TURNS, TURNS
-from polarguide.capture.filter.names import angles_of_names, folders_of_angles
+from polarguide.capture.exposures import TABLE, angles_of_names, folders_of_angles
+from polarguide.capture.filter.camera_files import QUARTER_TURNS, TURNS
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
+from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.layout import angle_folders, describe_contents, index_files, list_files
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import read_pose_file
@@ -27,7 +29,43 @@ from polarguide.core.files import require_folder
 from polarguide.preparation.filter_source import FilterSource, SinglesSource
 from polarguide.preparation.mosaic_source import MosaicSource
 from polarguide.preparation.settings import PrepareSettings, check_format
-from polarguide.preparation.source import MaskedSource, Source, StokesSource
+from polarguide.preparation.source import Source, StokesSource
+
+
+def _views_of_masks(files: Iterable[Path], views: Sequence[str]) -> dict[str, Path]:
+    """Masks by view: called like it, as COLMAP and Metashape name masks (``cup.jpg.png``, ``cup_mask.png``), or so."""
+    found: dict[str, Path] = {}
+    pictures = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
+    for shorten in (str, view_of_name, lambda name: name.removesuffix("_mask")):
+        for path in pictures:
+            view = shorten(path.stem)
+            if view in views:
+                found.setdefault(view, path)
+    return found
+
+
+def _found_masks(folder: Path, views: Sequence[str]) -> dict[str, Path]:
+    """The object masks of a folder, by view.
+
+    Raises:
+        PolarguideError: there is no such folder, or none of its pictures is named like a view.
+    """
+    if not folder.is_dir():
+        raise PolarguideError(
+            "--masks",
+            expected="a folder of masks named like the views",
+            found=f"{folder}, which is not a folder",
+            remedy="Give the folder that holds <view>.png.",
+        )
+    masks = _views_of_masks(folder.iterdir(), views)
+    if not masks:
+        raise PolarguideError(
+            folder,
+            expected=f"masks named like the views ({listed(list(views), 3)})",
+            found=listed(sorted(path.name for path in folder.iterdir()), 3) or "no file",
+            remedy="Rename them; views without a mask are used whole.",
+        )
+    return masks
 
 
 def open_source(root: Path, settings: PrepareSettings) -> Source:
@@ -58,7 +96,8 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
             found=describe_contents(root),
             remedy="See docs/reference/formats.md for the layouts.",
         )
-    return found if settings.masks is None else MaskedSource(found, settings.masks)
+    found.masks = {} if settings.masks is None else _found_masks(settings.masks, found.views)
+    return found
 
 
 def are_single_shots(root: Path, settings: PrepareSettings) -> bool:

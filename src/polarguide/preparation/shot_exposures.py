@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import Gains
 from polarguide.capture.checks import measured_gains, pair_moments
-from polarguide.capture.filter.camera_raw import is_camera_raw
-from polarguide.capture.filter.exif import read_taken
+from polarguide.capture.filter.camera_files import is_camera_raw, read_taken
 from polarguide.capture.filter.shots import read_stack
 from polarguide.capture.formats.pictures import may_use_fewer_bits
 from polarguide.capture.sensor.pattern import FULL_16, Levels, estimate_levels, level_notes

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.calibration import UNIT_GAINS, balancing_gains
+from polarguide.capture.sensor.analyzers import imbalance_notes
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
 from polarguide.capture.sensor.pattern import sensor_pattern
 from polarguide.capture.view import ANGLES
@@ -304,12 +305,7 @@ def gains_of(
 ) -> tuple[tuple[float, float, float, float], tuple[str, ...]]:
     """Gains of the four pictures, and what to say of them."""
     if options.analyzers is not None:
-        if ratio is None:
-            return UNIT_GAINS, ()
-        notes = [f"With the calibration, I0 + I90 is {ratio - 1:+.2%} off I45 + I135."]
-        if abs(ratio - 1) > _LARGE_IMBALANCE:
-            notes.append("That is more than a calibration of this camera leaves: is it one of another?")
-        return UNIT_GAINS, tuple(notes)
+        return UNIT_GAINS, tuple(imbalance_notes(ratio))
     if options.calibration.gains is not None:
         return options.calibration.gains, ()
     if ratio is None:

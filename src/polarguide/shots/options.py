@@ -10,7 +10,7 @@ import tyro
 from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, checked
-from polarguide.capture.sensor.pattern import Packing, SensorName
+from polarguide.capture.sensor.pattern import MosaicOptions, Positive, SensorName
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import check_finite
 from polarguide.core.records import check_options, option_name
@@ -46,25 +46,17 @@ _OWNERS: dict[str, tuple[Kind, ...]] = {
 }  # fmt: skip
 """Options that mean something for some kinds of shots only."""
 _OPTION_OF = {"analyzers": "--calibration (of polarguide calibrate)", "align": "--no-align"}
-_NotNegative = Annotated[int, Meta(ge=0, le=1 << 20)]
-_Positive = Annotated[int, Meta(ge=1, le=1 << 31)]
 
 
 @dataclass(frozen=True)
-class ShotOptions:
+class ShotOptions(MosaicOptions):
     """How the files of a shot become intensities, and from when on a pixel counts.
 
     Attributes:
         sensor: Sensor of raw mosaics: IMX250MYR and IMX264MYR are color, IMX250MZR is monochrome. Without it files are
             shots through a filter.
-        packing: Packing of .raw files (there are several of 10 and of 12 bits; never guessed).
-        width: Width of .raw files in pixels; others must have it, too.
-        height: Height of .raw files in pixels.
         bits: Bits of a value in 16-bit files; without it 16 for shots through a filter, for mosaics 12 if no value
             exceeds 4095, else 16.
-        offset_x: Column of the sensor at which the region of interest starts.
-        offset_y: Row of the sensor at which it starts.
-        black_level: Stored value without light.
         dark_frame: Picture with the lens covered, subtracted in place of the black level.
         saturation: Stored value from which the sensor saturates; without it that at which samples pile up, or full
             scale.
@@ -84,15 +76,9 @@ class ShotOptions:
     """
 
     sensor: SensorName | None = None
-    packing: Packing | None = None
-    width: _Positive | None = None
-    height: _Positive | None = None
     bits: Annotated[int, Meta(ge=8, le=16)] | None = None
-    offset_x: _NotNegative = 0
-    offset_y: _NotNegative = 0
-    black_level: Annotated[float, Meta(ge=0)] = 0.0
     dark_frame: Path | None = None
-    saturation: _Positive | None = None
+    saturation: Positive | None = None
     gamma: Annotated[float, Meta(ge=0.1, le=4.0)] = 1.0
     flip: Literal["none", "x", "y", "xy"] = "none"
     demosaic: Literal["half", "quarter", "full"] = "full"

@@ -20,15 +20,15 @@ from polarguide.capture.given_arrays import Array, as_numpy, exposures_of, kind_
 from polarguide.capture.view import ANGLES, View
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import check_finite, index_of
-from polarguide.core.text import decimal
+from polarguide.core.text import decimals
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
 from polarguide.shots.develop import develop, develop_view, samples_of, set_samples
-from polarguide.shots.exposures import ExposureSet, find_shots
+from polarguide.shots.exposures import find_shots
 from polarguide.shots.fit import DARK_SNR, maps_of_set
 from polarguide.shots.maps import Developed, Map, Part, Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
-from polarguide.shots.sets import require_determined
+from polarguide.shots.sets import ExposureSet, require_determined
 
 UNREADABLE = (PolarguideError, OSError, MemoryError)
 """What one bad file may raise; others come after it."""
@@ -202,23 +202,17 @@ def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
     Raises:
         PolarguideError: it is something else.
     """
-    try:
-        fx, fy, cx, cy = (decimal(part) for part in text.split(","))
-        # A center may lie outside of a cut picture; beyond these bounds it is a slip.
-        centered = all(abs(c - n / 2) <= 10 * n for c, n in zip((cx, cy), size, strict=True))
-        known = centered and all(0 < f <= 1e6 for f in (fx, fy))
-    except ValueError:
-        known = False
-    if not known:
+    numbers = decimals(text)
+    # A center may lie outside of a cut picture; beyond these bounds it is a slip.
+    centered = all(abs(c - n / 2) <= 10 * n for c, n in zip(numbers[2:], size, strict=False))
+    if len(numbers) != 4 or not centered or not all(0 < f <= 1e6 for f in numbers[:2]):
         raise PolarguideError(
             "--intrinsics",
             expected="fx,fy,cx,cy in pixels of the developed picture",
             found=repr(text),
             remedy="Correct the value; the center of the first pixel is at 0.5.",
         )
-    return Camera(
-        *size, fx, fy, cx, cy, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    )
+    return Camera(*size, *numbers, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
 
 
 def camera_of(shot: ExposureSet, size: tuple[int, int], intrinsics: str | None) -> Camera | None:

@@ -21,13 +21,7 @@ from polarguide.core.files import atomic, in_utf8, make_folder, require_inside, 
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import to_json
 from polarguide.shots.develop import check_files
-from polarguide.shots.exposures import (
-    ExposureSet,
-    find_shots,
-    require_elsewhere,
-    require_name,
-    require_own_folder,
-)
+from polarguide.shots.exposures import find_shots, require_elsewhere, require_name, require_own_folder
 from polarguide.shots.maps import REASONS, Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.pictures import (
@@ -40,6 +34,7 @@ from polarguide.shots.pictures import (
     with_legend,
 )
 from polarguide.shots.read import UNREADABLE, SurfaceMaps, camera_of, fault_of, read_shot, surface_maps
+from polarguide.shots.sets import ExposureSet
 from polarguide.visualization import figures
 from polarguide.visualization.embedded import data_uri
 from polarguide.visualization.pages import page, page_part, script_json

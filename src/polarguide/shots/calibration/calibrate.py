@@ -19,7 +19,7 @@ from polarguide.capture.sensor.analyzers import (
     AnalyzerCalibration,
     grid_shape,
 )
-from polarguide.capture.sensor.pattern import Pattern
+from polarguide.capture.sensor.pattern import Pattern, tiled
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder
 from polarguide.core.progress import SILENT, Reporter
@@ -96,7 +96,9 @@ def fit_pixels(
     variance = rest / max(1, len(light) - 3)
     level = _brightness(2 * vectors[0], pattern)
     vectors /= level
-    defects = saturated | ~plausible(np.moveaxis(vectors, 0, -1), _nominal(pattern, squares.shape))
+    defects = saturated | ~plausible(
+        np.moveaxis(vectors, 0, -1), np.radians(tiled(pattern.angles, squares.shape))
+    )
     sound = ~defects
     noise = float(np.mean((variance / level**2)[sound]) * np.trace(normal)) if sound.any() else 0.0
     return PixelFit(np.ascontiguousarray(np.moveaxis(vectors, 0, -1), np.float32), noise, defects)
@@ -193,13 +195,6 @@ def _at_pixels(
     rows, columns = y // block - offset[1] // block, x // block - offset[0] // block
     period = pattern.period
     return np.asarray(means[rows[:, None], columns, (y % period)[:, None], x % period])
-
-
-def _nominal(pattern: Pattern, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Nominal angle of each pixel in radians, [H, W]."""
-    period = pattern.period
-    repeat = [-(-length // period) for length in shape]
-    return np.radians(np.tile(pattern.angles, repeat)[: shape[0], : shape[1]])
 
 
 def _brightness(throughput: NDArray[np.float64], pattern: Pattern) -> NDArray[np.float64]:

@@ -20,7 +20,7 @@ from polarguide.core.files import make_folder, require_inside
 from polarguide.core.options import PathLike
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.shots.develop import check_files
-from polarguide.shots.exposures import ExposureSet, find_shots, require_elsewhere
+from polarguide.shots.exposures import find_shots, require_elsewhere
 from polarguide.shots.maps import ShotMaps
 from polarguide.shots.measurement.fields import FORMAT, KEYS, NO_LIMITS, Value, faults, read_limits
 from polarguide.shots.measurement.pictures import difference_picture, regions_picture
@@ -38,6 +38,7 @@ from polarguide.shots.measurement.regions import (
 from polarguide.shots.measurement.table import Entry, FileStamp, Status, Table, stamps
 from polarguide.shots.options import MeasureOptions, ShotOptions
 from polarguide.shots.read import NAME, UNREADABLE, array_shot, fault_of, is_array, read_shot, stacked_array
+from polarguide.shots.sets import ExposureSet
 from polarguide.visualization.figures import write_png
 
 
@@ -80,21 +81,16 @@ class Measurer:
         self._limits = NO_LIMITS
         if options.limits is not None:
             self._limits = read_limits(options.limits, names, reference=options.reference is not None)
-        self._reference = None
+        self.reference = None
         if options.reference is not None:
-            self._reference = Reference.read(options.reference, self._reading)
-            placed(self._regions, self._reference.size, options.reference)
-        self._part = None if self._reference is not None else box_of(self._regions)
+            self.reference = Reference.read(options.reference, self._reading)
+            placed(self._regions, self.reference.size, options.reference)
+        self._part = None if self.reference is not None else box_of(self._regions)
 
     @property
     def reference_files(self) -> tuple[Path, ...]:
-        """Files of the reference."""
-        return () if self._reference is None else self._reference.shot.paths
-
-    @property
-    def reference_name(self) -> str:
-        """Its name; empty without one."""
-        return "" if self._reference is None else self._reference.name
+        """Files that are compared with, and not measured where they lie in a watched folder."""
+        return () if self.reference is None else self.reference.shot.paths
 
     def read(self, shot: ExposureSet, *, whole: bool = False) -> ShotMaps:
         """The maps of a shot: of all of it where ``whole``, or where it is compared with a reference; else at least of
@@ -112,7 +108,7 @@ class Measurer:
             PolarguideError: it does not fit the regions or the reference.
         """
         regions = placed(self._regions, maps.whole or maps.size, shot.where)
-        differences = None if self._reference is None else self._reference.differences(maps)
+        differences = None if self.reference is None else self.reference.differences(maps)
         found = [self._region(maps, region, differences) for region in regions]
         statuses = [str(figures["status"]) for _, figures, _ in found]
         status: Status = (
@@ -251,11 +247,6 @@ class Line:
     def __exit__(self, *_: object) -> None:
         self.table.close()
 
-    @property
-    def reference_files(self) -> tuple[Path, ...]:
-        """Files that are compared with, and not measured where they lie in a watched folder."""
-        return self.measurer.reference_files
-
     def measure(self, shot: ExposureSet, files: tuple[FileStamp, ...]) -> Entry:
         """Measure a shot, draw what is to be drawn, and write its line.
 
@@ -295,9 +286,10 @@ class Line:
             maps = maps if maps.whole is None else self.measurer.read(shot, whole=True)
             make_folder(self.out / BEYOND)
             write_png(self.out / BEYOND / f"{name}.png", regions_picture(maps, measured.beyond))
-        if differences is not None:
+        reference = self.measurer.reference
+        if differences is not None and reference is not None:
             make_folder(self.out / DIFFERENCES)
-            picture = difference_picture(differences, maps.name, self.measurer.reference_name)
+            picture = difference_picture(differences, maps.name, reference.name)
             write_png(self.out / DIFFERENCES / f"{name}.png", picture)
         return name
 
