@@ -11,7 +11,7 @@ import torch
 from faults import Fault
 from other_device import BACKEND, OtherDevice, unfused_adam
 
-from polarguide.api import Run, open_run
+from polarguide.api.runs import Run, open_run
 from polarguide.capture import load_scene
 from polarguide.capture.presentation import Crop
 from polarguide.cli.app import run

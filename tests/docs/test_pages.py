@@ -91,6 +91,21 @@ def anchors(text):
     return {re.sub(r"[^\w\- ]", "", h.lower().replace("`", "")).replace(" ", "-") for h in headings}
 
 
+@pytest.mark.parametrize("path", TEXTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_pictures_say_what_they_show(path):
+    text = text_of(path)
+    blocks = re.findall(r"^```\{(?:image|figure|code-cell)\}.*?^```", text, re.MULTILINE | re.DOTALL)
+    pictured = [
+        block
+        for block in blocks
+        if re.search(r"\{(?:image|figure)\}|^show\(|^figure, axes", block, re.MULTILINE)
+    ]
+    assert re.findall(r"!\[\s*\]\([^)]+\)", text) == []
+    assert [block for block in pictured if not re.search(r"alt: \S", block)] == []
+    for drawing in re.findall(r":file: (\S+\.svg)", text):
+        assert "aria-label=" in text_of(path.parent / drawing)
+
+
 @pytest.mark.parametrize("code", list(python_blocks()))
 def test_python_compiles(code):
     ast.parse(code)

@@ -31,15 +31,15 @@ def export(
 ) -> None:
     """Write a run as the files of other programs.
 
-    ply, spz and sog are ordinary splats, with reflections baked as far as harmonics carry them; mesh (GLB and PLY) is
-    fused from rendered depth, with diffuse colors and learned normals; glb (or obj) is a textured model for Blender,
-    game engines and viewers of glTF, whose base color has neither highlights nor shading; points are opaque Gaussians
-    with normals; environment is the learned light as a panorama (EXR, HDR and PNG); cameras are a COLMAP model and
+    ply, spz, sog and splat-glb are ordinary splats, with reflections baked as far as harmonics carry them; mesh (GLB
+    and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb (or obj) is a textured model
+    for Blender, game engines and viewers of glTF, whose base color has neither highlights nor shading; points are
+    opaque Gaussians with normals; environment is the learned light as a panorama (EXR, HDR and PNG); cameras are a COLMAP model and
     transforms.json.
 
     Args:
         run: Run folder.
-        format: ply, spz, sog, mesh, glb, obj, points, environment or cameras.
+        format: ply, spz, sog, splat-glb, mesh, glb, obj, points, environment or cameras.
         out: Folder to write; RUN/export by default.
         resolution: Voxels of the mesh along its longest side.
         spz_version: Version of the SPZ file; readers are split between the two.

@@ -20,7 +20,9 @@ Transfer = Literal["linear", "srgb"]
 Split = Literal["directions", "every-8th"]
 Exposures = Literal["captured", "four", "three", "two", "one", "unknown", "mixed", "sparse", "none"]
 EXPOSURES: tuple[Exposures, ...] = get_args(Exposures)
-ExportFormat = Literal["ply", "spz", "sog", "mesh", "glb", "obj", "points", "environment", "cameras"]
+ExportFormat = Literal[
+    "ply", "spz", "sog", "splat-glb", "mesh", "glb", "obj", "points", "environment", "cameras"
+]
 BaseColor = Literal["delit", "diffuse", "photographs", "picture"]
 PictureFormat = Literal["png", "exr", "npy"]
 EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {

@@ -5,17 +5,20 @@ The PLY holds display values that ordinary 3DGS viewers show right, and our line
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from polarguide.capture.presentation import colored
 from polarguide.fields.model import FieldModel
+from polarguide.gaussians.gaussians import CORE_SHAPES
 from polarguide.gaussians.geometry import shortest_axis_normals
-from polarguide.gaussians.ply import refit_sh_to_display, write_ply
+from polarguide.gaussians.ply import refit_sh, write_ply
 from polarguide.geometry.camera import Camera
-from polarguide.optics.color import srgb_encode
+from polarguide.optics.color import srgb_encode, srgb_slope
 from polarguide.raster import Backend
 from polarguide.raster.magnification import as_trained
 from polarguide.raster.surface import alpha_in_front
@@ -126,10 +129,35 @@ def gaussian_colors(gaussians: Parameters, light: Light, shading: ShadingModel, 
 
 
 @torch.no_grad()
-def shown_colors(state: TrainingState, shading: ShadingModel, directions: Tensor) -> Tensor:
-    """``gaussian_colors`` of a training for display, [N, K, 3] in [0, 1]."""
-    linear = _toward(state.gaussians, state.light, shading, directions)
-    return torch.stack([srgb_encode(color.clamp(0, 1)) for color in linear], dim=1)
+def baked_harmonics(
+    gaussians: Parameters,
+    light: Light,
+    shading: ShadingModel,
+    *,
+    shown: Callable[[Tensor], Tensor],
+    linear: bool,
+) -> tuple[Tensor, Tensor]:
+    """Harmonics, as of ``refit_sh``, of ``gaussian_colors``.
+
+    Args:
+        gaussians, light, shading: of the run.
+        shown: what becomes of linear colors. linear: whether they are still linear then.
+    """
+    known = {
+        name: values
+        for name in (*CORE_SHAPES, *shading.parameters)
+        if (values := gaussians.get(name)) is not None
+    }
+    means = known["means"].detach()
+    normals = shortest_axis_normals(
+        means, known["quaternions"].detach(), known["log_scales"].detach(), means.new_zeros(3)
+    )
+
+    def colors(part: slice, directions: Tensor) -> Tensor:
+        some = {name: values.detach()[part] for name, values in known.items()}
+        return shown(gaussian_colors(some, light, shading, directions))
+
+    return refit_sh(colors, normals, srgb_slope if linear else None)
 
 
 def _toward(gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor) -> list[Tensor]:
@@ -167,13 +195,28 @@ def learned_normals(gaussians: Parameters, centers: Tensor | None) -> Tensor:
 
 @torch.no_grad()
 def write_run_ply(
-    path: Path, state: TrainingState, shading: ShadingModel, centers: Tensor | None = None
+    path: Path,
+    state: TrainingState,
+    shading: ShadingModel,
+    centers: Tensor | None = None,
+    *,
+    color: Tensor | None = None,
+    linear: bool = False,
 ) -> None:
-    """Write the trained Gaussians; see the module's text, and ``learned_normals`` for the centers of the cameras."""
+    """Write the trained Gaussians; see the module's text, and ``learned_normals`` for the centers of the cameras.
+
+    Args:
+        path: the file. state, shading: of the run. centers: [M, 3] of the cameras.
+        color: [3, 3] of a presentation; it holds for the harmonics that other programs show, never for our own fields.
+        linear: whether the harmonics are of linear colors, for readers that want them.
+    """
     gaussians = state.gaussians
-    dc, rest = refit_sh_to_display(
-        lambda directions: shown_colors(state, shading, directions).cpu(), len(gaussians)
-    )
+
+    def shown(colors: Tensor) -> Tensor:
+        colors = colored(colors, color).clamp(0, 1)
+        return colors if linear else srgb_encode(colors)
+
+    dc, rest = baked_harmonics(gaussians, state.light, shading, shown=shown, linear=linear)
     plain = {
         name: gaussians[name].detach().cpu()
         for name in ("means", "log_scales", "quaternions", "opacity_logits")

@@ -13,13 +13,14 @@ from torch import Tensor
 
 from polarguide.capture import read_model
 from polarguide.capture.layout import refuse_scene
-from polarguide.capture.presentation import balanced
+from polarguide.capture.presentation import colored
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import holds_files, make_folder, require_inside, temporary_folder, write_text
 from polarguide.core.options import ExportFormat, ModelOptions, PathLike, check_choice, check_finite
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.fields.model import FieldModel
 from polarguide.geometry.camera import Camera
+from polarguide.optics.color import srgb_encode
 from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
 from polarguide.results.evaluation.table import shown_metrics
 from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
@@ -35,6 +36,7 @@ from polarguide.results.export.placement import (
     write_transforms,
 )
 from polarguide.results.export.share import share_page
+from polarguide.results.export.splat_glb import COLOR_SPACES, Encoding, write_splat_glb
 from polarguide.results.export.splats import write_sog, write_spz
 from polarguide.results.rendering.mesh import RESOLUTION, implicit_mesh, scene_mesh
 from polarguide.results.rendering.relight import needs_radiance, panorama, write_exr, write_hdr
@@ -48,7 +50,7 @@ from polarguide.visualization import figures
 TRANSFORMS = "transforms.json"
 
 PANORAMA_HEIGHT = 512
-SPLATS = ("ply", "spz", "sog", "points")
+SPLATS = ("ply", "spz", "sog", "splat-glb", "points")
 """Formats of Gaussians."""
 
 
@@ -62,14 +64,14 @@ def export(
     model: ModelOptions = ModelOptions(),
     reporter: Reporter = SILENT,
 ) -> list[Path]:
-    """Write a run as the files of other programs, as it is presented: cropped, in meters, upright (see ``Placement``).
+    """Write a run as the files of other programs, as it is presented: in its color, cropped, in meters, upright.
 
     Args:
         run: the run; its scene is read for all but ply, spz and sog.
-        format: ply, spz and sog are ordinary splats, with reflections baked as far as harmonics carry them; mesh (GLB
-            and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb and obj are a
-            textured model; points are opaque Gaussians with normals; environment is the learned light as a panorama
-            (EXR, HDR and PNG); cameras are a COLMAP model and transforms.json.
+        format: ply, spz, sog and splat-glb are ordinary splats, with reflections baked as far as harmonics carry
+            them; mesh (GLB and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb and
+            obj are a textured model; points are opaque Gaussians with normals; environment is the learned light as a
+            panorama (EXR, HDR and PNG); cameras are a COLMAP model and transforms.json.
         out: folder to write; ``export`` in the run's folder by default.
         resolution: voxels of the mesh along its longest side, 16 to 1024.
         spz_version: of the SPZ file, 3 or 4; readers are split between them.
@@ -90,6 +92,7 @@ def export(
         "ply": lambda: [_ply(run, presented, folder / "splats.ply")],
         "spz": lambda: [_spz(run, presented, folder / "splats.spz", spz_version)],
         "sog": lambda: [_sog(run, presented, folder / "splats.sog")],
+        "splat-glb": lambda: _splat_glb(run, presented, folder),
         "mesh": lambda: _mesh(run, presented, folder, resolution, reporter),
         "glb": lambda: _model(run, presented, folder, resolution, model, reporter, "glb"),
         "obj": lambda: _model(run, presented, folder, resolution, model, reporter, "obj"),
@@ -191,17 +194,30 @@ class _Presented:
         )
         self.origin = Origin(self.presentation, made_of)
 
+    def upright(self, run: OpenedRun) -> Placement:
+        """The placement in formats whose up is +y."""
+        axes = run.frame.panorama_axes()
+        return replace(self.placement, rotation=axes.T, upright=True)
+
     @property
     def comments(self) -> list[str]:
         """For the head of a file."""
         return comments(self.origin, self.placement)
 
 
-def _ply(run: OpenedRun, presented: _Presented, path: Path, placement: Placement | None = None) -> Path:
+def _ply(
+    run: OpenedRun,
+    presented: _Presented,
+    path: Path,
+    placement: Placement | None = None,
+    *,
+    linear: bool = False,
+) -> Path:
     with temporary_folder(path.with_suffix(".whole")) as folder:
         whole = folder / path.name
         model = run.gaussian_model("format ply")
-        write_run_ply(whole, model.state, model.shading, _camera_centers(run))
+        color = presented.presentation.color
+        write_run_ply(whole, model.state, model.shading, _camera_centers(run), color=color, linear=linear)
         selected = None if presented.kept is None else presented.kept.cpu()
         rewrite_splats(path, whole, placement or presented.placement, selected, presented.comments)
     return path
@@ -242,6 +258,17 @@ def _sog(run: OpenedRun, presented: _Presented, path: Path) -> Path:
     return path
 
 
+def _splat_glb(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
+    """From PLY files that are gone afterwards, one for each kind of reader."""
+    place = presented.upright(run)
+    paths: dict[Encoding, Path] = {kind: folder / f"splats-{kind}.glb" for kind in COLOR_SPACES}
+    with temporary_folder(folder / "splats.ply") as parts:
+        for kind, path in paths.items():
+            ply = _ply(run, presented, parts / f"{kind}.ply", place, linear=kind == "linear")
+            write_splat_glb(path, ply, asset_record(place, presented.origin), kind)
+    return [*paths.values()]
+
+
 def _mesh(
     run: OpenedRun, presented: _Presented, folder: Path, resolution: int, reporter: Reporter
 ) -> list[Path]:
@@ -252,6 +279,8 @@ def _mesh(
     if (crop := presented.presentation.crop) is not None:
         inside = crop.inside(torch.from_numpy(mesh.surface.vertices), run.camera_frame).numpy()
         mesh = mesh.within(inside)
+    shown = colored(torch.from_numpy(mesh.colors), presented.presentation.color).clamp(max=1)
+    mesh = replace(mesh, colors=shown.numpy())
     paths = [folder / "mesh.glb", folder / "mesh.ply"]
     for path in paths:
         write_mesh(path, mesh, run.frame, presented.placement, presented.origin)
@@ -308,19 +337,21 @@ def _points(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
     path, model, placement = folder / "points.ply", run.gaussian_model("format points"), presented.placement
     assert presented.gaussians is not None
     views, rasterize = run.scene.views, model.backend.rasterize
-    places, normals, colors = surface_points(presented.gaussians, model.shading, views, rasterize)
+    places, normals, linear = surface_points(presented.gaussians, model.shading, views, rasterize)
+    colors = srgb_encode(colored(linear, presented.presentation.color).clamp(0, 1))
     write_points(path, placement.points(places), placement.directions(normals), colors, presented.comments)
     return [path]
 
 
 def _environment(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
     cubemap = needs_radiance(run.model.shading, what="format")
-    picture = panorama(run.light[cubemap.name], cubemap, run.frame, PANORAMA_HEIGHT)
+    learned = panorama(run.light[cubemap.name], cubemap, run.frame, PANORAMA_HEIGHT)
+    picture = colored(learned, presented.presentation.color)
     paths = [folder / f"environment.{kind}" for kind in ("exr", "hdr", "png")]
     credit = presented.presentation.credit
     write_exr(paths[0], picture, {"owner": credit} if credit else {})
     write_hdr(paths[1], picture)
-    figures.write_png(paths[2], figures.radiance_to_rgb(balanced(picture, presented.presentation.gains)))
+    figures.write_png(paths[2], figures.radiance_to_rgb(picture))
     return paths
 
 
