@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from polarguide import __version__, optics
@@ -74,15 +73,12 @@ SHOT_LAYERS: tuple[Layer, ...] = (
 
 def layer_uris(view: InspectedView, layers: Sequence[Layer]) -> dict[str, str]:
     """Layers of a view as data URIs, by key."""
-    shown = _shown(view.intensities().mean(dim=0))
+    photograph = view.intensities().mean(dim=0)
+    shown = figures.radiance_to_rgb(photograph / max(quantile(photograph, 0.99), 1e-6))
     pictures = {"s0": shown, "saturation": _marked(shown, view)}
     if layers is LAYERS:
         pictures |= _of_four(view)
     return {layer.key: data_uri(pictures[layer.key], layer.key, SIDE) for layer in layers}
-
-
-def _shown(photograph: Tensor) -> Picture:
-    return figures.radiance_to_rgb(photograph / max(quantile(photograph, 0.99), 1e-6))
 
 
 def _of_four(view: InspectedView) -> dict[str, Picture]:

@@ -96,7 +96,8 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
             found=describe_contents(root),
             remedy="See docs/reference/formats.md for the layouts.",
         )
-    found.masks = {} if settings.masks is None else _found_masks(settings.masks, found.views)
+    if settings.masks is not None:
+        found.masks = _found_masks(settings.masks, found.views)
     return found
 
 

@@ -134,7 +134,9 @@ class PrepareSettings(MosaicOptions):
             white_balance="gray" if self.white_balance == "grey" else self.white_balance,
             dark_frame=_absolute(self.dark_frame),
             analyzers=_absolute(self.analyzers),
-            angles=_table_path(self.angles),
+            angles=os.path.realpath(self.angles)
+            if self.angles and self.angles.lower().endswith(".csv")
+            else self.angles,
             poses=self.poses if self.poses in ORIGINS else os.path.realpath(self.poses),
             masks=_absolute(self.masks),
         )
@@ -272,11 +274,6 @@ def _four_angles(text: str) -> tuple[int, int, int, int]:
             remedy="Name the angle of the pictures called 0, 45, 90 and 135, in this order.",
         ) from None
     return first, second, third, fourth
-
-
-def _table_path(angles: str | None) -> str | None:
-    """``--angles``, with an absolute path where it names a table."""
-    return os.path.realpath(angles) if angles is not None and angles.lower().endswith(".csv") else angles
 
 
 def _absolute(path: Path | None) -> Path | None:

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import cv2
@@ -96,7 +97,7 @@ class Source(Protocol):
     cameras: Mapping[str, PosedCamera] | None
     views: list[str]
     paths: list[Path]
-    masks: Mapping[str, Path]
+    masks: Mapping[str, Path] = MappingProxyType({})
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """Measure what is common to the whole capture, as JSON types; ``notes`` are messages for the user."""
