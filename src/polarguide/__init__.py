@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from polarguide.shots.calibration.settings import CalibrateSettings
     from polarguide.shots.exposures import find_shots
     from polarguide.shots.maps import ShotMaps
-    from polarguide.shots.measurement.options import MeasureOptions, WatchOptions
     from polarguide.shots.measurement.watch import watch_folder
-    from polarguide.shots.options import ShotOptions
+    from polarguide.shots.options import MeasureOptions, ShotOptions, WatchOptions
     from polarguide.shots.read import SurfaceMaps, read_shot, surface_maps
     from polarguide.training.recipe import Recipe
     from polarguide.training.settings import TrainSettings
@@ -48,7 +47,6 @@ _NAMES = {
     "experiments.options": ("CompareOptions",),
     "geometry.camera": ("Camera",),
     "inspection.settings": ("InspectSettings",),
-    "shots.measurement.options": ("MeasureOptions", "WatchOptions"),
     "shots.measurement.watch": ("watch_folder",),
     "core.options": ("SceneOptions", "SessionOptions"),
     "preparation.settings": ("PrepareSettings",),
@@ -56,7 +54,7 @@ _NAMES = {
     "shots.calibration.settings": ("CalibrateSettings",),
     "shots.exposures": ("find_shots",),
     "shots.maps": ("ShotMaps",),
-    "shots.options": ("ShotOptions",),
+    "shots.options": ("MeasureOptions", "ShotOptions", "WatchOptions"),
     "shots.read": ("SurfaceMaps", "read_shot", "surface_maps"),
     "training.recipe": ("Recipe",),
     "training.settings": ("TrainSettings",),

@@ -14,7 +14,7 @@ from polarguide.core.files import read_file
 from polarguide.core.options import DeviceName, PathLike, SceneOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.inspection.inspect import Inspection, inspect_scene, inspection_folder
-from polarguide.inspection.record import write_inspection
+from polarguide.inspection.report import write_inspection
 from polarguide.inspection.settings import InspectSettings
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.raster import choose_backend

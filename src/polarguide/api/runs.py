@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from polarguide.capture import Scene
-from polarguide.capture.thumbnails import figure, table
+from polarguide.capture.view import figure, table
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_folder
 from polarguide.core.options import PathLike, SceneOptions, SessionOptions, VisitorOptions

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from polarguide.capture.layout import refuse_scene
-from polarguide.capture.memory import require_memory
+from polarguide.capture.layout import refuse_scene, require_memory
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import atomic, make_folder, require_inside
 from polarguide.core.options import PathLike, check_finite
