@@ -2,9 +2,8 @@
 
     python benchmarks/accuracy/method_figures.py
 
-Writes docs/images/method-dolp.png (Fresnel's equations over the zenith), method-ambiguity.png (the candidates of a pixel,
-and what a guide makes of them) and method-separation.png (the layers of a measured view beside the true ones). The view
-is one of the demo scene.
+Writes into docs/images method-dolp.png (Fresnel's equations over the zenith), method-ambiguity.png (the candidates of a
+pixel, and what a guide makes of them) and method-separation.png (the layers of a view beside the true ones).
 """
 
 from __future__ import annotations
