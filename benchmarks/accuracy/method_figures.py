@@ -4,7 +4,6 @@
 
 Writes docs/images/method-dolp.png (Fresnel's equations over the zenith), method-ambiguity.png (the candidates of a
 pixel, and what a guide makes of them) and method-separation.png (the layers of a measured view beside the true ones).
-The view is one of the demo scene.
 """
 
 from __future__ import annotations

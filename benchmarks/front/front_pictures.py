@@ -5,7 +5,7 @@
     done
     python benchmarks/front/front_pictures.py SCENE RUNS --view v040
 
-Writes ``docs/images/front.png`` and ``docs/images/front.webp``. Pictures have the size of the scene's own, whatever the
+Writes ``docs/images/front.jpg`` and ``docs/images/front.webp``. Pictures have the size of the scene's own, whatever the
 training's was.
 """
 
@@ -28,7 +28,7 @@ IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 RECIPES = ("3dgs", "3dgs-dr", "polarguide-stokes")
 LAYERS = {"final": "picture", "specular": "specular", "diffuse": "diffuse", "normal": "normals"}
 FRAMES_PER_SECOND = 12
-HOLD, WIPE = 10, 14
+HOLD, WIPE = 14, 16
 """Frames in which a layer stands, and in which the next one comes over it."""
 
 
@@ -42,11 +42,22 @@ def sheet(scene: pg.Scene, runs: dict[str, pg.Run], name: str) -> Picture:
     """A held-out view: a row for each layer, the truth and each recipe side by side."""
     view = scene.view(name)
     columns = [ground_truth_pictures(view), *(drawn(run, view.camera) for run in runs.values())]
+    none = absent(view.camera.width, view.camera.height)
     return contact_sheet(
-        [[column.get(layer) for column in columns] for layer in LAYERS],
+        [[none if column[layer] is None else column[layer] for column in columns] for layer in LAYERS],
         list(LAYERS.values()),
         ["photograph, truth", *runs],
+        minimum_width=1,
     )
+
+
+def absent(width: int, height: int) -> Picture:
+    """The tile of a layer that a recipe does not have."""
+    image = Image.new("RGB", (width, height), "#eeeeee")
+    ImageDraw.Draw(image).text(
+        (width / 2, height / 2), "none", font=ImageFont.load_default(18), fill="#777777", anchor="mm"
+    )
+    return np.asarray(image)
 
 
 def film(run: pg.Run, size: tuple[int, int]) -> Iterator[Picture]:
@@ -63,20 +74,23 @@ def film(run: pg.Run, size: tuple[int, int]) -> Iterator[Picture]:
         yield wiped(pictures, below, above, edge)
 
 
+def named(picture: Picture | None, name: str) -> Picture:
+    """A picture with its name in the upper left corner."""
+    assert picture is not None
+    image = Image.fromarray(picture)
+    ImageDraw.Draw(image).text(
+        (10, 8), name, font=ImageFont.load_default(20), fill="white", stroke_width=2, stroke_fill="black"
+    )
+    return np.array(image)
+
+
 def wiped(pictures: dict[str, Picture | None], below: str, above: str, edge: int) -> Picture:
     """One layer to the right of a column, another to the left of it, each with its name."""
-    left, right = pictures[above], pictures[below]
-    assert left is not None
-    assert right is not None
-    image = Image.fromarray(np.concatenate((left[:, :edge], right[:, edge:]), axis=1))
-    draw, font = ImageDraw.Draw(image), ImageFont.load_default(18)
-    if edge:
-        draw.line((edge, 0, edge, image.height), fill="white", width=2)
-    for layer, x, anchor in ((above, edge - 8, "ra"), (below, max(edge + 8, image.width - 8), "ra")):
-        draw.text(
-            (x, 8), LAYERS[layer], font=font, fill="white", anchor=anchor, stroke_width=2, stroke_fill="black"
-        )
-    return np.asarray(image)
+    frame = named(pictures[below], LAYERS[below])
+    frame[:, :edge] = named(pictures[above], LAYERS[above])[:, :edge]
+    if 0 < edge < frame.shape[1]:
+        frame[:, edge - 1 : edge + 1] = 255
+    return frame
 
 
 def write_film(path: Path, frames: Sequence[Picture], quality: int) -> None:
@@ -95,16 +109,19 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("runs", type=Path, help="a folder with a run of each recipe, by its name")
     parser.add_argument("--view", required=True, help="a held-out view")
-    parser.add_argument("--size", type=int, nargs=2, default=(384, 288), help="of the film")
-    parser.add_argument("--quality", type=int, default=60, help="of the film")
+    parser.add_argument("--size", type=int, nargs=2, default=(448, 336), help="of the film")
+    parser.add_argument("--quality", type=int, default=65, help="of the film")
+    parser.add_argument("--no-film", action="store_true", help="draw the sheet alone")
     parser.add_argument("--out", type=Path, default=IMAGES)
     given = parser.parse_args()
     runs = {recipe: pg.open_run(given.runs / recipe) for recipe in RECIPES}
     picture = Image.fromarray(sheet(pg.load_scene(given.scene), runs, given.view))
-    picture.save(given.out / "front.png", optimize=True)
+    picture.save(given.out / "front.jpg", quality=90)
+    if given.no_film:
+        return
     frames = list(film(runs["polarguide-stokes"], tuple(given.size)))
     write_film(given.out / "front.webp", frames, given.quality)
-    for name in ("front.png", "front.webp"):
+    for name in ("front.jpg", "front.webp"):
         print(f"{given.out / name}: {(given.out / name).stat().st_size / 1e6:.2f} MB")
 
 

@@ -82,7 +82,8 @@ def test_files_and_links_exist(path):
             continue
         if not found.exists() or (anchor and anchor not in anchors(text_of(found))):
             missing.append(target)
-    assert missing == []
+    served = re.findall(r'(?:href|src)="([^"#:]+)"', text)
+    assert missing + [name for name in served if not (DOCS / "extra" / name).exists()] == []
 
 
 def anchors(text):
@@ -101,6 +102,7 @@ def test_pictures_say_what_they_show(path):
         if re.search(r"\{(?:image|figure)\}|^show\(|^figure, axes", block, re.MULTILINE)
     ]
     assert re.findall(r"!\[\s*\]\([^)]+\)", text) == []
+    assert re.findall(r'<img(?![^>]* alt="[^"]+)[^>]*>', text) == []
     assert [block for block in pictured if not re.search(r"alt: \S", block)] == []
     for drawing in re.findall(r":file: (\S+\.svg)", text):
         assert "aria-label=" in text_of(path.parent / drawing)
