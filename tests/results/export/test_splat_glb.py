@@ -13,8 +13,9 @@ import pytest
 import torch
 from random_runs import random_state
 
+import polarguide
 from polarguide.capture.presentation import Presentation, write_presentation
-from polarguide.cli.app import run
+from polarguide.core.options import ModelOptions
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.ply import read_ply
 from polarguide.optics.color import srgb_decode_array
@@ -84,7 +85,7 @@ def test_both_variants_show_the_same_upright_and_balanced(trained: Path, tmp_pat
         if gains:
             write_presentation(copy, Presentation((*gains,), (0.0, 0.3, 1.0), 0.5))
         out = tmp_path / name
-        assert run(["export", str(copy), "--format", "splat-glb", "--out", str(out), "--threads", "1"]) == 0
+        polarguide.open_run(copy).export("splat-glb", out)
         assert sorted(path.name for path in out.iterdir()) == ["splats-linear.glb", "splats-srgb.glb"]
         read[name] = {kind: read_glb(out / f"splats-{kind}.glb")[1] for kind in COLOR_SPACES}
     place = read_ply(copy / "point_cloud.ply")["means"].double().numpy()
@@ -110,13 +111,13 @@ def test_both_variants_show_the_same_upright_and_balanced(trained: Path, tmp_pat
     reason="no gltf-validator -> apt-get install nodejs npm; make test",
 )
 @pytest.mark.parametrize("kind", ["mesh", "glb", "splat-glb"])
-def test_the_validator_has_nothing_to_say(kind: str, trained: Path, tmp_path: Path) -> None:
+def test_the_validator_has_nothing_to_say(kind: Any, trained: Path, tmp_path: Path) -> None:
     """No error and no warning; of splats none but that it does not know their extension."""
-    more = ["--triangles", "500", "--texture", "128", "--resolution", "32"] if kind == "glb" else []
     assert NODE is not None
-    for options in ([*more], [*more, "--unlit"])[: 2 if more else 1]:
-        command = ["export", str(trained), "--format", kind, "--out", str(tmp_path), "--threads", "1"]
-        assert run([*command, *options]) == 0
+    opened = polarguide.open_run(trained)
+    for unlit in (False, True)[: 1 + (kind == "glb")]:
+        small = ModelOptions(triangles=500, texture=128, unlit=unlit)
+        opened.export(kind, tmp_path, resolution=32, model=small)
     files = sorted(tmp_path.glob("*.glb"))
     assert len(files) == (1 if kind == "mesh" else 2)
     for path in files:
