@@ -106,6 +106,10 @@ def test_what_is_to_be_closed_has_no_holes(hole: str) -> None:
     assert mesh.volume == pytest.approx(share * BALL.volume, rel=0.03)
 
 
+def test_a_surface_without_area_is_refused() -> None:
+    Fault(where="the model", found="none").raised_by(cleaned, np.zeros((3, 3)), np.array([[0, 1, 2]]))
+
+
 def test_texels_interpolate_and_textures_are_filled_to_their_end() -> None:
     """A square of two triangles in the middle of a texture: texel centers at half texels, the first row at v = 0."""
     uv = np.array([[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]])

@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 import torch
 from faults import Fault
+from plyfile import PlyData
 from random_runs import random_state, ring
 
 import polarguide
 from polarguide.capture.presentation import Presentation, write_presentation
 from polarguide.core.options import EXPORT_PACKAGES, ExportFormat, ModelOptions
+from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.ply import read_ply
 from polarguide.geometry.scene_frame import scene_frame
-from polarguide.optics.color import srgb_encode_array
+from polarguide.optics.color import srgb_decode_array, srgb_encode_array
 from polarguide.results.export.model.gltf import Textured
 from polarguide.results.export.model.subject import subject_of
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
@@ -114,6 +116,24 @@ def test_a_usdz_holds_splats(tmp_path: Path) -> None:
     harmonics = np.array(field.GetRadianceSphericalHarmonicsCoefficientsAttr().Get()).reshape(9, 16, 3)
     np.testing.assert_array_equal(harmonics[:, 0], ply["sh_dc"][:, 0])
     np.testing.assert_array_equal(harmonics[:, 1:], ply["sh_rest"])
+
+
+def mean_color(folder: Path, kind: ExportFormat, out: Path) -> np.ndarray:
+    """Linear, of a PLY of splats or of a mesh."""
+    exported(folder, out, kind)
+    if kind == "ply":
+        shown = 0.5 + SH_C0 * read_ply(out / "splats.ply")["sh_dc"][:, 0].numpy()
+    else:
+        rows = PlyData.read(out / "mesh.ply")["vertex"]
+        shown = np.stack([rows[name] for name in ("red", "green", "blue")], axis=1) / 255
+    return np.asarray(srgb_decode_array(np.clip(shown, 0, 1)).mean(axis=0))
+
+
+@pytest.mark.parametrize("kind", ["ply", "mesh"])
+def test_white_balance_reaches_colors(kind: ExportFormat, credited: Path, tmp_path: Path) -> None:
+    before = mean_color(credited, kind, tmp_path / "a")
+    write_presentation(credited, Presentation((1.0, 0.5, 0.25)))
+    np.testing.assert_allclose(mean_color(credited, kind, tmp_path / "b"), before * [1, 0.5, 0.25], rtol=0.05)
 
 
 def test_an_stl_is_closed_in_millimeters_and_upright(credited: Path, tmp_path: Path) -> None:

@@ -72,13 +72,6 @@ def subject_surface(
     if inside is not None:
         surface = ColoredMesh(surface, surface.vertices).within(inside(surface.vertices)).surface
     surface = simplified(surface, options.triangles, closed=options.close_bottom)
-    if not len(surface.faces):
-        raise PolarguideError(
-            "the model",
-            expected="a surface",
-            found="none",
-            remedy="Train for more steps, or move the crop box.",
-        )
     return surface, views, box
 
 

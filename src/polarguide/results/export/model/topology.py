@@ -12,7 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from polarguide.core.errors import optional_import
-from polarguide.results.rendering.mesh import Surface, largest_pieces
+from polarguide.results.rendering.mesh import NoSurfaceError, Surface, largest_pieces
 
 ISLAND = 0.01
 """Pieces with fewer faces than this share of the largest one's are dropped."""
@@ -63,7 +63,7 @@ def simplified(surface: Surface, triangles: int, *, closed: bool = False) -> Sur
     """At most about so many triangles (quadric error, Garland and Heckbert 1997), cleaned; see ``cleaned``.
 
     Raises:
-        PolarguideError: fast-simplification is not installed.
+        PolarguideError: fast-simplification is not installed, or no face is left.
     """
     if len(surface.faces) <= triangles:
         return cleaned(surface.vertices, surface.faces, closed=closed)
@@ -81,10 +81,20 @@ def cleaned(vertices: Places, faces: Faces, *, closed: bool = False) -> Surface:
     """The surface of faces whose edges each occur once in each direction at most, without islands and small holes.
 
     Where it is to be ``closed`` it has no hole at all: each is closed flat, as the bottom of what stood on a table.
+
+    Raises:
+        NoSurfaceError: no face is left.
     """
     vertices, faces = _welded(vertices, faces)
-    surface = Surface(vertices, consistent(vertices, faces), np.zeros_like(vertices))
-    surface = largest_pieces(surface, ISLAND)
+    faces = consistent(vertices, faces)
+    if not len(faces):
+        raise NoSurfaceError(
+            "the model",
+            expected="a surface",
+            found="none",
+            remedy="Train for more steps, or move the crop box.",
+        )
+    surface = largest_pieces(Surface(vertices, faces, np.zeros_like(vertices)), ISLAND)
     vertices, faces = _closed(surface.vertices, surface.faces, math.inf if closed else SMALL_HOLE)
     return Surface(vertices, faces, vertex_normals(vertices, faces))
 
