@@ -1,7 +1,7 @@
 """How exported models look in Blender (Cycles, on the CPU) from held-out cameras, against the photographs.
 
     python3.11 -m venv ENV && ENV/bin/pip install bpy==5.0.1          # 1 GB, in an environment of its own
-    python benchmarks/accuracy/blender.py RUN MODEL.glb [MODEL.glb ...] --bpy ENV/bin/python [--room SCENE]
+    python benchmarks/accuracy/blender.py RUN MODEL.glb [MODEL.usdz ...] --bpy ENV/bin/python [--room SCENE]
 
 The models are exports of RUN in the scene's own units. They are lit by the run's exported environment, or with --room
 by that of a scene which ``polarguide synth`` has rendered with the same things and cameras in another room, whose

@@ -34,7 +34,8 @@ def main() -> None:
     job = json.loads(Path(sys.argv[1]).read_text())
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
-    bpy.ops.import_scene.gltf(filepath=job["model"])
+    read = bpy.ops.wm.usd_import if job["model"].endswith(".usdz") else bpy.ops.import_scene.gltf
+    read(filepath=job["model"])
     set_light(scene, job["environment"], unlit=job["unlit"])
     scene.render.engine = "CYCLES"
     scene.cycles.device, scene.cycles.samples, scene.cycles.use_denoising = "CPU", job["samples"], True

@@ -85,6 +85,7 @@ def test_a_usdz_holds_mesh_and_material(lit: bool, tmp_path: Path) -> None:
     np.testing.assert_array_equal(mesh.GetPointsAttr().Get(), SQUARE)
     np.testing.assert_array_equal(geom.PrimvarsAPI(mesh).GetPrimvar("st").Get(), [[0, 1], [1, 1], [1, 0]])
     surface = shade.Shader(stage.GetPrimAtPath("/model/material/surface"))
+    assert surface.GetIdAttr().Get() == "UsdPreviewSurface"
     assert surface.GetInput("ior").Get() == pytest.approx(1.4)
     color = "diffuseColor" if lit else "emissiveColor"
     source = surface.GetInput(color).GetConnectedSources()[0][0].source.GetPrim()

@@ -79,7 +79,7 @@ def _bind(stage: Any, mesh: Any, model: Textured, folder: Path, *, jpeg: bool) -
         surface.CreateInput("roughness", types.Float).Set(1.0)
     else:
         surface.CreateInput("diffuseColor", types.Color3f).ConnectToSource(color)
-        values = texture("surface", model.surface, "raw")
+        values = texture("reflection", model.surface, "raw")
         for name, channel in (("roughness", "g"), ("metallic", "b")):
             surface.CreateInput(name, types.Float).ConnectToSource(values.CreateOutput(channel, types.Float))
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", types.Token))
