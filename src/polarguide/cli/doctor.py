@@ -23,7 +23,8 @@ EXTRAS = {
     "cuda": "train and render on an NVIDIA GPU",
     "lpips": "the metric lpips",
     "heic": "HEIC photographs",
-    "model": "textured models (export --format glb, obj)",
+    "model": "textured models (export --format glb, obj, usdz, stl, all)",
+    "usd": "USDZ packages (export --format usdz, splat-usdz)",
     "cluster": "compare, ablate, bench and batch on SLURM or PBS",
     "synth": "synth and bench: scenes with ground truth",
 }

@@ -13,13 +13,12 @@ import pytest
 import torch
 from random_runs import random_state
 
-from polarguide import open_run
+import polarguide
 from polarguide.capture.presentation import Presentation, write_presentation
 from polarguide.core.options import ModelOptions
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.ply import read_ply
 from polarguide.optics.color import srgb_decode_array
-from polarguide.results.export.formats import export
 from polarguide.results.export.splat_glb import COLOR_SPACES, EXTENSION, write_splat_glb
 from polarguide.runs.model import write_run_ply
 
@@ -88,7 +87,7 @@ def test_both_variants_show_the_same_upright_and_balanced(trained: Path, tmp_pat
                 copy, Presentation(white_balance=gains, up_axis=(0.0, 0.3, 1.0), meters_per_unit=0.5)
             )
         out = tmp_path / name
-        export(open_run(copy), "splat-glb", out)
+        polarguide.open_run(copy).export("splat-glb", out)
         assert sorted(path.name for path in out.iterdir()) == ["splats-linear.glb", "splats-srgb.glb"]
         read[name] = {kind: read_glb(out / f"splats-{kind}.glb")[1] for kind in COLOR_SPACES}
     place = read_ply(copy / "point_cloud.ply")["means"].double().numpy()
@@ -117,9 +116,10 @@ def test_both_variants_show_the_same_upright_and_balanced(trained: Path, tmp_pat
 def test_the_validator_has_nothing_to_say(kind: Any, trained: Path, tmp_path: Path) -> None:
     """No error and no warning; of splats none but that it does not know their extension."""
     assert NODE is not None
-    for unlit in (False, True) if kind == "glb" else (False,):
-        options = ModelOptions(triangles=500, texture=128, unlit=unlit)
-        export(open_run(trained), kind, tmp_path, resolution=32, model=options)
+    opened = polarguide.open_run(trained)
+    for unlit in (False, True)[: 1 + (kind == "glb")]:
+        small = ModelOptions(triangles=500, texture=128, unlit=unlit)
+        opened.export(kind, tmp_path, resolution=32, model=small)
     files = sorted(tmp_path.glob("*.glb"))
     assert len(files) == (1 if kind == "mesh" else 2)
     for path in files:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,17 +10,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polarguide.capture.presentation import Crop, Presentation, colored, colored_reflectance
+from polarguide.capture.presentation import Presentation, colored, colored_reflectance
 from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.options import BaseColor, ModelOptions
 from polarguide.core.progress import Reporter
 from polarguide.core.system import free_memory
-from polarguide.geometry.camera import Camera
 from polarguide.results.export.model.bake import Baked, ColorSource, bake
 from polarguide.results.export.model.gltf import Textured, color_pixels, linear_pixels
 from polarguide.results.export.model.irradiance import WHAT, Surroundings, delit, irradiance
+from polarguide.results.export.model.subject import Inside, SurfaceView, counted, subject_of, subject_surface
 from polarguide.results.export.model.texels import Texels, texels_of
-from polarguide.results.export.model.topology import simplified, topology
 from polarguide.results.export.model.unwrap import Unwrapped, unwrap
 from polarguide.results.export.placement import Placement
 from polarguide.results.rendering.mesh import ColoredMesh, Surface, fused_surface, painted
@@ -29,9 +27,7 @@ from polarguide.results.rendering.relight import needs_radiance
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.deferred import DeferredShading
-from polarguide.shading.result import RenderResult
 
-SurfaceView = Callable[[Camera], RenderResult]
 SOURCES: dict[BaseColor, ColorSource] = {
     "delit": "diffuse",
     "diffuse": "diffuse",
@@ -98,15 +94,17 @@ def textured_model(
         needs_radiance(run.model.shading, what=WHAT)
         require_package("embreex", WHAT, extra="model")
     with reporter.track("fusing the surface"):
-        mesh, voxel = _subject(run, surface_view, presentation.crop, options, resolution)
-    reporter.say(_counted(mesh.surface))
+        inside = subject_of(run, presentation.crop, masked=options.masked)
+        surface, views, box = subject_surface(run, surface_view, inside, options, resolution)
+        mesh = painted(surface, views, box)
+    reporter.say(counted(mesh.surface))
     unwrapped = unwrap(mesh.surface.vertices, mesh.surface.faces, options.texture, folder, reporter)
     texels = texels_of(unwrapped, options.texture)
     vertices, normals = (values[unwrapped.source] for values in (mesh.surface.vertices, mesh.surface.normals))
     facing = texels.interpolated(unwrapped.faces, normals)
     facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-9)
     places = texels.interpolated(unwrapped.faces, vertices)
-    baked = bake(run, run.scene.train_views, places, facing, SOURCES[kind], voxel, reporter)
+    baked = bake(run, run.scene.train_views, places, facing, SOURCES[kind], box.size, reporter)
     reporter.say(
         f"{unwrapped.charts:,} charts, {len(texels.index) / options.texture**2:.0%} of the texture used; "
         f"{1 - baked.seen.mean():.1%} of the surface is in no view and has the nearest color"
@@ -114,7 +112,7 @@ def textured_model(
     light = None
     if kind == "delit":
         light = texels.interpolated(
-            unwrapped.faces, _irradiance(run, mesh, presentation.crop, reporter)[unwrapped.source]
+            unwrapped.faces, _irradiance(run, mesh, inside, reporter)[unwrapped.source]
         )
     color, baked = _presented(baked, light, presentation.color, _index(run), reporter)
     axes = run.frame.panorama_axes().numpy()
@@ -157,15 +155,6 @@ def _within_white(color: NDArray[np.float32], baked: Baked, reporter: Reporter) 
     )
 
 
-def _counted(surface: Surface) -> str:
-    """The counts of a mesh, for people."""
-    counts = topology(surface.faces)
-    return (
-        f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, {counts.pieces} pieces; "
-        f"{counts.boundary_edges:,} boundary edges, {counts.non_manifold_edges} non-manifold edges"
-    )
-
-
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unit vectors [V, 3] once they are rounded; up where there is no direction."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -182,19 +171,8 @@ def _index(run: OpenedRun) -> float:
     return float(run.model.shading.refractive_index)
 
 
-def _subject(
-    run: OpenedRun, surface_view: SurfaceView, crop: Crop | None, options: ModelOptions, resolution: int
-) -> tuple[ColoredMesh, float]:
-    """The mesh of the subject with learned normals and diffuse colors, and the side of a voxel."""
-    surface, views, box = fused_surface(run.cameras, surface_view, resolution=resolution)
-    if crop is not None:
-        inside = crop.inside(torch.from_numpy(surface.vertices), run.camera_frame).numpy()
-        surface = ColoredMesh(surface, surface.vertices).within(inside).surface
-    return painted(simplified(surface, options.triangles), views, box), box.size
-
-
 def _irradiance(
-    run: OpenedRun, mesh: ColoredMesh, crop: Crop | None, reporter: Reporter
+    run: OpenedRun, mesh: ColoredMesh, inside: Inside | None, reporter: Reporter
 ) -> NDArray[np.float64]:
     """Irradiance [V, 3] at the vertices of the subject."""
     cubemap = needs_radiance(run.model.shading, what=WHAT)
@@ -204,18 +182,17 @@ def _irradiance(
         found = cubemap.radiance(cubemap_lookup(texels, torch.from_numpy(directions).float()))
         return np.asarray(found.double().numpy())
 
-    around = Surroundings(radiance, mesh if crop is None else _joined(mesh, _outside(run, crop)))
+    around = Surroundings(radiance, mesh if inside is None else _joined(mesh, _outside(run, inside)))
     surface = mesh.surface
     with reporter.track("light on the surface", len(surface.vertices)) as progress:
         return irradiance(surface.vertices, surface.normals, around, _index(run), progress)
 
 
-def _outside(run: OpenedRun, crop: Crop) -> ColoredMesh:
-    """What the scene has outside the crop box: it shades the subject and gives light back."""
+def _outside(run: OpenedRun, inside: Inside) -> ColoredMesh:
+    """What the scene has beside the subject: it shades the subject and gives light back."""
     surface, views, box = fused_surface(run.cameras, run.result, resolution=SURROUNDINGS_RESOLUTION)
     mesh = painted(surface, views, box)
-    inside = crop.inside(torch.from_numpy(surface.vertices), run.camera_frame).numpy()
-    faces = surface.faces[~inside[surface.faces].any(axis=1)]
+    faces = surface.faces[~inside(surface.vertices)[surface.faces].any(axis=1)]
     kept, used = mesh.surface.with_faces(faces)
     return ColoredMesh(kept, mesh.colors[used])
 
