@@ -72,7 +72,10 @@ def _noise(rise: NDArray[np.float32], middle: NDArray[np.float32]) -> NDArray[np
     common = edges[1:][np.diff(edges) == 0]
     edges = np.unique(np.concatenate((edges, np.nextafter(common, np.float32(np.inf)))))
     number = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, max(0, len(edges) - 2))
-    medians = [float(np.median(deviation[number == k])) for k in range(max(1, len(edges) - 1))]
+    bins = max(1, len(edges) - 1)
+    together = deviation[np.argsort(number.astype(np.uint8), kind="stable")]  # by bin
+    ends = np.cumsum(np.bincount(number, minlength=bins))
+    medians = [float(np.median(each)) for each in np.split(together, ends[:-1])]
     place = np.clip(np.searchsorted(edges, middle, side="right") - 1, 0, len(medians) - 1)
     # Whole numbers are rounded: no noise is less than a third of a step.
     return np.maximum(1.4826 * np.asarray(medians, np.float32), 1 / 3)[place]
