@@ -5,8 +5,7 @@ import hashlib
 import json
 import shlex
 import shutil
-import subprocess
-import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -21,6 +20,7 @@ from tiny_capture import write_picture
 from polarguide import optics
 from polarguide.capture import load_scene
 from polarguide.capture.colmap.model import read_model
+from polarguide.cli.app import run
 from polarguide.core.progress import Reporter
 from polarguide.synth import render as runner
 from polarguide.synth.folder import MANIFEST, photograph, scene_digest, verify_scene
@@ -190,15 +190,23 @@ def test_other_settings_and_other_folders_are_refused(scene: Path, spec: SceneSp
     )
 
 
-def polarguide(*arguments: str) -> str:
-    """What a command line prints."""
-    command = [sys.executable, "-m", "polarguide", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+@pytest.fixture
+def polarguide(capsys: pytest.CaptureFixture[str]) -> Iterator[Callable[..., str]]:
+    """Runs a command line that ends well; returns what it prints."""
+
+    def run_and_read(*arguments: str) -> str:
+        assert run(list(arguments)) == 0
+        return capsys.readouterr().out
+
+    yield run_and_read
+    choose_variant("rgb", threads=1)
 
 
 @COMPILED
 @pytest.mark.parametrize("sensor", ["imx250mzr", "imx250myr"])
-def test_mosaics_come_back_through_prepare(sensor: str, variant: Variant, tmp_path: Path) -> None:
+def test_mosaics_come_back_through_prepare(
+    sensor: str, variant: Variant, tmp_path: Path, polarguide: Callable[..., str]
+) -> None:
     """As a user goes: by the command that ``synth`` prints at its end; compared with the truth of the same paths."""
     out = tmp_path / "scene"
     ground, ball = TINY["things"]
@@ -236,7 +244,9 @@ def test_mosaics_come_back_through_prepare(sensor: str, variant: Variant, tmp_pa
 
 
 @COMPILED
-def test_photographs_through_a_filter_come_back_through_prepare(variant: Variant, tmp_path: Path) -> None:
+def test_photographs_through_a_filter_come_back_through_prepare(
+    variant: Variant, tmp_path: Path, polarguide: Callable[..., str]
+) -> None:
     """By the command that ``synth`` prints; the pictures are what a sheet before the lens passes of the light."""
     out = tmp_path / "scene"
     (tmp_path / "tiny.json").write_text(json.dumps(TINY))

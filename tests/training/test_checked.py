@@ -17,7 +17,6 @@ from trainings import different
 
 import polarguide
 from polarguide.capture import Scene
-from polarguide.core.errors import PolarguideError
 from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve
@@ -254,7 +253,4 @@ def test_first_values_have_the_declared_shapes(
 ) -> None:
     scene = polarguide.load_scene(demo_scene, downscale=8)
     recipe = dataclasses.replace(TOY, shading=shading)
-    with pytest.raises(PolarguideError) as refusal:
-        first_state(scene, recipe, resolve(TrainSettings(4), scene, recipe))
-    assert refusal.value.where == where
-    assert refusal.value.found.startswith(values)
+    Fault(where, found=values).raised_by(first_state, scene, recipe, resolve(TrainSettings(4), scene, recipe))
