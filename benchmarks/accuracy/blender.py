@@ -7,7 +7,7 @@ The models are exports of RUN in the scene's own units. They are lit by the run'
 by that of a scene which ``polarguide synth`` has rendered with the same things and cameras in another room, whose
 pictures they are compared with. PSNR is of sRGB values in the mask of the foreground: as it is, and with the factor on
 the light that is best for all views, since its brightness is not known. Files with "unlit" in their names are drawn
-without light.
+without light. "not black" is of dielectrics with an albedo above 0.05, with their own best factor.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ from polarguide.runs.opened import read_scene
 from polarguide.visualization import figures
 
 HEIGHT = 512
+BLACK = 0.05
+"""Albedo of bodies of which little more than reflections is seen."""
 FACTORS = np.exp(np.linspace(-1.5, 1.5, 121))
 
 
@@ -54,7 +56,7 @@ def frame_of(camera: Camera, axes: np.ndarray) -> dict[str, Any]:
 def room_light(scene: Path, axes: np.ndarray) -> torch.Tensor:
     """The panorama [H, 2 H, 3] of a rendered scene's true environment, upright in a run's axes (columns of [3, 3])."""
     exposure = json.loads((scene / "scene.json").read_text())["exposure"]
-    true = read_radiance(scene / "environment.hdr") * exposure
+    true = read_radiance(scene / "environment.hdr") * exposure / 2  # photographs are S0 / 2
     height, width = true.shape[:2]
     latitude = np.pi * (0.5 - (np.arange(HEIGHT)[:, None] + 0.5) / HEIGHT)
     longitude = np.pi * ((np.arange(2 * HEIGHT)[None] + 0.5) / HEIGHT - 1)
@@ -73,6 +75,31 @@ def psnr(first: np.ndarray, second: np.ndarray) -> float:
     return float(-10 * np.log10(np.mean((shown[0] - shown[1]) ** 2)))
 
 
+def best_factor(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
+    """The PSNR with the best of the factors on the first, and that factor."""
+    return max((psnr(factor * first, second), float(factor)) for factor in FACTORS)
+
+
+def chosen(found: list[np.ndarray], true: list[np.ndarray], masks: list[np.ndarray]) -> list[np.ndarray]:
+    """Both with all pixels of the masks in one row, [N, 3]."""
+    return [np.concatenate([p[m] for p, m in zip(each, masks, strict=True)]) for each in (found, true)]
+
+
+def drawn(
+    path: Path, folder: Path, frames: dict[str, Any], arguments: argparse.Namespace
+) -> list[np.ndarray]:
+    """Blender's pictures [H, W, 3] of a model, of linear radiance; the folder has the light, and gets files."""
+    job = {"model": str(path.resolve()), "environment": str(folder / "environment.exr"),
+           "unlit": "unlit" in path.stem, "samples": arguments.samples, "frames": frames,
+           "out": str(folder)}  # fmt: skip
+    (folder / "job.json").write_text(json.dumps(job))
+    command = [arguments.bpy, Path(__file__).with_name("blender_draw.py"), folder / "job.json"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(done.stderr[-2000:])
+    return [read_radiance(folder / f"{name}.exr")[..., :3] for name in frames]
+
+
 def main() -> None:
     """Print a table: each model, and our own pictures where the light is that of the run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -89,10 +116,18 @@ def main() -> None:
     scene = read_scene(arguments.room) if arguments.room else run.scene
     views = [scene.view(view.name) for view in run.scene.test_views[: arguments.views]]
     photographs = [view.photograph().numpy() for view in views]
-    masks = []
+    masks, bodies = [], []
     for view in views:
         with np.load(run.scene.root / "gt" / f"{view.name}.npz") as truth:
             masks.append(truth["mask"] > 0)
+            bodies.append(masks[-1] & (truth["metalness"] == 0) & (truth["albedo"].mean(axis=-1) > BLACK))
+
+    def scored(label: str, pictures: list[np.ndarray]) -> None:
+        inside, colored = (chosen(pictures, photographs, part) for part in (masks, bodies))
+        best, factor = best_factor(*inside)
+        scores = f"{psnr(*inside):9.2f} {best:9.2f} {factor:7.2f} {best_factor(*colored)[0]:9.2f}"
+        print(f"{label:32} {scores}", flush=True)
+
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if arguments.room:
@@ -100,39 +135,18 @@ def main() -> None:
         else:
             run.export("environment", folder)
         frames = {view.name: frame_of(view.camera, axes) for view in views}
-        print(f"{'model':32} {'as it is':>9} {'1 factor':>9} {'factor':>7}")
+        print(f"{'model':32} {'as it is':>9} {'1 factor':>9} {'factor':>7} {'not black':>9}")
         for path in arguments.models:
-            job = {"model": str(path.resolve()), "environment": str(folder / "environment.exr"),
-                   "unlit": "unlit" in path.stem, "samples": arguments.samples, "frames": frames,
-                   "out": str(folder)}  # fmt: skip
-            (folder / "job.json").write_text(json.dumps(job))
-            script = Path(__file__).with_name("blender_draw.py")
-            drawn = subprocess.run(
-                [arguments.bpy, script, folder / "job.json"], capture_output=True, text=True
-            )
-            if drawn.returncode:
-                sys.exit(drawn.stderr[-2000:])
-            found = [read_radiance(folder / f"{view.name}.exr")[..., :3] for view in views]
-            inside = [
-                np.concatenate([p[m] for p, m in zip(each, masks, strict=True)])
-                for each in (found, photographs)
-            ]
-            scores = [psnr(factor * inside[0], inside[1]) for factor in FACTORS]
-            best = int(np.argmax(scores))
+            found = drawn(path, folder, frames, arguments)
             label = f"{path.parent.name}/{path.name}"
-            print(f"{label:32} {psnr(*inside):9.2f} {scores[best]:9.2f} {FACTORS[best]:7.2f}", flush=True)
+            scored(label, found)
             if arguments.pictures:
                 arguments.pictures.mkdir(parents=True, exist_ok=True)
                 rows = [np.concatenate(pair, axis=1) for pair in zip(found, photographs, strict=True)]
                 picture = figures.radiance_to_rgb(torch.from_numpy(np.concatenate(rows)).float())
                 figures.write_png(arguments.pictures / f"{label.replace('/', '_')}.png", picture)
         if not arguments.room:
-            ours = [run.result(view.camera).to("cpu").final.numpy() for view in views]
-            inside = [
-                np.concatenate([p[m] for p, m in zip(each, masks, strict=True)])
-                for each in (ours, photographs)
-            ]
-            print(f"{'our own pictures':32} {psnr(*inside):9.2f}")
+            scored("our own pictures", [run.result(v.camera).to("cpu").final.numpy() for v in views])
 
 
 if __name__ == "__main__":
