@@ -1,7 +1,7 @@
 # make demo    train, score and render the demo scene that ships with the package
 # make dataset    render the five scenes of docs/how-to/synthesize.md into scenes/ (hours on few cores; goes on where it stopped),
 #                 check the files of those that are finished, and print a SHA-256 of each
-# make test    linter, formatter, types and tests, on the package as it is installed;
+# make test    linter, formatter, spelling, types and tests, on the package as it is installed;
 #                 its last lines say what was skipped, and how to change that
 # make fuzz N=20    all tables of tests/robustness, random cases with N seeds; prints what failed, and how to repeat it
 # make soak N=300    kill commands N times at random moments, go on, and compare the files
@@ -45,6 +45,7 @@ dataset: $(VENV)/.installed-synth
 test: $(VENV)/.installed-test $(READERS)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 	$(BIN)/mypy
 	$(BIN)/python -m pytest $(PYTEST)
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_capture import NAMES, TinyCapture, encode_srgb, fails, write_picture
+from faults import Fault
+from tiny_capture import NAMES, TinyCapture, encode_srgb, write_picture
 
 from polarguide.capture import checks, load_scene
 from polarguide.capture.layout import refuse_scene
-from polarguide.core.errors import PolarguideError
 from polarguide.geometry.polarizer import ANGLES
 
 
@@ -55,51 +55,56 @@ def two_folders(capture: TinyCapture) -> None:
     (capture.root / "45").mkdir()
 
 
-FAULTS: dict[str, tuple[Callable[[TinyCapture], object], tuple[str, ...]]] = {
+FAULTS: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
     "no picture of an angle in its folder": (
         folders_without("I-90/v002.png"),
-        ("I-90/v002.png", "view v002 at 90 degrees", "found only 0, 45, 135 degrees"),
+        Fault("I-90/v002.png", "view v002 at 90 degrees", "only 0, 45, 135 degrees"),
     ),
     "no folder of an angle": (
         folders_without("", "I-00", "I-45", "I-90", "polarizer135"),
-        ("four folders", "none for 135 degrees beside I-00, I-45, I-90", "Add the folder"),
+        Fault(expected="four folders", found="none for 135 degrees beside I-00, I-45, I-90", remedy="Add the folder"),
     ),
     "two folders of an angle": (
-        two_folders, ("one folder for 45 degrees", "found 45 and I-45", "Remove or rename")
+        two_folders, Fault(expected="one folder for 45 degrees", found="45 and I-45", remedy="Remove or rename")
     ),
     "two files of a picture": (
         lambda capture: capture.picture("v001", 0, ".jpg").write_bytes(b""),
-        ("polar", "one file called v001_000", "found v001_000.jpg and v001_000.png"),
+        Fault("polar", "one file called v001_000", "v001_000.jpg and v001_000.png"),
     ),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_of_a_layout_is_named(capture: TinyCapture, fault: str) -> None:
-    damage, parts = FAULTS[fault]
+@pytest.mark.parametrize("case", FAULTS)
+def test_each_fault_of_a_layout_is_named(capture: TinyCapture, case: str) -> None:
+    damage, fault = FAULTS[case]
     damage(capture)
-    fails(capture.root, *parts)
+    fault.raised_by(load_scene, capture.root)
 
 
 def test_no_such_folder(capture: TinyCapture) -> None:
-    nowhere = ("nowhere", "a capture folder", "found nothing", "polar/<view>_000.png")
-    fails(capture.root / "nowhere", *nowhere)
-    fails(capture.picture("v000", 0), "v000_000.png", "a capture folder", "found a file")
+    Fault("nowhere", "a capture folder", "nothing", "polar/<view>_000.png").raised_by(
+        load_scene, capture.root / "nowhere"
+    )
+    Fault("v000_000.png", "a capture folder", "a file").raised_by(load_scene, capture.picture("v000", 0))
 
 
 def test_a_folder_without_pictures(tmp_path: Path) -> None:
-    fails(tmp_path, "found an empty folder", "I-00, I-45")
+    Fault(found="an empty folder", remedy="I-00, I-45").raised_by(load_scene, tmp_path)
     (tmp_path / "images").mkdir()
-    fails(tmp_path, "found a folder with images", "I-00, I-45")
+    Fault(found="a folder with images", remedy="I-00, I-45").raised_by(load_scene, tmp_path)
     (tmp_path / "polar").mkdir()
-    fails(tmp_path, "pictures of at least one view, found none")
+    Fault(expected="pictures of at least one view", found="none").raised_by(load_scene, tmp_path)
 
 
 def test_missing_angle(capture: TinyCapture) -> None:
     capture.picture("v003", 45).unlink()
-    fails(capture.root, "polar/v003_045.png", "view v003 at 45 degrees", "found only 0, 90, 135 degrees.")
+    Fault("polar/v003_045.png", "view v003 at 45 degrees", "only 0, 90, 135 degrees").raised_by(
+        load_scene, capture.root
+    )
     capture.picture("v005", 90).unlink()
-    fails(capture.root, "polar/v003_045.png", "(2 views are incomplete)", "Add the file")
+    Fault("polar/v003_045.png", found="(2 views are incomplete)", remedy="Add the file").raised_by(
+        load_scene, capture.root
+    )
 
 
 def test_files_that_are_passed_over_are_reported_once(capture: TinyCapture) -> None:
@@ -129,13 +134,9 @@ def test_view_names_may_contain_underscores_and_digits(capture: TinyCapture) -> 
 def test_nothing_is_written_into_a_scene(tmp_path: Path, place: str) -> None:
     scene = tmp_path / "scene"
     (scene / "polar").mkdir(parents=True)
-    with pytest.raises(PolarguideError, match=r"expected a folder for what is written, found .*scene"):
-        refuse_scene(scene / place)
+    Fault(expected="a folder for what is written", found="scene").raised_by(refuse_scene, scene / place)
     (tmp_path / "link").symlink_to(scene / place)
-    with pytest.raises(
-        PolarguideError, match=r"found (polar|masks|gt|sparse|invalid)/ of a scene|found a scene"
-    ):
-        refuse_scene(tmp_path / "link")
+    Fault("link", "a folder for what is written", "a scene").raised_by(refuse_scene, tmp_path / "link")
     refuse_scene(tmp_path / "polar" / "new")
     refuse_scene(scene / "runs" / "mine")  # nothing is read from there
 
@@ -144,8 +145,7 @@ def test_four_folders_of_angles_are_a_scene_too(tmp_path: Path) -> None:
     for angle in ("I-00", "I-45", "I-90", "I-135"):
         (tmp_path / angle).mkdir()
     for place in (tmp_path, tmp_path / "I-45", tmp_path / "I-45" / "new"):
-        with pytest.raises(PolarguideError, match="expected a folder for what is written"):
-            refuse_scene(place)
+        Fault(expected="a folder for what is written").raised_by(refuse_scene, place)
 
 
 def warnings_of(capture: TinyCapture, **arguments: str) -> tuple[str, ...]:

@@ -12,13 +12,14 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from tiny_capture import NAMES, TinyCapture, fails
+from faults import Fault
+from tiny_capture import NAMES, TinyCapture
 
 from polarguide.capture import load_scene, read_model
 from polarguide.capture.colmap import sfm
 from polarguide.capture.colmap.model import load_model, posed_images, unseen_points
 from polarguide.capture.colmap.poses import Geometry, Poses
-from polarguide.capture.colmap.sfm import NotConnectedError, connected_views, log_false_alarms, reconstruct
+from polarguide.capture.colmap.sfm import connected_views, log_false_alarms, reconstruct
 from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import SILENT
 from polarguide.geometry.camera import Camera
@@ -172,12 +173,14 @@ def pose_of_another(capture: TinyCapture) -> None:
 
 
 NAN = struct.pack("<d", float("nan"))
-REFUSED = ("sparse/0", "a readable COLMAP model", "pycolmap refuses", "Export the model again")
-FAULTS: dict[str, tuple[Callable[[TinyCapture], object], tuple[str, ...]]] = {
+REFUSED = Fault(
+    "sparse/0", expected="a readable COLMAP model", found="pycolmap refuses", remedy="Export the model again"
+)
+FAULTS: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
     **{
         line.split()[1]: (
             lambda capture, line=line: capture.write_cameras(line),
-            ("camera 1, image v000.png", "undistorted", f"found {line.split()[1]}", "Undistort"),
+            Fault("camera 1, image v000.png", "undistorted", line.split()[1], "Undistort"),
         )
         for line in (
             "1 SIMPLE_RADIAL 12 10 15.5 6.5 4.75 0.01",
@@ -193,55 +196,59 @@ FAULTS: dict[str, tuple[Callable[[TinyCapture], object], tuple[str, ...]]] = {
     },
     "intrinsics of another shape": (
         lambda capture: capture.write_cameras("1 PINHOLE 13 10 15 15 6 5"),
-        ("camera of view v000", "the size of the pictures, 12x10", "found 13x10"),
+        Fault("camera of view v000", "the size of the pictures, 12x10", "13x10"),
     ),
     "no model": (
         lambda capture: model_folder(capture).rename(capture.root / "model"),
-        ("sparse/0", "a COLMAP model", "found neither there nor in sparse/", "structure from motion"),
+        Fault("sparse/0", "a COLMAP model", "neither there nor in sparse/", "structure from motion"),
     ),
     "an incomplete model": (
         lambda capture: (model_folder(capture) / "images.txt").unlink(),
-        ("images.txt", "found nothing", "cameras.txt, images.txt and points3D.txt together"),
+        Fault("images.txt", found="nothing", remedy="cameras.txt, images.txt and points3D.txt together"),
     ),
-    "images cut short": (broken_binary("images.bin", lambda data: data[:20]), ("sparse/0",)),
-    "points cut short": (broken_binary("points3D.bin", lambda data: data[:20]), ("sparse/0",)),
+    "images cut short": (broken_binary("images.bin", lambda data: data[:20]), Fault("sparse/0")),
+    "points cut short": (broken_binary("points3D.bin", lambda data: data[:20]), Fault("sparse/0")),
     "a pose that is no number": (  # with frames.bin, from which the poses are taken
         broken_binary("images.bin", lambda data: data[:12] + NAN + data[20:]),
-        ("images.bin", "an image whose pose is not finite"),
+        Fault("images.bin", found="an image whose pose is not finite"),
     ),
     "no turn": (
-        edited("images.txt", "1 1 0 0 0 ", "1 0 0 0 0 "), ("image v000.png", "a unit quaternion", "found quaternion")
+        edited("images.txt", "1 1 0 0 0 ", "1 0 0 0 0 "), Fault("image v000.png", "a unit quaternion", "quaternion")
     ),
     "a negative focal length": (
         edited("cameras.txt", "PINHOLE 12 10 15.5", "PINHOLE 12 10 -15.5"),
-        ("image v000.png", "positive focal lengths", "found quaternion"),
+        Fault("image v000.png", "positive focal lengths", "quaternion"),
     ),
     "a principal point far away": (
-        edited("cameras.txt", " 6.5 ", " 1e9 "), ("image v000.png", "a principal point, at most 10000 sides")
+        edited("cameras.txt", " 6.5 ", " 1e9 "),
+        Fault("image v000.png", expected="a principal point, at most 10000 sides")
     ),
     "a tiny focal length": (
-        edited("cameras.txt", "15.5 ", "1e-4 "), ("image v000.png", "a principal point, at most 10000 sides")
+        edited("cameras.txt", "15.5 ", "1e-4 "),
+        Fault("image v000.png", expected="a principal point, at most 10000 sides")
     ),
     "a camera without pixels": (
-        edited("cameras.txt", "PINHOLE 12 10", "PINHOLE 0 0"), ("camera of view v000", "12x10", "found 0x0")
+        edited("cameras.txt", "PINHOLE 12 10", "PINHOLE 0 0"), Fault("camera of view v000", "12x10", "0x0")
     ),
     "no points": (
         lambda capture: (model_folder(capture) / "points3D.txt").write_text("# none\n"),
-        ("points3D.txt", "3D points", "found none", "Triangulate"),
+        Fault("points3D.txt", "3D points", "none", "Triangulate"),
     ),
     "a picture without a pose": (
         edited("images.txt", "v004.png", "v4.png"),
-        ("sparse/0", "image called v004", "found none; the nearest are", "Register the view"),
+        Fault("sparse/0", "image called v004", "none; the nearest are", "Register the view"),
     ),
-    "two poses of one name": (pose_of_another, ("one posed image called v005", "found left/v005.jpg, v005.png")),
+    "two poses of one name": (
+        pose_of_another, Fault(expected="one posed image called v005", found="left/v005.jpg, v005.png")
+    ),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_of_a_model_is_named(capture: TinyCapture, fault: str) -> None:
-    damage, parts = FAULTS[fault]
+@pytest.mark.parametrize("case", FAULTS)
+def test_each_fault_of_a_model_is_named(capture: TinyCapture, case: str) -> None:
+    damage, fault = FAULTS[case]
     damage(capture)
-    fails(capture.root, *parts)
+    fault.raised_by(load_scene, capture.root)
 
 
 def test_intrinsics_of_pictures_that_were_resized_are_scaled(capture: TinyCapture) -> None:
@@ -328,8 +335,9 @@ def test_a_model_of_wrong_matches_is_refused(tmp_path: Path, monkeypatch: pytest
     model = SimpleNamespace(num_reg_images=lambda: 3)
     monkeypatch.setattr(sfm, "match_features", lambda database, *_, **__: write_database(database, 0.0))
     monkeypatch.setattr(sfm, "_map", lambda *_, **__: {0: model})
-    with pytest.raises(NotConnectedError, match="3 of 3 views registered, by matches that agree no better"):
-        reconstruct(tmp_path, SIZES, matching="exhaustive", seed=0, reporter=SILENT, untried="")
+    Fault(found="3 of 3 views registered, by matches that agree no better").raised_by(
+        reconstruct, tmp_path, SIZES, matching="exhaustive", seed=0, reporter=SILENT, untried=""
+    )
     assert not (tmp_path / "model").exists()
 
 

@@ -13,13 +13,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from faults import Fault
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from tiny_capture import TinyCapture, encode_srgb, fails, ideal_intensities, write_picture
+from tiny_capture import TinyCapture, encode_srgb, ideal_intensities, write_picture
 
 from polarguide.capture import load_scene
-from polarguide.capture.filter.exif import orientation, taken
+from polarguide.capture.filter.camera_files import orientation, taken
 from polarguide.capture.formats import pictures
 from polarguide.capture.formats.integrity import declared_size, find_damage
 from polarguide.capture.formats.pictures import decode_picture, linear_codes
@@ -160,10 +161,9 @@ def test_full_alpha_is_dropped_and_channels_are_in_rgb_order(tmp_path: Path) -> 
 def test_a_transparent_pixel_is_refused(tmp_path: Path, kind: type) -> None:
     bgra = np.full((4, 5, 4), np.iinfo(kind).max, kind)
     bgra[2, 3, 3] = 7
-    with pytest.raises(
-        PolarguideError, match=r"expected an opaque picture, found 5\.0% of it transparent\. Save"
-    ):
-        decode_picture(tmp_path, encoded(".png", bgra))
+    Fault(expected="an opaque picture", found="5.0% of it transparent", remedy="Save").raised_by(
+        decode_picture, tmp_path, encoded(".png", bgra)
+    )
 
 
 @pytest.mark.parametrize("data", JPEGS.values(), ids=JPEGS.keys())
@@ -240,41 +240,41 @@ def other_picture(
     return lambda capture: write_picture(capture.picture("v003", 135), values(capture), bits=bits)
 
 
-PICTURES: dict[str, tuple[Callable[[TinyCapture], object], tuple[str, ...]]] = {
-    "empty": (cut(0), ("v002_090.png", "a complete PNG, JPEG or TIFF file", "an empty file", "Copy or export")),
-    "cut": (cut(300), ("v002_090.png", "a complete PNG", "a PNG file cut short", "Copy or export")),
-    "without its end": (cut(-1), ("v002_090.png", "a PNG file cut short")),
-    "a cut JPEG": (cut(-3, ".jpg"), ("v002_090.jpg", "file cut short")),
-    "a cut TIFF": (cut(-3, ".tif"), ("v002_090.tif", "file cut short")),
+PICTURES: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
+    "empty": (cut(0), Fault("v002_090.png", "a complete PNG, JPEG or TIFF file", "an empty file", "Copy or export")),
+    "cut": (cut(300), Fault("v002_090.png", "a complete PNG", "a PNG file cut short", "Copy or export")),
+    "without its end": (cut(-1), Fault("v002_090.png", found="a PNG file cut short")),
+    "a cut JPEG": (cut(-3, ".jpg"), Fault("v002_090.jpg", found="file cut short")),
+    "a cut TIFF": (cut(-3, ".tif"), Fault("v002_090.tif", found="file cut short")),
     "another kind": (
         lambda capture: capture.picture("v001", 0).write_bytes(b"GIF89a and so on"),
-        ("v001_000.png", "found a file that is none of these"),
+        Fault("v001_000.png", found="a file that is none of these"),
     ),
-    "a folder": (folder_of_a_picture, ("v001_000.png", "a readable file", "found Is a directory")),
+    "a folder": (folder_of_a_picture, Fault("v001_000.png", "a readable file", "Is a directory")),
     "another size": (
         other_picture(lambda _: ideal_intensities(0, height=8, width=12)[3]),
-        ("v003_135.png", "the size of polar/v003_000.png, 12x10", "found 12x8"),
+        Fault("v003_135.png", "the size of polar/v003_000.png, 12x10", "12x8"),
     ),
     "another depth": (
         other_picture(lambda capture: capture.linear["v003"][3], bits=8),
-        ("v003_135.png", "found 12x10 with 8 bits", "Export the pictures of a view alike"),
+        Fault("v003_135.png", found="12x10 with 8 bits", remedy="Export the pictures of a view alike"),
     ),
     "another size than its camera": (
         lambda capture: capture.write_view("v003", ideal_intensities(0, height=8, width=12)),
-        ("camera of view v003", "the size of the pictures, 12x8", "found 12x10", "no crop"),
+        Fault("camera of view v003", "the size of the pictures, 12x8", "12x10", "no crop"),
     ),
     "a view of another depth": (
         lambda capture: capture.write_view("v003", capture.linear["v003"], bits=8),
-        ("one number of bits for all views", "8 bits in view v003 and 16 in view v000"),
+        Fault(expected="one number of bits for all views", found="8 bits in view v003 and 16 in view v000"),
     ),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("fault", PICTURES)
-def test_each_fault_of_a_picture_is_named(capture: TinyCapture, fault: str) -> None:
-    damage, parts = PICTURES[fault]
+@pytest.mark.parametrize("case", PICTURES)
+def test_each_fault_of_a_picture_is_named(capture: TinyCapture, case: str) -> None:
+    damage, fault = PICTURES[case]
     damage(capture)
-    fails(capture.root, *parts)
+    fault.raised_by(load_scene, capture.root)
 
 
 def test_a_png_that_is_whole_but_makes_no_sense(capture: TinyCapture) -> None:
@@ -284,7 +284,7 @@ def test_a_png_that_is_whole_but_makes_no_sense(capture: TinyCapture) -> None:
         for kind, body in ((b"IHDR", header), (b"IDAT", b"no zlib stream"), (b"IEND", b""))
     )
     capture.picture("v001", 0).write_bytes(b"\x89PNG\r\n\x1a\n" + chunks)
-    fails(capture.root, "v001_000.png", "found one that cannot be decoded")
+    Fault("v001_000.png", found="one that cannot be decoded").raised_by(load_scene, capture.root)
 
 
 def test_floating_point_pictures(capture: TinyCapture) -> None:
@@ -292,33 +292,35 @@ def test_floating_point_pictures(capture: TinyCapture) -> None:
         capture.picture("v001", angle).unlink()
         path = capture.picture("v001", angle, ".tif")
         assert cv2.imwrite(str(path), np.full((10, 12, 3), 900.0, np.float32))
-    fails(capture.root, "v001_000.tif", "floating-point values from 0 to 1", "found up to 900", "16-bit")
+    Fault(
+        "v001_000.tif", expected="floating-point values from 0 to 1", found="up to 900", remedy="16-bit"
+    ).raised_by(load_scene, capture.root)
 
 
 @pytest.mark.parametrize("folder", ["masks", "invalid"])
 def test_mask_of_another_size_or_damaged(capture: TinyCapture, folder: str) -> None:
     path = capture.root / folder / "v002.png"
     write_picture(path, np.ones((12, 10)), bits=8)
-    fails(
-        capture.root, f"{folder}/v002.png", "the size of the pictures, 12x10", "found 10x12", "Make it anew"
+    Fault(f"{folder}/v002.png", "the size of the pictures, 12x10", "10x12", "Make it anew").raised_by(
+        load_scene, capture.root
     )
     write_picture(path, np.ones((10, 12)), bits=8)
     path.write_bytes(path.read_bytes()[:-1])
-    fails(capture.root, f"{folder}/v002.png", "a PNG file cut short")
+    Fault(f"{folder}/v002.png", found="a PNG file cut short").raised_by(load_scene, capture.root)
 
 
 def test_a_lack_of_memory_is_told_from_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = cv2.imencode(".png", np.zeros((40, 50), np.uint16))[1].tobytes()
     monkeypatch.setattr(pictures.cv2, "imdecode", lambda *_: None)
-    with pytest.raises(PolarguideError, match="one that cannot be decoded"):
-        pictures.decode_stored(tmp_path / "a.png", data)
+    Fault(found="one that cannot be decoded").raised_by(pictures.decode_stored, tmp_path / "a.png", data)
 
     def none_left(*_: object) -> None:
         raise MemoryError
 
     monkeypatch.setattr(pictures.np, "empty", none_left)
-    with pytest.raises(PolarguideError, match="expected memory for a picture of 50x40 pixels, found less"):
-        pictures.decode_stored(tmp_path / "a.png", data)
+    Fault(expected="memory for a picture of 50x40 pixels", found="less").raised_by(
+        pictures.decode_stored, tmp_path / "a.png", data
+    )
 
 
 @pytest.mark.parametrize("code", [1, 2, 3, 6])

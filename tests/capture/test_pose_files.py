@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dataset_files import HEIGHT, INNER, WIDTH, idr_cameras, poses
+from faults import Fault
 
 from polarguide.capture.colmap.files import colmap_camera
 from polarguide.capture.pose_files import read_pose_file
@@ -121,8 +122,7 @@ def test_idr_cameras_belong_to_views_by_number_or_in_order(tmp_path: Path) -> No
         for view, (rotation, _) in zip(views, poses(), strict=True):
             np.testing.assert_allclose(found[view].rotation, rotation, atol=1e-6)
             assert found[view].parameters == pytest.approx((INNER[0, 0], INNER[1, 1], 33, 23))
-    with pytest.raises(PolarguideError, match="as many cameras as views, 3"):
-        read_pose_file(path, VIEWS[:3], stated)
+    Fault(expected="as many cameras as views, 3").raised_by(read_pose_file, path, VIEWS[:3], stated)
 
 
 FOCAL = {"fl_x": 90.0, "fl_y": 92.0}
@@ -322,20 +322,19 @@ UNNAMED = '<camera id="7" sensor_id="0"><transform>1 0 0 0 0 1 0 0 0 0 1 0 0 0 0
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "message"),
+    ("name", "content", "fault"),
     [
-        ("c.xml", "<document", "cannot be parsed"),
-        ("c.xml", "<!DOCTYPE a [<!ENTITY b 'c'>]><a/>", "exported by Metashape"),
-        ("c.xml", "<document/>", "cameras with a pose, found none"),
-        ("t.json", '{"frames": []}', "cameras with a pose, found none"),
-        ("t.json", '{"frames": [{"file_path": "a.png", "transform_matrix": [[1]]}]}', "4x4"),
+        ("c.xml", "<document", Fault(found="cannot be parsed")),
+        ("c.xml", "<!DOCTYPE a [<!ENTITY b 'c'>]><a/>", Fault(expected="exported by Metashape")),
+        ("c.xml", "<document/>", Fault(expected="cameras with a pose", found="none")),
+        ("t.json", '{"frames": []}', Fault(expected="cameras with a pose", found="none")),
+        ("t.json", '{"frames": [{"file_path": "a.png", "transform_matrix": [[1]]}]}', Fault(expected="4x4")),
         ("t.json", '{"camera_model": "FISHEYE624", "w": 4, "h": 4, "fl_x": 3, "frames": [{"file_path": "a.png", '
-         '"transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}', "a camera of OPENCV"),
+         '"transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}', Fault(expected="a camera of OPENCV")),
         ("t.json", '{"frames": [{"file_path": "a.png", '
-         '"transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}', "a focal length"),
+         '"transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}', Fault(expected="a focal length")),
     ],
 )  # fmt: skip
-def test_files_that_are_none(tmp_path: Path, name: str, content: str, message: str) -> None:
+def test_files_that_are_none(tmp_path: Path, name: str, content: str, fault: Fault) -> None:
     (tmp_path / name).write_text(content)
-    with pytest.raises(PolarguideError, match=message):
-        read_pose_file(tmp_path / name, VIEWS, stated)
+    fault.raised_by(read_pose_file, tmp_path / name, VIEWS, stated)

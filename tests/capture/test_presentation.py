@@ -8,19 +8,19 @@ from pathlib import Path
 
 import pytest
 import torch
+from faults import Fault
 from random_runs import ring
 
 from polarguide.capture.presentation import (
     PRESENTATION_FILE,
     Crop,
     Presentation,
-    balanced,
+    colored,
     parse_length,
     read_presentation,
     shown_length,
     write_presentation,
 )
-from polarguide.core.errors import PolarguideError
 from polarguide.geometry.scene_frame import scene_frame
 
 AROUND = scene_frame(list(ring().values()))
@@ -45,28 +45,27 @@ def test_what_is_written_is_read_and_what_is_missing_is_left_out(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "fault"),
     [
-        ('{"white_balance": [1, 1]}', r"\(white_balance\)"),
-        ('{"white_balance": [1, 0, 1]}', r"\(white_balance\[1\]\): expected 0.02 to 50, found 0"),
-        ('{"white_balance": [1, NaN, 1]}', "finite|0.02 to 50"),
-        ('{"up_axis": [0, 0, 0]}', r"\(up_axis\): expected a direction"),
-        ('{"meters_per_unit": 0}', r"\(meters_per_unit\): expected 1e-09 to "),
-        ('{"meters_per_unit": 1e-300}', r"\(meters_per_unit\): expected 1e-09 to "),
-        ('{"meters_per_unit": "1"}', r"\(meters_per_unit\): expected a number"),
-        ('{"crop": {"low": [0, 0, 0], "high": [1, 0, 1]}}', r"\(crop\): expected a low side less than"),
-        ('{"crop": {"low": [0, 0, 0], "high": [1, 1, 1e9]}}', r"\(crop\)"),
-        ('{"author": "two\\nlines"}', r"\(author\): expected one line"),
-        ('{"licence": "CC0"}', "expected only white_balance, up_axis.*found licence"),
-        ('{"title": "' + 1001 * "x" + '"}', r"\(title\)"),
-        ("[]", "JSON object"),
+        ('{"white_balance": [1, 1]}', Fault("(white_balance)")),
+        ('{"white_balance": [1, 0, 1]}', Fault("(white_balance[1])", "0.02 to 50", "0")),
+        ('{"white_balance": [1, NaN, 1]}', Fault(expected="0.02 to 50")),
+        ('{"up_axis": [0, 0, 0]}', Fault("(up_axis)", expected="a direction")),
+        ('{"meters_per_unit": 0}', Fault("(meters_per_unit)", expected="1e-09 to")),
+        ('{"meters_per_unit": 1e-300}', Fault("(meters_per_unit)", expected="1e-09 to")),
+        ('{"meters_per_unit": "1"}', Fault("(meters_per_unit)", expected="a number")),
+        ('{"crop": {"low": [0, 0, 0], "high": [1, 0, 1]}}', Fault("(crop)", expected="a low side less than")),
+        ('{"crop": {"low": [0, 0, 0], "high": [1, 1, 1e9]}}', Fault("(crop)")),
+        ('{"author": "two\\nlines"}', Fault("(author)", expected="one line")),
+        ('{"licence": "CC0"}', Fault(expected="only white_balance, chart", found="licence")),
+        ('{"title": "' + 1001 * "x" + '"}', Fault("(title)")),
+        ("[]", Fault(expected="JSON object")),
     ],
 )
-def test_what_is_wrong_is_refused_by_name(text: str, message: str, tmp_path: Path) -> None:
+def test_what_is_wrong_is_refused_by_name(text: str, fault: Fault, tmp_path: Path) -> None:
     (tmp_path / PRESENTATION_FILE).write_text(text)
-    with pytest.raises(PolarguideError, match=message) as error:
-        read_presentation(tmp_path)
-    assert PRESENTATION_FILE in error.value.where
+    error = fault.raised_by(read_presentation, tmp_path)
+    assert PRESENTATION_FILE in error.where
 
 
 def test_a_run_s_own_goes_before_its_scene_s_field_by_field() -> None:
@@ -109,8 +108,7 @@ def test_lengths(text: str, meters: float) -> None:
 
 @pytest.mark.parametrize("text", ["", "mm", "0", "-1", "1 mile", "1..2", "nan", "inf", "1e99"])
 def test_what_is_no_length(text: str) -> None:
-    with pytest.raises(PolarguideError, match="distance: expected a length above 0 such as 85mm"):
-        parse_length(text)
+    Fault("distance", expected="a length above 0 such as 85mm").raised_by(parse_length, text)
 
 
 def test_lengths_are_told_with_a_unit() -> None:
@@ -122,6 +120,6 @@ def test_lengths_are_told_with_a_unit() -> None:
 
 def test_white_balance_is_a_factor_on_light() -> None:
     light = torch.rand(4, 3, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(balanced(light, WHOLE.gains), light * torch.tensor([1.5, 1.0, 0.75]))
-    assert balanced(light, None) is light
-    assert not math.isnan(float(balanced(light, WHOLE.gains).sum()))
+    torch.testing.assert_close(colored(light, WHOLE.color), light * torch.tensor([1.5, 1.0, 0.75]))
+    assert colored(light, None) is light
+    assert not math.isnan(float(colored(light, WHOLE.color).sum()))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from camera_files import COLOR, MONO, behind, busy_light, mosaic, pack, smooth_light, write_mosaic
+from faults import Fault
 
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, DemosaicedPicture, demosaic
 from polarguide.capture.sensor.pattern import (
@@ -18,7 +19,6 @@ from polarguide.capture.sensor.pattern import (
     unusable_samples,
 )
 from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, packed_size, read_mosaic, unpack
-from polarguide.core.errors import PolarguideError
 from polarguide.preparation.mosaic_source import sample_blocks
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
@@ -95,10 +95,12 @@ def test_full_scale(
 def test_levels_out_of_order_are_refused() -> None:
     for changes in ({"black": 300.0}, {"saturation": 300}, {"black": 100.0, "saturation": 90}):
         asked = {"bits": 8, "black": 0.0, "saturation": None, **changes}
-        with pytest.raises(PolarguideError, match="0 <= black level < saturation <= 255"):
-            estimate_levels(200, 255, 8, **asked)
-    with pytest.raises(PolarguideError, match="values below 1024 for 10 bits, found 1025"):
-        estimate_levels(1025, 2047, 16, bits=10, black=0.0, saturation=None)
+        Fault(expected="0 <= black level < saturation <= 255").raised_by(
+            estimate_levels, 200, 255, 8, **asked
+        )
+    Fault(expected="values below 1024 for 10 bits", found="1025").raised_by(
+        estimate_levels, 1025, 2047, 16, bits=10, black=0.0, saturation=None
+    )
 
 
 def test_saturated_and_dark_samples() -> None:
@@ -152,8 +154,9 @@ def test_the_wrong_kind_of_sensor_is_refused(tmp_path: Path, pattern, named, rig
     write_mosaic(
         tmp_path / "in" / "v.png", mosaic(behind(smooth_light(128, 192, color=color)), pattern), bits=12
     )
-    with pytest.raises(PolarguideError, match=f"found {found}. Use --sensor {right}"):
-        prepare_scene(tmp_path / "in", tmp_path / "out", PrepareSettings(sensor=named, poses="none"))
+    Fault(found=found, remedy=f"Use --sensor {right}").raised_by(
+        prepare_scene, tmp_path / "in", tmp_path / "out", PrepareSettings(sensor=named, poses="none")
+    )
     prepare_scene(tmp_path / "in", tmp_path / "out2", PrepareSettings(sensor=right, poses="none"))
 
 

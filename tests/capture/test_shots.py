@@ -18,14 +18,18 @@ import cv2
 import numpy as np
 import pytest
 from camera_files import ANGLES, behind, read_invalid, read_polar, smooth_light
+from faults import Fault
 
 from polarguide.capture.calibration import Calibration
-from polarguide.capture.exposures import Angle, angle_labels, turned
-from polarguide.capture.filter.camera_raw import read_camera_raw
-from polarguide.capture.filter.exif import apply_orientation, orientation_calibration, read_taken, taken
-from polarguide.capture.filter.names import split_name
+from polarguide.capture.exposures import Angle, angle_labels, split_name, turned
+from polarguide.capture.filter.camera_files import (
+    apply_orientation,
+    orientation_calibration,
+    read_camera_raw,
+    read_taken,
+    taken,
+)
 from polarguide.capture.filter.ring_scale import BAND, place, ring_scale
-from polarguide.core.errors import PolarguideError
 from polarguide.geometry.polarizer import malus
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
@@ -114,37 +118,38 @@ def test_orientation_turns_pixels_and_angles(tmp_path: Path) -> None:
 
 def test_raw_is_not_srgb(tmp_path: Path) -> None:
     write_shots(tmp_path / "in", smooth_light(64, 96))
-    with pytest.raises(PolarguideError, match="--transfer: expected auto or linear"):
-        prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, transfer="srgb"))
+    Fault("--transfer", expected="auto or linear").raised_by(
+        prepare_scene, tmp_path / "in", tmp_path / "out", replace(PLAIN, transfer="srgb")
+    )
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "fault"),
     [
-        (lambda path: path.write_bytes(b""), "found an empty file"),
-        (lambda path: path.write_bytes(path.read_bytes()[:300]), "cannot be developed"),
-        (lambda path: path.write_bytes(path.read_bytes()[:-2000]), "cannot be developed"),
-        (lambda path: path.write_bytes(b"hello" * 100), "cannot be developed"),
-        (lambda path: path.unlink(), r"shots of view cup .*found none at 90"),
+        (lambda path: path.write_bytes(b""), Fault(found="an empty file")),
+        (lambda path: path.write_bytes(path.read_bytes()[:300]), Fault(found="cannot be developed")),
+        (lambda path: path.write_bytes(path.read_bytes()[:-2000]), Fault(found="cannot be developed")),
+        (lambda path: path.write_bytes(b"hello" * 100), Fault(found="cannot be developed")),
+        (lambda path: path.unlink(), Fault(expected="shots of view cup", found="none at 90")),
         (
             lambda path: path.with_suffix(".jpg").write_bytes(b""),
-            "one picture of cup at 90 degrees, found cup.dng and cup.jpg",
+            Fault(expected="one picture of cup at 90 degrees", found="cup.dng and cup.jpg"),
         ),
     ],
 )
-def test_damaged_files(tmp_path: Path, change: object, message: str) -> None:
+def test_damaged_files(tmp_path: Path, change: object, fault: Fault) -> None:
     write_shots(tmp_path / "in", smooth_light(64, 96))
     change(tmp_path / "in" / "90" / "cup.dng")  # type: ignore[operator]
-    with pytest.raises(PolarguideError, match=message):
-        prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
+    fault.raised_by(prepare_scene, tmp_path / "in", tmp_path / "out", PLAIN)
     assert not (tmp_path / "out" / "scene.json").exists()
 
 
 def test_without_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.nef").write_bytes(b"raw")
     monkeypatch.setitem(sys.modules, "rawpy", None)
-    with pytest.raises(PolarguideError, match=r"not installed. Install it with .*rawpy"):
-        read_camera_raw(tmp_path / "a.nef", UNIT)
+    Fault(found="not installed", remedy="Install it with").raised_by(
+        read_camera_raw, tmp_path / "a.nef", UNIT
+    )
 
 
 class Recorder:
@@ -190,8 +195,9 @@ def test_white_balance_is_for_camera_raw(tmp_path: Path) -> None:
     from camera_files import write_shots as write_pictures
 
     write_pictures(tmp_path / "in", "v", behind(smooth_light()))
-    with pytest.raises(PolarguideError, match="--white-balance: expected none for pictures"):
-        prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, white_balance="1,2,3"))
+    Fault("--white-balance", expected="none for pictures").raised_by(
+        prepare_scene, tmp_path / "in", tmp_path / "out", replace(PLAIN, white_balance="1,2,3")
+    )
 
 
 @pytest.mark.parametrize(

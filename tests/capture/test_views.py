@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from faults import Fault
 from tiny_capture import HEIGHT, WIDTH, ideal_intensities, write_tiny_capture
 from torch import Tensor
 
@@ -28,7 +29,6 @@ from polarguide.capture.variants import (
     select_exposures,
 )
 from polarguide.capture.view import Loader
-from polarguide.core.errors import PolarguideError
 from polarguide.core.options import Exposures
 from polarguide.geometry.camera import Camera, look_at
 from polarguide.training.priors import view_priors
@@ -73,11 +73,9 @@ def test_a_picture_that_has_changed_is_refused(tmp_path: Path) -> None:
     capture = write_tiny_capture(tmp_path / "tiny")
     scene = load_scene(capture.root, hold=False)
     capture.write_view("v004", ideal_intensities(99))
-    with pytest.raises(PolarguideError, match=r"v004_000\.png: expected the file that was there"):
-        _ = scene.view("v004").codes
+    Fault("v004_000.png", expected="the file that was there").raised_by(lambda: scene.view("v004").codes)
     (capture.root / "polar" / "v005_090.png").unlink()
-    with pytest.raises(PolarguideError, match=r"v005_090\.png"):
-        _ = scene.view("v005").codes
+    Fault("v005_090.png").raised_by(lambda: scene.view("v005").codes)
 
 
 def masked_scene(folder: Path, *, hold: bool, downscale: int = 1) -> Scene:
@@ -266,20 +264,19 @@ def test_masks_of_test_views_do_not_choose_points() -> None:
     nothing = torch.zeros(HIGH, WIDE, dtype=torch.bool)
     scene = scene_of(view(mask=subject_mask()), view("v1", mask=nothing))
     assert mask_background(replace(scene, test_names=("v1",))).points.tolist() == [[0.0, 0.0, 0.0]]
-    with pytest.raises(PolarguideError, match="none of 2 points"):
-        mask_background(scene)
+    Fault(found="none of 2 points").raised_by(mask_background, scene)
 
 
 def test_a_view_without_a_mask_is_named() -> None:
-    with pytest.raises(PolarguideError, match=r"no mask for view v1.*masks/v1\.png"):
-        mask_background(scene_of(view(mask=subject_mask()), view("v1")))
+    Fault(found="no mask for view v1", remedy="masks/v1.png").raised_by(
+        mask_background, scene_of(view(mask=subject_mask()), view("v1"))
+    )
 
 
 def test_masks_that_hold_no_point_are_refused() -> None:
     corner = torch.zeros(HIGH, WIDE, dtype=torch.bool)
     corner[:3, :3] = True
-    with pytest.raises(PolarguideError, match="none of 2 points"):
-        mask_background(scene_of(view(mask=corner)))
+    Fault(found="none of 2 points").raised_by(mask_background, scene_of(view(mask=corner)))
 
 
 SCENE = make_scene()
@@ -327,5 +324,6 @@ def test_three_and_none_hold_what_four_measured() -> None:
 
 
 def test_it_takes_four_pictures() -> None:
-    with pytest.raises(PolarguideError, match=r"0, 45, 90 and 135 degrees of every view"):
-        select_exposures(select_exposures(SCENE, "one"), "two")
+    Fault(expected="0, 45, 90 and 135 degrees of every view").raised_by(
+        select_exposures, select_exposures(SCENE, "one"), "two"
+    )

@@ -51,19 +51,28 @@ class Served:
             max_size=None,
         )
 
+    def picture(self, browser: ClientConnection) -> None:
+        """Read what a browser is sent up to a picture."""
+        while b"BackgroundImageMessage" not in _unpacked(browser.recv(PATIENCE)):
+            pass
+
     def is_well(self) -> bool:
         """Whether a browser that behaves is sent a picture."""
         with self.browser() as browser:
             browser.send(msgspec.msgpack.encode(CAMERA))
-            deadline = time.monotonic() + PATIENCE
-            while time.monotonic() < deadline:
-                if b"BackgroundImageMessage" in _unpacked(browser.recv(PATIENCE)):
-                    return self.thread.is_alive()
-        return False
+            self.picture(browser)
+        return self.thread.is_alive()
 
-    def controls(self) -> dict[str, Any]:
-        with self.viewer._lock:
-            return {name: None for s in self.viewer._sessions.values() for name in s.panel.accepts}
+    def controls(self) -> list[str]:
+        """The names of the controls that browsers have; waits until there are some."""
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            with self.viewer._lock:
+                names = [name for s in self.viewer._sessions.values() for name in s.panel.accepts]
+            if names:
+                return names
+            time.sleep(0.005)
+        raise TimeoutError("no browser has controls")
 
 
 def drain(browser: ClientConnection) -> None:

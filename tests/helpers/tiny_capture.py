@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 
-from polarguide.capture import load_scene
-from polarguide.core.errors import PolarguideError
 from polarguide.geometry.polarizer import ANGLES
 
 HEIGHT, WIDTH = 10, 12
@@ -117,10 +113,3 @@ def write_tiny_capture(root: Path) -> TinyCapture:
         tiny.write_view(name, tiny.linear[name])
     write_text_model(root / "sparse" / "0", NAMES)
     return tiny
-
-
-def fails(root: Path, *parts: str) -> None:
-    """``load_scene`` raises one error of one line whose message holds all parts, in order."""
-    with pytest.raises(PolarguideError, match=".*".join(re.escape(part) for part in parts)) as caught:
-        load_scene(root)
-    assert "\n" not in str(caught.value)

@@ -7,14 +7,14 @@ import json
 from pathlib import Path
 
 import pytest
+from faults import Fault
+from reduced_demo import VIEWS
 from single_shots import single_shots
 
 import polarguide
 from polarguide.capture.exposures import Exposure
-from polarguide.core.errors import PolarguideError
-from polarguide.inspection.settings import InspectSettings
+from polarguide.inspection.settings import Check, InspectSettings
 from polarguide.inspection.shots import ShotFindings, shot_checks
-from polarguide.inspection.verdict import Check
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.training.angles.polarizers import Judgment
@@ -122,15 +122,14 @@ def test_no_filter_and_unknown_angles() -> None:
 
 
 @pytest.mark.slow
-def test_a_folder_of_single_shots(whole_demo: Path, tmp_path: Path) -> None:
-    scene = single_shots(whole_demo, tmp_path / "shots", wrong=(11,))
-    polarguide.inspect(scene, tmp_path / "out", settings=InspectSettings(steps=600))
+def test_a_folder_of_single_shots(demo_scene: Path, tmp_path: Path) -> None:
+    scene = single_shots(demo_scene, tmp_path / "shots", wrong=(11,))
+    polarguide.inspect(scene, tmp_path / "out", settings=InspectSettings(steps=300))
     record = json.loads((tmp_path / "out" / "inspection.json").read_text())
     verdicts = {check["key"]: check["verdict"] for check in record["checks"]}
     assert verdicts["modulation"] == verdicts["handedness"] == verdicts["zero_offset"] == "ok"
-    # The twelfth view; the demo has every second or third of its capture.
-    assert "v016" in next(check for check in record["checks"] if check["key"] == "angles")["views"]
-    assert len(record["angles"]["pictures"]) == len(record["views"]) == 50
+    assert "v063" in next(check for check in record["checks"] if check["key"] == "angles")["views"]
+    assert len(record["angles"]["pictures"]) == len(record["views"]) == len(VIEWS)
     assert record["views"][0]["dolp"] is None
     assert "looks like" in (tmp_path / "out" / "inspection.html").read_text()
 
@@ -138,8 +137,7 @@ def test_a_folder_of_single_shots(whole_demo: Path, tmp_path: Path) -> None:
 def test_a_calibration_needs_four_pictures(demo_scene: Path, tmp_path: Path) -> None:
     scene = single_shots(demo_scene, tmp_path / "shots")
     settings = InspectSettings(calibration=tmp_path / "none.json")
-    with pytest.raises(PolarguideError, match="--calibration"):
-        polarguide.inspect(scene, tmp_path / "out", settings=settings)
+    Fault("--calibration").raised_by(polarguide.inspect, scene, tmp_path / "out", settings=settings)
 
 
 def test_ordinary_photographs_are_not_wrong(demo_scene: Path, tmp_path: Path) -> None:

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 import pytest
 from camera_files import ANGLES, behind, busy_light, read_invalid, read_polar, smooth_light, write_shots
+from faults import Fault
 from tiny_capture import encode_srgb, write_picture
 
+from polarguide.capture.filter.camera_files import apply_orientation, orientation
 from polarguide.capture.filter.develop import Shift, estimate_shifts
-from polarguide.capture.filter.exif import apply_orientation, orientation
 from polarguide.capture.filter.shots import find_shots
-from polarguide.core.errors import PolarguideError
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 
@@ -78,9 +78,10 @@ def test_folders_of_days_are_one_capture(tmp_path: Path) -> None:
     assert prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN).views == ["a", "b"]
     twice = tmp_path / "in" / "2026-05-02" / "a_0.png"
     twice.write_bytes((tmp_path / "in" / "2026-05-01" / "a_0.png").read_bytes())
-    message = "expected one picture of a at 0 degrees, found 2026-05-01/a_0.png and 2026-05-02/a_0.png"
-    with pytest.raises(PolarguideError, match=message):
-        prepare_scene(tmp_path / "in", tmp_path / "again", PLAIN)
+    both = "2026-05-01/a_0.png and 2026-05-02/a_0.png"
+    Fault(expected="one picture of a at 0 degrees", found=both).raised_by(
+        prepare_scene, tmp_path / "in", tmp_path / "again", PLAIN
+    )
 
 
 def test_folders_below_are_not_read_in_place_of_mosaics(tmp_path: Path) -> None:
@@ -94,9 +95,9 @@ def test_shots_under_the_numbers_of_the_camera_are_named(tmp_path: Path) -> None
     for k, (angle, values) in enumerate(zip(ANGLES, behind(smooth_light()), strict=True)):
         for view in range(2):
             write_picture(tmp_path / "in" / str(angle) / f"DSC_{4 * view + k}.png", values)
-    message = "expected equal names of the four shots .* found 2 files in each, all under different names"
-    with pytest.raises(PolarguideError, match=message):
-        prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
+    Fault(expected="equal names of the four shots", found="2 files in each").raised_by(
+        prepare_scene, tmp_path / "in", tmp_path / "out", PLAIN
+    )
 
 
 def test_floating_point_pictures(tmp_path: Path) -> None:
@@ -112,8 +113,9 @@ def test_floating_point_pictures(tmp_path: Path) -> None:
     assert invalid.sum() == 1
     assert np.abs(read_polar(tmp_path / "out", "v") - light)[:, ~invalid].max() < 2e-5
     assert cv2.imwrite(str(tmp_path / "in" / "0" / "v.tif"), (light[0] * 4000).astype(np.float32))
-    with pytest.raises(PolarguideError, match="floating-point values from 0 to 1"):
-        prepare_scene(tmp_path / "in", tmp_path / "out2", PLAIN)
+    Fault(expected="floating-point values from 0 to 1").raised_by(
+        prepare_scene, tmp_path / "in", tmp_path / "out2", PLAIN
+    )
 
 
 @pytest.mark.parametrize(("suffix", "transfer"), [(".jpg", "srgb"), (".png", "linear")])

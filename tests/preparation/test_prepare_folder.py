@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -18,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 from camera_files import write_mosaics
+from faults import Fault
 from refused_preparations import MOSAIC, NAMES, refused
 
 from polarguide.capture.calibration import Calibration
@@ -26,7 +26,6 @@ from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES
 from polarguide.capture.sensor.pattern import SENSORS
 from polarguide.capture.sensor.raw_file import PACKINGS
 from polarguide.core import files
-from polarguide.core.errors import PolarguideError
 from polarguide.core.system import hold_folder
 from polarguide.preparation import folder as folder_module
 from polarguide.preparation.prepare import prepare_scene
@@ -116,22 +115,21 @@ def foreign_scene(source: Path, out: Path) -> PrepareSettings:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "fault"),
     [
-        (other_setting, "a preparation with demosaic half, found demosaic quarter"),
-        (changed_source, "v001.png as it was, found .*changed, added or removed"),
-        (more_views, "v009.png"),
-        (foreign_scene, "scene.json of another origin"),
+        (other_setting, Fault(expected="a preparation with demosaic half", found="demosaic quarter")),
+        (changed_source, Fault(expected="v001.png as it was", found="changed, added or removed")),
+        (more_views, Fault(expected="v009.png")),
+        (foreign_scene, Fault(found="scene.json of another origin")),
     ],
 )
-def test_nothing_is_overwritten(tmp_path: Path, change: Callable, message: str) -> None:
+def test_nothing_is_overwritten(tmp_path: Path, change: Callable, fault: Fault) -> None:
     source, out = tmp_path / "in", tmp_path / "out"
     write_mosaics(source)
     prepare_scene(source, out, MOSAIC)
     settings = change(source, out)
     before = {path: path.read_bytes() for path in out.rglob("*.*")}
-    with pytest.raises(PolarguideError, match=message):
-        prepare_scene(source, out, settings)
+    fault.raised_by(prepare_scene, source, out, settings)
     assert {path: path.read_bytes() for path in out.rglob("*.*")} == before
 
 
@@ -162,8 +160,7 @@ def test_nothing_is_removed_at_the_word_of_a_journal(tmp_path: Path, stranger: s
         views[view] = views.pop("v000")
     (out / "scene.json").unlink()
     (out / "prepare.json").write_text(json.dumps(journal))
-    with pytest.raises(PolarguideError, match=r"prepare\.json .*nothing was written"):
-        prepare_scene(source, out, MOSAIC)
+    Fault("prepare.json", remedy="nothing was written").raised_by(prepare_scene, source, out, MOSAIC)
     assert victim.read_text() == "mine"
 
 
@@ -176,8 +173,7 @@ def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
     for path in elsewhere.iterdir():
         path.write_bytes(b"mine")
     (out / "scene.json").rename(out / "prepare.json")
-    with pytest.raises(PolarguideError, match="found a link to "):
-        prepare_scene(source, out, MOSAIC)
+    Fault(found="a link to").raised_by(prepare_scene, source, out, MOSAIC)
     assert {path.read_bytes() for path in elsewhere.iterdir()} == {b"mine"}
 
 
@@ -190,8 +186,7 @@ def test_no_link_in_an_unfinished_scene_is_written_through(tmp_path: Path, place
     elsewhere.mkdir()
     (out / place).parent.mkdir(exist_ok=True)
     (out / place).symlink_to(elsewhere)
-    with pytest.raises(PolarguideError, match=f"{re.escape(place)}: expected a place in .*found a link to "):
-        prepare_scene(source, out, MOSAIC)
+    Fault(place, "a place in", "a link to").raised_by(prepare_scene, source, out, MOSAIC)
     assert not any(elsewhere.iterdir())
 
 
@@ -200,8 +195,9 @@ def test_one_preparation_at_a_time_writes_a_folder(tmp_path: Path) -> None:
     settings = PrepareSettings(sensor="IMX250MYR", bits=16, poses="none")
     (tmp_path / "out").mkdir()
     let_go = hold_folder(tmp_path / "out")
-    with pytest.raises(PolarguideError, match="another polarguide prepare at work"):
-        prepare_scene(tmp_path / "raw", tmp_path / "out", settings)
+    Fault(found="another polarguide prepare at work").raised_by(
+        prepare_scene, tmp_path / "raw", tmp_path / "out", settings
+    )
     assert list((tmp_path / "out").iterdir()) == []
     let_go()
     assert prepare_scene(tmp_path / "raw", tmp_path / "out", settings).new
@@ -224,8 +220,8 @@ def test_what_was_measured_is_checked_before_it_is_gone_on_with(
     if value is None:
         del journal["prepare"]["measured"][key]
     path.write_text(json.dumps(journal))
-    with pytest.raises(PolarguideError, match=rf"prepare\.json.*{key}"):
-        prepare_scene(tmp_path / "source", tmp_path / "out", MOSAIC)
+    error = Fault("prepare.json").raised_by(prepare_scene, tmp_path / "source", tmp_path / "out", MOSAIC)
+    assert key in str(error)
 
 
 def test_a_fault_of_ours_is_not_said_to_be_one_of_the_folder(
@@ -260,9 +256,10 @@ def noise_mosaics(folder: Path, count: int) -> Path:
 @pytest.mark.parametrize("count", [1, 2])
 def test_too_few_views(tmp_path: Path, count: int) -> None:
     source = noise_mosaics(tmp_path / "in", count)
-    with pytest.raises(PolarguideError, match=f"at least 3 views .* found {count}") as caught:
-        prepare_scene(source, tmp_path / "out", SETTINGS)
-    assert f"polarguide priors {source} --out in-priors --sensor IMX250MZR --bits 12" in str(caught.value)
+    priors = f"polarguide priors {source} --out in-priors --sensor IMX250MZR --bits 12"
+    Fault(expected="at least 3 views", found=str(count), remedy=priors).raised_by(
+        prepare_scene, source, tmp_path / "out", SETTINGS
+    )
     assert not (tmp_path / "out").exists()
     alone = prepare_scene(
         source, tmp_path / "out", PrepareSettings(sensor="IMX250MZR", bits=12, poses="none")
@@ -275,16 +272,14 @@ def test_views_that_do_not_register(tmp_path: Path, there: bool) -> None:
     source, out = noise_mosaics(tmp_path / "in", 3), tmp_path / "out"
     if there:
         out.mkdir()
-    with pytest.raises(PolarguideError, match="0 of 3 views registered") as caught:
-        prepare_scene(source, out, SETTINGS)
-    assert f"polarguide priors {source}" in str(caught.value)
+    caught = Fault(found="0 of 3 views registered").raised_by(prepare_scene, source, out, SETTINGS)
+    assert f"polarguide priors {source}" in str(caught)
     # What is recommended changes something: all pairs are compared by default.
-    assert "--matching exhaustive" not in str(caught.value)
-    assert "--sfm-pictures minimum" in str(caught.value)
+    assert "--matching exhaustive" not in str(caught)
+    assert "--sfm-pictures minimum" in str(caught)
     tried = replace(SETTINGS, matching="sequential", sfm_pictures="minimum")
-    with pytest.raises(PolarguideError, match="--matching exhaustive") as caught:
-        prepare_scene(source, out, tried)
-    assert "--sfm-pictures" not in str(caught.value)
+    caught = Fault(remedy="--matching exhaustive").raised_by(prepare_scene, source, out, tried)
+    assert "--sfm-pictures" not in str(caught)
     assert out.exists() == there
     assert not there or not list(out.iterdir())
 
@@ -293,8 +288,7 @@ def test_a_scene_without_poses_is_as_it_was(tmp_path: Path) -> None:
     source, out = noise_mosaics(tmp_path / "in", 3), tmp_path / "out"
     prepare_scene(source, out, PrepareSettings(sensor="IMX250MZR", bits=12, poses="none"))
     before = {path.relative_to(out): path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    with pytest.raises(PolarguideError, match="0 of 3 views registered"):
-        prepare_scene(source, out, SETTINGS)
+    Fault(found="0 of 3 views registered").raised_by(prepare_scene, source, out, SETTINGS)
     after = {path.relative_to(out): path.read_bytes() for path in out.rglob("*") if path.is_file()}
     assert after == before
 
@@ -304,9 +298,8 @@ def test_shots_of_a_filter_are_advised_without_a_sensor(tmp_path: Path) -> None:
     picture = np.random.default_rng(1).integers(20_000, 30_000, (32, 32, 3)).astype(np.uint16)
     for angle in (0, 45, 90, 135):
         cv2.imwrite(str(tmp_path / "in" / f"cup_{angle}.png"), picture)
-    with pytest.raises(PolarguideError, match=r"found 1 \(cup\)") as caught:
-        prepare_scene(tmp_path / "in", tmp_path / "out")
-    assert f"polarguide priors {tmp_path / 'in'} --out in-priors." in str(caught.value)
+    caught = Fault(found="1 (cup)").raised_by(prepare_scene, tmp_path / "in", tmp_path / "out")
+    assert f"polarguide priors {tmp_path / 'in'} --out in-priors." in str(caught)
 
 
 def choices(hint: Any) -> set[str]:
@@ -364,10 +357,9 @@ def test_a_damaged_journal_is_refused(tmp_path: Path) -> None:
     content = json.loads(path.read_text())
     content["prepare"]["views"]["v000"]["files"]["polar/v000_000.png"] = "large"
     path.write_text(json.dumps(content))
-    with pytest.raises(
-        PolarguideError, match=r"scene.json \(prepare.views\[...\].*a whole number, found text"
-    ):
-        prepare_scene(tmp_path / "in", tmp_path / "out", settings)
+    Fault("scene.json (prepare.views[...]", "a whole number", "text").raised_by(
+        prepare_scene, tmp_path / "in", tmp_path / "out", settings
+    )
 
 
 @pytest.mark.parametrize("verb", ["prepare", "inspect", "synth"])

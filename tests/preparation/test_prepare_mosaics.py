@@ -20,6 +20,7 @@ from camera_files import (
     write_mosaic,
     write_mosaics,
 )
+from faults import Fault
 from heard import Heard
 from made_sensor import MadeSensor, made_sensor, true_calibration, write_codes
 
@@ -281,10 +282,12 @@ def test_the_same_command_goes_on_and_another_calibration_is_refused(tmp_path: P
     prepare_scene(tmp_path / "raw", tmp_path / "scene", settings)
     assert not prepare_scene(tmp_path / "raw", tmp_path / "scene", settings).new
     write_analyzers(tmp_path / "other.safetensors", replace(true_calibration(sensor), lens="another"))
-    with pytest.raises(PolarguideError, match="that was changed, added or removed"):
-        prepare_scene(
-            tmp_path / "raw", tmp_path / "scene", replace(settings, analyzers=tmp_path / "other.safetensors")
-        )
+    Fault(found="that was changed, added or removed").raised_by(
+        prepare_scene,
+        tmp_path / "raw",
+        tmp_path / "scene",
+        replace(settings, analyzers=tmp_path / "other.safetensors"),
+    )
 
 
 def test_a_scene_of_an_earlier_version_can_be_repeated(tmp_path: Path) -> None:
@@ -322,8 +325,9 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path: Path) -> 
             prepare_scene(tmp_path / "raw", tmp_path / "scene", asked)
         assert expected in str(error.value)
     path.write_bytes(path.read_bytes()[:-50])
-    with pytest.raises(PolarguideError, match="damaged or foreign data"):
-        prepare_scene(tmp_path / "raw", tmp_path / "scene", wanted)
+    Fault(found="damaged or foreign data").raised_by(
+        prepare_scene, tmp_path / "raw", tmp_path / "scene", wanted
+    )
     assert not (tmp_path / "scene").exists()
 
 

@@ -25,14 +25,14 @@ from camera_files import (
     write_picture,
     write_shots,
 )
+from faults import Fault
 from heard import Heard
 from relief import DEPTHS, write_relief
 
 from polarguide.capture import load_scene
 from polarguide.capture.colmap import triangulate as points_module
-from polarguide.capture.colmap.features import match_features
 from polarguide.capture.colmap.files import PosedCamera, write_cameras
-from polarguide.capture.colmap.sfm import tone_mapped
+from polarguide.capture.colmap.sfm import match_features, tone_mapped
 from polarguide.capture.colmap.triangulate import sample_visual_hull
 from polarguide.capture.write import write_png
 from polarguide.core.errors import PolarguideError
@@ -201,19 +201,18 @@ def test_pictures_for_sfm_with_less_glare() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("changes", "fault"),
     [
-        ({"intrinsics": "260,260,160"}, "--intrinsics: expected fx,fy,cx,cy or"),
-        ({"intrinsics": "260,0,160,120"}, "--intrinsics: expected fx,fy,cx,cy or"),
-        ({"refine_intrinsics": True}, "--refine-intrinsics: expected intrinsics to begin with"),
-        ({"intrinsics": "9,9,9,9", "poses": "none"}, "expected poses by structure from motion"),
-        ({"masks": "nowhere"}, "--masks: expected a folder of masks"),
+        ({"intrinsics": "260,260,160"}, Fault("--intrinsics", expected="fx,fy,cx,cy or")),
+        ({"intrinsics": "260,0,160,120"}, Fault("--intrinsics", expected="fx,fy,cx,cy or")),
+        ({"refine_intrinsics": True}, Fault("--refine-intrinsics", expected="intrinsics to begin with")),
+        ({"intrinsics": "9,9,9,9", "poses": "none"}, Fault(expected="poses by structure from motion")),
+        ({"masks": "nowhere"}, Fault("--masks", expected="a folder of masks")),
     ],
 )
-def test_wrong_use_is_told(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+def test_wrong_use_is_told(tmp_path: Path, changes: dict[str, Any], fault: Fault) -> None:
     write_shots(tmp_path / "in", "v0", behind(smooth_light()))
-    with pytest.raises(PolarguideError, match=words):
-        prepare_scene(tmp_path / "in", tmp_path / "out", replace(FILTER, **changes))
+    fault.raised_by(prepare_scene, tmp_path / "in", tmp_path / "out", replace(FILTER, **changes))
     assert not (tmp_path / "out").exists()
 
 
@@ -238,11 +237,13 @@ def test_masks_have_to_fit(tmp_path: Path) -> None:
     write_shots(tmp_path / "in", "v0", behind(smooth_light()))
     settings = replace(FILTER, masks=str(tmp_path / "masks"), poses="none")
     write_picture(tmp_path / "masks" / "other.png", np.ones((4, 4)), bits=8)
-    with pytest.raises(PolarguideError, match="expected masks named like the views"):
-        prepare_scene(tmp_path / "in", tmp_path / "out", settings)
+    Fault(expected="masks named like the views").raised_by(
+        prepare_scene, tmp_path / "in", tmp_path / "out", settings
+    )
     write_picture(tmp_path / "masks" / "v0.png", np.ones((4, 4)), bits=8)
-    with pytest.raises(PolarguideError, match=r"v0\.png: expected the size of the picture"):
-        prepare_scene(tmp_path / "in", tmp_path / "out", settings)
+    Fault("v0.png", expected="the size of the picture").raised_by(
+        prepare_scene, tmp_path / "in", tmp_path / "out", settings
+    )
 
 
 def test_poses_may_follow_on_none(tmp_path: Path) -> None:
@@ -352,8 +353,9 @@ def test_cameras_that_look_apart_are_refused(tmp_path: Path) -> None:
         write_shots(tmp_path / "in", view, behind(smooth_light()))
     (tmp_path / "model").mkdir()
     write_cameras(tmp_path / "model", apart)
-    with pytest.raises(PolarguideError, match="expected poses of cameras with a common field of view"):
-        prepare_scene(tmp_path / "in", tmp_path / "out", replace(FILTER, poses=str(tmp_path / "model")))
+    Fault(expected="poses of cameras with a common field of view").raised_by(
+        prepare_scene, tmp_path / "in", tmp_path / "out", replace(FILTER, poses=str(tmp_path / "model"))
+    )
     assert not (tmp_path / "out" / "scene.json").exists()
 
 

@@ -12,11 +12,12 @@ import cv2
 import numpy as np
 import pytest
 from camera_files import ANGLES, behind, smooth_light, write_model, write_mosaics, write_shots
+from faults import Fault
 from refused_preparations import FILTER, MOSAIC, refused
 
 from polarguide.capture import load_scene
 from polarguide.capture.calibration import Calibration, read_calibration
-from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.errors import PolarguideWarning
 from polarguide.core.progress import Reporter
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
@@ -193,25 +194,24 @@ def test_views_with_blanks_and_umlauts(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "fault"),
     [
-        ("{", "expected a JSON file"),
-        ("[]", r"a JSON object .* found \[\]"),
-        ('{"gain": 1}', "expected only gains, order, sense, zero, found gain"),
-        ('{"gains": {"0": 1}}', r"\(gains\): expected the field 45"),
-        ('{"gains": {"0": 1, "45": 1, "90": "x", "135": 1}}', r'\(gains.90\): expected a number, found "x"'),
-        ('{"gains": {"0": 1, "45": 1, "90": 0, "135": 1}}', r"\(gains.90\): expected 0.5 to 2, found 0\."),
-        ('{"order": [0, 45]}', "a list of length 4"),
-        ('{"sense": "left"}', "ccw or cw"),
-        ('{"zero": null}', "a number, found null"),
-        ('{"zero": 1e308}', r"\(zero\): expected -3600 to 3600, found 1e\+308"),
+        ("{", Fault(expected="a JSON file")),
+        ("[]", Fault(expected="a JSON object", found="[]")),
+        ('{"gain": 1}', Fault(expected="only gains, order, sense, zero", found="gain")),
+        ('{"gains": {"0": 1}}', Fault("(gains)", expected="the field 45")),
+        ('{"gains": {"0": 1, "45": 1, "90": "x", "135": 1}}', Fault("(gains.90)", "a number", '"x"')),
+        ('{"gains": {"0": 1, "45": 1, "90": 0, "135": 1}}', Fault("(gains.90)", "0.5 to 2", "0")),
+        ('{"order": [0, 45]}', Fault(expected="a list of length 4")),
+        ('{"sense": "left"}', Fault(expected="ccw or cw")),
+        ('{"zero": null}', Fault(expected="a number", found="null")),
+        ('{"zero": 1e308}', Fault("(zero)", "-3600 to 3600", "1e+308")),
     ],
 )
-def test_calibration_files(tmp_path: Path, text: str, message: str) -> None:
+def test_calibration_files(tmp_path: Path, text: str, fault: Fault) -> None:
     path = tmp_path / "calibration.json"
     path.write_text(text)
-    with pytest.raises(PolarguideError, match=message):
-        read_calibration(path)
+    fault.raised_by(read_calibration, path)
 
 
 def test_a_calibration_file(tmp_path: Path) -> None:

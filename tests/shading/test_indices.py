@@ -17,7 +17,7 @@ from polarguide.raster import choose_backend, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.surface import surface_picture
 from polarguide.recipes import recipe_named
-from polarguide.runs.defaults import resolve
+from polarguide.runs.folder import resolve
 from polarguide.shading.deferred import INDEX_NOTE, DeferredShading
 from polarguide.shading.gbuffer import RenderRequest, render, splatting
 from polarguide.shading.model import PLAIN

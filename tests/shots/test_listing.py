@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faults import Fault
 
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.polarizer import ANGLES
-from polarguide.shots.exposures import ExposureSet, find_shots
+from polarguide.shots.exposures import find_shots
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import read_shot
+from polarguide.shots.sets import ExposureSet
 from polarguide.shots.write import write_shots
 from tests.shots.test_read import CUP, MONO, PLAIN, write_four, write_mosaic
 
@@ -137,10 +139,10 @@ def test_a_path_that_is_given_twice_is_one(parts: Path) -> None:
 def test_nothing_but_faults_is_an_error(tmp_path: Path) -> None:
     write_mosaic(tmp_path / "a.png")
     write_mosaic(tmp_path / "b.png")
-    with pytest.raises(PolarguideError, match=r"--sensor, or shots .* found a folder with a.png, b.png"):
-        find_shots([tmp_path])
-    with pytest.raises(PolarguideError, match=r"a.png: expected raw mosaics with --sensor"):
-        find_shots([tmp_path / "a.png", tmp_path / "b.png"])
+    Fault(expected="--sensor, or shots", found="a folder with a.png, b.png").raised_by(find_shots, [tmp_path])
+    Fault("a.png", expected="raw mosaics with --sensor").raised_by(
+        find_shots, [tmp_path / "a.png", tmp_path / "b.png"]
+    )
 
 
 def test_mosaics_of_one_stem_are_two_shots(tmp_path: Path) -> None:
@@ -159,8 +161,7 @@ def test_shots_whose_names_cannot_be_told_apart(tmp_path: Path) -> None:
     assert [(shot.name, shot.fault is None) for shot in found] == [
         ("a_part", False), ("a_part", False), ("d_part", True), ("whole", True),
     ]  # fmt: skip
-    with pytest.raises(PolarguideError, match="expected one shot of each name, found a_part also at"):
-        read_shot(found[0], MONO)
+    Fault(expected="one shot of each name", found="a_part also at").raised_by(read_shot, found[0], MONO)
 
 
 def test_the_others_are_written(parts: Path, tmp_path: Path) -> None:
@@ -173,5 +174,4 @@ def test_the_others_are_written(parts: Path, tmp_path: Path) -> None:
 
 def test_options_that_name_no_sensor_do_not_read_mosaics(tmp_path: Path) -> None:
     write_mosaic(tmp_path / "cup_0.png")
-    with pytest.raises(PolarguideError, match="none at 45 and 90 and 135"):
-        read_shot(tmp_path / "cup_0.png", ShotOptions())
+    Fault(found="none at 45 and 90 and 135").raised_by(read_shot, tmp_path / "cup_0.png", ShotOptions())

@@ -10,12 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from faults import Fault
 from PIL import Image
 
 from polarguide import optics
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.capture.write import write_view
-from polarguide.core.errors import PolarguideError
 from polarguide.geometry.polarizer import ANGLES, malus
 from polarguide.shots.exposures import find_shots
 from polarguide.shots.maps import Reason, ShotMaps
@@ -186,47 +186,52 @@ def test_unequal_gains_are_told_and_corrected_on_demand(tmp_path: Path) -> None:
 
 
 class TestWrong:
-    def fails(self, expected: str, given: list[Path], options: ShotOptions | None = None) -> None:
+    def fails(self, fault: Fault, given: list[Path], options: ShotOptions | None = None) -> None:
         def read() -> None:
             for shot in find_shots(given, options):
                 read_shot(shot, options)
 
-        with pytest.raises(PolarguideError, match=expected):
-            read()
+        fault.raised_by(read)
 
     def test_three_of_four(self, tmp_path: Path) -> None:
         paths = write_four(tmp_path, CUP)
-        self.fails("shots of view cup at 0, 45, 90 and 135 degrees, found none at 90", [*paths[:2], paths[3]])
+        missing = Fault(expected="shots of view cup at 0, 45, 90 and 135 degrees", found="none at 90")
+        self.fails(missing, [*paths[:2], paths[3]])
         paths[1].unlink()
-        self.fails("found none at 45", [tmp_path])
+        self.fails(Fault(found="none at 45"), [tmp_path])
 
     def test_files_without_angles(self, tmp_path: Path) -> None:
         write_mosaic(tmp_path / "part.png")
-        self.fails("raw mosaics with --sensor, or shots with angles in their names", [tmp_path / "part.png"])
-        self.fails("raw mosaics with --sensor", [tmp_path])
+        self.fails(
+            Fault("part.png", expected="raw mosaics with --sensor, or shots with angles in their names"),
+            [tmp_path / "part.png"],
+        )
+        self.fails(Fault(expected="raw mosaics with --sensor"), [tmp_path])
 
     def test_no_such_file(self, tmp_path: Path) -> None:
-        self.fails("expected a file or folder of shots, found none", [tmp_path / "none.png"])
+        self.fails(Fault("none.png", expected="a file or folder of shots"), [tmp_path / "none.png"])
 
     def test_an_empty_folder(self, tmp_path: Path) -> None:
-        self.fails("expected shots, found an empty folder", [tmp_path])
+        self.fails(Fault(expected="shots", found="an empty folder"), [tmp_path])
 
     def test_wrong_sensor(self, tmp_path: Path) -> None:
         rng = np.random.default_rng(0)
         values = np.kron(rng.uniform(600, 2500, (32, 32)), np.ones((8, 8))).astype(np.uint16)
         cv2.imwrite(str(tmp_path / "a.png"), values)
-        self.fails("found no sign of color filters", [tmp_path / "a.png"], ShotOptions(sensor="IMX250MYR"))
+        self.fails(
+            Fault(found="no sign of color filters"), [tmp_path / "a.png"], ShotOptions(sensor="IMX250MYR")
+        )
 
     def test_a_file_cut_short(self, tmp_path: Path) -> None:
         write_mosaic(tmp_path / "a.png")
         data = (tmp_path / "a.png").read_bytes()
         (tmp_path / "a.png").write_bytes(data[: len(data) // 2])
-        self.fails("found a PNG file cut short", [tmp_path / "a.png"], MONO)
+        self.fails(Fault(found="a PNG file cut short"), [tmp_path / "a.png"], MONO)
 
     def test_wrong_depth(self, tmp_path: Path) -> None:
         write_mosaic(tmp_path / "a.png")
         self.fails(
-            r"a.png \(--bits\): expected values below 256 for 8 bits",
+            Fault("a.png (--bits)", expected="values below 256 for 8 bits"),
             [tmp_path / "a.png"],
             ShotOptions(sensor="IMX250MZR", bits=8),
         )
@@ -234,15 +239,14 @@ class TestWrong:
     def test_wrong_size(self, tmp_path: Path) -> None:
         write_mosaic(tmp_path / "a.png")
         options = ShotOptions(sensor="IMX250MZR", width=2448, height=2048)
-        self.fails("expected 2448x2048 pixels", [tmp_path / "a.png"], options)
+        self.fails(Fault(expected="2448x2048 pixels"), [tmp_path / "a.png"], options)
         cv2.imwrite(str(tmp_path / "b.png"), np.zeros((2100, 2500), np.uint16))
-        self.fails("at most 2464x2056 pixels", [tmp_path / "b.png"], MONO)
+        self.fails(Fault(expected="at most 2464x2056 pixels"), [tmp_path / "b.png"], MONO)
 
     def test_two_shots_where_one_is_asked_for(self, tmp_path: Path) -> None:
         for name in "ab":
             write_mosaic(tmp_path / f"{name}.png")
-        with pytest.raises(PolarguideError, match="expected one shot, found 2"):
-            read_shot(tmp_path, MONO)
+        Fault(expected="one shot", found="2").raised_by(read_shot, tmp_path, MONO)
 
     def test_two_of_one_name(self, tmp_path: Path) -> None:
         for folder in "ab":
@@ -251,11 +255,10 @@ class TestWrong:
         found = find_shots([tmp_path / "a" / "part.png", tmp_path / "b" / "part.png"], MONO)
         assert [shot.name for shot in found] == ["a_part", "b_part"]
         shutil.copytree(tmp_path / "a", tmp_path / "c" / "a")
-        self.fails("expected one shot of each name", [tmp_path / "a", tmp_path / "c" / "a"], MONO)
+        self.fails(Fault(expected="one shot of each name"), [tmp_path / "a", tmp_path / "c" / "a"], MONO)
 
     def test_options_out_of_range(self) -> None:
-        with pytest.raises(PolarguideError, match="--bits: expected 8 to 16, found 20"):
-            ShotOptions(bits=20).checked()
+        Fault("--bits", "8 to 16", "20").raised_by(ShotOptions(bits=20).checked)
 
 
 BITS = {

@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from faults import Fault
 
 import polarguide
 from polarguide import optics
-from polarguide.core.errors import PolarguideError
 from polarguide.geometry.vectors import unit
 from polarguide.results.rendering.priors import _guide
-from polarguide.shots.developed import Developed
-from polarguide.shots.exposures import ExposureSet, find_shots
-from polarguide.shots.maps import NoiseModel, ShotMaps
+from polarguide.shots.exposures import find_shots
+from polarguide.shots.maps import Developed, NoiseModel, ShotMaps
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import TOWARD, camera_of, maps_of, parse_intrinsics, read_shot, surface_maps
+from polarguide.shots.sets import ExposureSet
 
 VIEW = "v000"
 
@@ -111,10 +111,10 @@ def test_pixels_without_an_angle_have_no_normal() -> None:
 
 @pytest.mark.parametrize("text", ["", "1,2,3", "a,b,c,d", "-5,5,1,1", "nan,1,1,1"])
 def test_wrong_intrinsics(text: str) -> None:
-    with pytest.raises(PolarguideError, match="--intrinsics: expected fx,fy,cx,cy"):
-        parse_intrinsics(text, (10, 10))
+    Fault("--intrinsics", expected="fx,fy,cx,cy").raised_by(parse_intrinsics, text, (10, 10))
 
 
 def test_wrong_index() -> None:
-    with pytest.raises(PolarguideError, match="refractive_index"):
-        surface_maps(made(np.full((4, 4), 0.2), np.zeros((4, 4))), refractive_index=0.9)
+    Fault("refractive_index").raised_by(
+        surface_maps, made(np.full((4, 4), 0.2), np.zeros((4, 4))), refractive_index=0.9
+    )

@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from polarguide.capture.presentation import balanced
+from polarguide.capture.presentation import colored
+from polarguide.fields.model import FieldModel
 from polarguide.gaussians.gaussians import CORE_SHAPES
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import refit_sh, write_ply
@@ -26,54 +26,6 @@ from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.model import Light, Parameters, ShadingModel
 from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
 from polarguide.training.state import TrainingState
-
-
-class Model(Protocol):
-    """The interface of every kind of model: see ``GaussianModel`` and ``fields.model.FieldModel``."""
-
-    @property
-    def shading(self) -> ShadingModel:
-        """Which layers there are, and what light is learned."""
-
-    @property
-    def device(self) -> torch.device:
-        """Where layers are rendered."""
-
-    @property
-    def light(self) -> dict[str, Tensor]:
-        """Parameters of the learned light by name; empty where there is none."""
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """Names of the layers that it renders, in the order of ``LAYERS``; then ``POLARIZED`` where it predicts it."""
-
-    @property
-    def steps(self) -> int:
-        """How many steps it has been trained for."""
-
-    @property
-    def gaussians(self) -> int | None:
-        """How many Gaussians it has; None: it is made of something else."""
-
-    @property
-    def size(self) -> str:
-        """How large it is, for people."""
-
-    def render(
-        self, camera: Camera, *, normals: bool = True, depth: bool = False, surface: bool = False
-    ) -> RenderResult:
-        """All layers.
-
-        Args:
-            camera: any. normals: also where the model can do without them. depth: whether to render it.
-            surface: normals and depth are those of the surface at the pixel's median depth, see ``raster.surface``.
-        """
-
-    def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
-        """The Stokes vectors [3, H, W, 3] that a rendered picture predicts; None: it predicts none."""
-
-    def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Share of each pixel's alpha that lies nearer than a depth [H, W]."""
 
 
 def layers_of(shading: ShadingModel) -> tuple[str, ...]:
@@ -126,7 +78,12 @@ class GaussianModel:
     def render(
         self, camera: Camera, *, normals: bool = True, depth: bool = False, surface: bool = False
     ) -> RenderResult:
-        """All layers: see ``Model``."""
+        """All layers.
+
+        Args:
+            camera: any. normals: also where the model can do without them. depth: whether to render it.
+            surface: normals and depth are those of the surface at the pixel's median depth, see ``raster.surface``.
+        """
         return render(
             self.state.gaussians,
             camera,
@@ -151,6 +108,10 @@ class GaussianModel:
         if footprints is not None:
             drawn = as_trained(drawn, camera, footprints)
         return alpha_in_front(drawn, camera, depth, self.backend.rasterize)
+
+
+Model = GaussianModel | FieldModel
+"""What was trained: whatever scores, shows or examines a run asks either for the same."""
 
 
 @torch.no_grad()
@@ -239,19 +200,20 @@ def write_run_ply(
     shading: ShadingModel,
     centers: Tensor | None = None,
     *,
-    gains: Tensor | None = None,
+    color: Tensor | None = None,
     linear: bool = False,
 ) -> None:
     """Write the trained Gaussians; see the module's text, and ``learned_normals`` for the centers of the cameras.
 
     Args:
         path: the file. state, shading: of the run. centers: [M, 3] of the cameras.
-        gains: [3] of a white balance. linear: whether the harmonics are of linear colors, for readers that want them.
+        color: [3, 3] of a presentation; it holds for the harmonics that other programs show, never for our own fields.
+        linear: whether the harmonics are of linear colors, for readers that want them.
     """
     gaussians = state.gaussians
 
     def shown(colors: Tensor) -> Tensor:
-        colors = balanced(colors, gains).clamp(0, 1)
+        colors = colored(colors, color).clamp(0, 1)
         return colors if linear else srgb_encode(colors)
 
     dc, rest = baked_harmonics(gaussians, state.light, shading, shown=shown, linear=linear)

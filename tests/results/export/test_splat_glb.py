@@ -83,7 +83,9 @@ def test_both_variants_show_the_same_upright_and_balanced(trained: Path, tmp_pat
     read = {}
     for name, gains in (("as it is", None), ("balanced", (1.0, 0.5, 1.0))):
         if gains:
-            write_presentation(copy, Presentation((*gains,), (0.0, 0.3, 1.0), 0.5))
+            write_presentation(
+                copy, Presentation(white_balance=gains, up_axis=(0.0, 0.3, 1.0), meters_per_unit=0.5)
+            )
         out = tmp_path / name
         polarguide.open_run(copy).export("splat-glb", out)
         assert sorted(path.name for path in out.iterdir()) == ["splats-linear.glb", "splats-srgb.glb"]

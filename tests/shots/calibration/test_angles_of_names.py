@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faults import Fault
 
-from polarguide.core.errors import PolarguideError
 from polarguide.shots.calibration.settings import CalibrateSettings
 
 
@@ -29,6 +29,7 @@ def test_angles_of_names(name: str, degrees: float) -> None:
 )  # fmt: skip
 def test_names_that_may_mean_another_angle_are_refused(name: str, why: str) -> None:
     settings = CalibrateSettings("IMX250MZR", angles="names")
-    with pytest.raises(PolarguideError, match="a name that ends in the angle") as error:
-        settings.known_angles([Path(f"{name}.png")])
-    assert why in str(error.value)
+    error = Fault(expected="a name that ends in the angle").raised_by(
+        settings.known_angles, [Path(f"{name}.png")]
+    )
+    assert why in str(error)

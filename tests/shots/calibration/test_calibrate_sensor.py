@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from faults import Fault
 from made_sensor import (
     MadeSensor,
     dolp_aolp,
@@ -21,7 +22,6 @@ from made_sensor import (
 
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration
-from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import Reporter
 from polarguide.shots.calibration.calibrate import Calibrated, calibrate_sensor
 from polarguide.shots.calibration.settings import CalibrateSettings
@@ -367,24 +367,25 @@ REFUSED = {
 @pytest.mark.parametrize("make", REFUSED, ids=lambda make: make.__name__)
 def test_wrong_shots_are_refused_with_one_line_and_nothing_is_written(tmp_path: Path, make: Any) -> None:
     where, expected = REFUSED[make]
-    options = make(tmp_path)
-    with pytest.raises(PolarguideError) as error:
-        calibrated(tmp_path, "IMX250MZR", **options)
-    assert any(part in error.value.where for part in where.split("|"))
-    assert expected in str(error.value)
-    assert "\n" not in str(error.value)
+    error = Fault().raised_by(calibrated, tmp_path, "IMX250MZR", **make(tmp_path))
+    assert any(part in error.where for part in where.split("|"))
+    assert expected in str(error)
     assert not list(tmp_path.glob("camera*"))
 
 
 def test_what_exists_is_not_overwritten(tmp_path: Path) -> None:
     write_at(tmp_path, DEGREES)
     (tmp_path / "mine.png").write_bytes(b"a photograph")
-    with pytest.raises(PolarguideError, match=r"mine\.png: expected a new file"):
-        calibrate_sensor(tmp_path / "shots", tmp_path / "mine.safetensors", CalibrateSettings("IMX250MZR"))
-    with pytest.raises(PolarguideError, match=r"ends in \.safetensors"):
-        calibrate_sensor(tmp_path / "shots", tmp_path / "mine.json", CalibrateSettings("IMX250MZR"))
+    Fault("mine.png", expected="a new file").raised_by(
+        calibrate_sensor, tmp_path / "shots", tmp_path / "mine.safetensors", CalibrateSettings("IMX250MZR")
+    )
+    Fault(expected="ends in .safetensors").raised_by(
+        calibrate_sensor, tmp_path / "shots", tmp_path / "mine.json", CalibrateSettings("IMX250MZR")
+    )
     assert (tmp_path / "mine.png").read_bytes() == b"a photograph"
-    with pytest.raises(PolarguideError, match="one among the shots"):
-        calibrate_sensor(
-            tmp_path / "shots", tmp_path / "shots" / "new.safetensors", CalibrateSettings("IMX250MZR")
-        )
+    Fault(found="one among the shots").raised_by(
+        calibrate_sensor,
+        tmp_path / "shots",
+        tmp_path / "shots" / "new.safetensors",
+        CalibrateSettings("IMX250MZR"),
+    )

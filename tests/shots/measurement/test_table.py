@@ -10,13 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from faults import Fault
 
-from polarguide.core.errors import PolarguideError
 from polarguide.shots.measurement.fields import FORMAT, KEYS
 from polarguide.shots.measurement.line import measure_shots
-from polarguide.shots.measurement.options import MeasureOptions
 from polarguide.shots.measurement.table import CSV, LINES, Entry, FileStamp, Table, stamps
-from polarguide.shots.options import ShotOptions
+from polarguide.shots.options import MeasureOptions, ShotOptions
 
 SETTINGS = {"threshold": 0.05}
 
@@ -76,8 +75,7 @@ def test_what_cannot_be_written_leaves_no_half_line(tmp_path: Path, monkeypatch)
 
         with monkeypatch.context() as patch:
             patch.setattr("os.fsync", full)
-            with pytest.raises(PolarguideError, match="No space left"):
-                table.add(entry(1))
+            Fault(found="No space left").raised_by(table.add, entry(1))
         assert (tmp_path / LINES).read_bytes() == before
         assert table.status_of(entry(1).files) is None
 
@@ -86,16 +84,14 @@ def test_damage_in_the_middle_is_told(tmp_path: Path) -> None:
     write(tmp_path, [entry(0), entry(1)])
     lines = (tmp_path / LINES).read_bytes()
     (tmp_path / LINES).write_bytes(b"x" + lines)
-    with pytest.raises(PolarguideError, match=r"line 1\): expected a JSON file"):
-        Table(tmp_path, SETTINGS)
+    Fault("line 1)", expected="a JSON file").raised_by(Table, tmp_path, SETTINGS)
     assert (tmp_path / LINES).read_bytes() == b"x" + lines
 
 
 def test_one_table_has_one_set_of_options(tmp_path: Path) -> None:
     write(tmp_path, [entry(0)])
     lines = (tmp_path / LINES).read_bytes()
-    with pytest.raises(PolarguideError, match=r"threshold\): expected 0.05, found 0.1"):
-        Table(tmp_path, {"threshold": 0.1})
+    Fault("threshold)", "0.05", "0.1").raised_by(Table, tmp_path, {"threshold": 0.1})
     assert (tmp_path / LINES).read_bytes() == lines
     Table(tmp_path, {"threshold": 0.1}, overwrite=True).close()
     assert (tmp_path / LINES).read_bytes() == b""
@@ -107,8 +103,7 @@ def test_which_of_many_options_is_another_is_told(tmp_path: Path) -> None:
         table.add(entry(0))
     Table(tmp_path, settings).close()
     settings["reading"]["o98"] = 2
-    with pytest.raises(PolarguideError, match=r"\(reading.o98\): expected 1, found 2"):
-        Table(tmp_path, settings)
+    Fault("(reading.o98)", "1", "2").raised_by(Table, tmp_path, settings)
 
 
 def test_a_table_of_nothing_but_failures_is_begun_anew(tmp_path: Path) -> None:
@@ -118,8 +113,8 @@ def test_a_table_of_nothing_but_failures_is_begun_anew(tmp_path: Path) -> None:
 
 
 def test_two_do_not_write_one_table(tmp_path: Path) -> None:
-    with Table(tmp_path, SETTINGS), pytest.raises(PolarguideError, match="another polarguide measure"):
-        Table(tmp_path, SETTINGS)
+    with Table(tmp_path, SETTINGS):
+        Fault(found="another polarguide measure").raised_by(Table, tmp_path, SETTINGS)
     Table(tmp_path, SETTINGS).close()
 
 
@@ -154,16 +149,16 @@ def test_two_hundred_shots_take_no_more_memory_than_twenty(tmp_path: Path, readi
 
 
 @pytest.mark.parametrize(
-    ("line", "where"),
-    [({"format": FORMAT + 1}, "format"), ({"files": [{"path": "a", "bytes": 1, "modified": 10**30}]}, "modified"),
-     ({"files": [{"path": "a", "bytes": 1, "modified": -(10**20)}]}, "modified")],
+    ("line", "fault"),
+    [({"format": FORMAT + 1}, Fault("format")),
+     ({"files": [{"path": "a", "bytes": 1, "modified": 10**30}]}, Fault("modified")),
+     ({"files": [{"path": "a", "bytes": 1, "modified": -(10**20)}]}, Fault("modified"))],
 )  # fmt: skip
-def test_a_line_that_this_version_does_not_write_is_named(tmp_path: Path, line: dict, where: str) -> None:
+def test_a_line_that_this_version_does_not_write_is_named(tmp_path: Path, line: dict, fault: Fault) -> None:
     write(tmp_path, [entry(0)])
     written = json.loads((tmp_path / LINES).read_text())
     (tmp_path / LINES).write_text(json.dumps({**written, **line}) + "\n")
-    with pytest.raises(PolarguideError, match=where):
-        Table(tmp_path, SETTINGS)
+    fault.raised_by(Table, tmp_path, SETTINGS)
 
 
 def test_a_time_of_no_date_is_still_a_line(tmp_path: Path) -> None:
@@ -190,8 +185,7 @@ def test_a_table_writes_nowhere_else_and_waits_for_nothing(tmp_path: Path, name:
     before = victim.read_bytes()
     (folder / name).unlink()
     (folder / name).symlink_to(victim) if how == "link" else os.mkfifo(folder / name)
-    with pytest.raises(PolarguideError, match=name):
-        Table(folder, SETTINGS)
+    Fault(name).raised_by(Table, folder, SETTINGS)
     assert victim.read_bytes() == before
 
 
@@ -231,19 +225,16 @@ def test_a_table_that_goes_away_takes_no_more_lines(tmp_path: Path, how: str) ->
         if how == "replaced":
             (tmp_path / "table" / LINES).write_text("")
         for act in (table.require_there, lambda: table.add(entry(1))):
-            with pytest.raises(PolarguideError, match=r"table\.jsonl: .*removed, renamed or replaced"):
-                act()
+            Fault("table.jsonl", found="removed, renamed or replaced").raised_by(act)
 
 
 def test_no_table_among_the_shots(folder: Path, reading: ShotOptions) -> None:
-    with pytest.raises(PolarguideError, match="found that of the shots"):
-        measure_shots([folder], folder, MeasureOptions(), reading)
+    Fault(found="that of the shots").raised_by(measure_shots, [folder], folder, MeasureOptions(), reading)
     assert not (folder / LINES).exists()
 
 
 def test_a_table_of_somebody_else_is_kept(tmp_path: Path) -> None:
     (tmp_path / CSV).write_text("mine")
-    with pytest.raises(PolarguideError, match="found a file of this name alone"):
-        Table(tmp_path, SETTINGS)
+    Fault(found="a file of this name alone").raised_by(Table, tmp_path, SETTINGS)
     assert (tmp_path / CSV).read_text() == "mine"
     Table(tmp_path, SETTINGS, overwrite=True).close()

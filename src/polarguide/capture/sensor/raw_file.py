@@ -116,7 +116,14 @@ def require_mosaic(where: Path | str, values: NDArray[Any], *, least: int) -> No
             found=f"{values.shape[1]}x{values.shape[0]}",
             remedy="Give the whole picture of the sensor.",
         )
-    _require_one_picture(where, values)
+    if is_tiled(values):
+        raise PolarguideError(
+            where,
+            expected="a raw mosaic, in which the four angles take turns from pixel to pixel",
+            found="the same view four times, side by side",
+            remedy="Save what the sensor delivers (a pixel format such as Mono12 or BayerRG12), not one that shows the "
+            "four angles apart; or cut the file into four shots, NAME_0, NAME_45, NAME_90 and NAME_135.",
+        )
 
 
 def _read_plain(path: Path, raw: RawFormat) -> NDArray[Any]:
@@ -193,22 +200,6 @@ def is_tiled(values: NDArray[Any]) -> bool:
         detail.append(fine - fine.mean())
     first, *others = (fine / max(float(np.linalg.norm(fine)), 1e-12) for fine in detail)
     return min(float(first @ other) for other in others) > _TILED
-
-
-def _require_one_picture(path: Path | str, values: NDArray[Any]) -> None:
-    """Refuse four pictures side by side in place of a mosaic: nothing later would tell.
-
-    Raises:
-        PolarguideError: the file holds them.
-    """
-    if is_tiled(values):
-        raise PolarguideError(
-            path,
-            expected="a raw mosaic, in which the four angles take turns from pixel to pixel",
-            found="the same view four times, side by side",
-            remedy="Save what the sensor delivers (a pixel format such as Mono12 or BayerRG12), not one that shows the "
-            "four angles apart; or cut the file into four shots, NAME_0, NAME_45, NAME_90 and NAME_135.",
-        )
 
 
 _APART = 4

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from polarguide.capture import read_model
 from polarguide.capture.layout import refuse_scene
+from polarguide.capture.presentation import colored
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import (
     atomic_folder,
@@ -49,7 +50,7 @@ from polarguide.results.export.share import share_page
 from polarguide.results.export.splat_glb import COLOR_SPACES, Encoding, write_splat_glb
 from polarguide.results.export.splats import write_sog, write_spz
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
-from polarguide.results.rendering.mesh import RESOLUTION, ColoredMesh, implicit_mesh, scene_mesh
+from polarguide.results.rendering.mesh import RESOLUTION, implicit_mesh, scene_mesh
 from polarguide.results.rendering.relight import needs_radiance, panorama, write_exr, write_hdr
 from polarguide.runs.model import write_run_ply
 from polarguide.runs.opened import OpenedRun
@@ -72,7 +73,7 @@ def export(
     model: ModelOptions = ModelOptions(),
     reporter: Reporter = SILENT,
 ) -> list[Path]:
-    """Write a run as the files of other programs, as it is presented: cropped, in meters, upright (see ``Placement``).
+    """Write a run as the files of other programs, as it is presented: in its color, cropped, in meters, upright.
 
     Args:
         run: the run; its scene is read for all but ply, spz and sog.
@@ -184,8 +185,8 @@ def _ply(
     with temporary_folder(path.with_suffix(".whole")) as folder:
         whole = folder / path.name
         model = run.gaussian_model("format ply")
-        gains = presented.presentation.gains
-        write_run_ply(whole, model.state, model.shading, _camera_centers(run), gains=gains, linear=linear)
+        color = presented.presentation.color
+        write_run_ply(whole, model.state, model.shading, _camera_centers(run), color=color, linear=linear)
         selected = None if presented.kept is None else presented.kept.cpu()
         rewrite_splats(path, whole, placement or presented.placement, selected, presented.comments)
     return path
@@ -256,8 +257,8 @@ def _mesh(
     if (crop := presented.presentation.crop) is not None:
         inside = crop.inside(torch.from_numpy(mesh.surface.vertices), run.camera_frame).numpy()
         mesh = mesh.within(inside)
-    colors = presented.balanced(torch.from_numpy(mesh.colors)).clamp(0, 1)
-    mesh = ColoredMesh(mesh.surface, colors.numpy())
+    shown = colored(torch.from_numpy(mesh.colors), presented.presentation.color).clamp(max=1)
+    mesh = replace(mesh, colors=shown.numpy())
     paths = [folder / "mesh.glb", folder / "mesh.ply"]
     for path in paths:
         write_mesh(path, mesh, run.frame, presented.placement, presented.origin)
@@ -337,7 +338,7 @@ def _all(
         if radiant:
             _environment(run, presented, parts)
         view = (run.scene.test_views + run.scene.train_views)[0]
-        shown = presented.balanced(run.result(view.camera).to("cpu").final)
+        shown = colored(run.result(view.camera).to("cpu").final, presented.presentation.color)
         figures.write_png(parts / "preview.png", figures.radiance_to_rgb(shown))
         names = sorted(path.name for path in parts.iterdir())
         record = package_record(
@@ -352,19 +353,20 @@ def _points(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
     assert presented.gaussians is not None
     views, rasterize = run.scene.views, model.backend.rasterize
     places, normals, linear = surface_points(presented.gaussians, model.shading, views, rasterize)
-    colors = srgb_encode(presented.balanced(linear).clamp(0, 1))
+    colors = srgb_encode(colored(linear, presented.presentation.color).clamp(0, 1))
     write_points(path, placement.points(places), placement.directions(normals), colors, presented.comments)
     return [path]
 
 
 def _environment(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
     cubemap = needs_radiance(run.model.shading, what="format")
-    picture = panorama(run.light[cubemap.name], cubemap, run.frame, PANORAMA_HEIGHT)
+    learned = panorama(run.light[cubemap.name], cubemap, run.frame, PANORAMA_HEIGHT)
+    picture = colored(learned, presented.presentation.color)
     paths = [folder / f"environment.{kind}" for kind in ("exr", "hdr", "png")]
     credit = presented.presentation.credit
     write_exr(paths[0], picture, {"owner": credit} if credit else {})
     write_hdr(paths[1], picture)
-    figures.write_png(paths[2], figures.radiance_to_rgb(presented.balanced(picture)))
+    figures.write_png(paths[2], figures.radiance_to_rgb(picture))
     return paths
 
 

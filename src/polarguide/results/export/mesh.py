@@ -100,7 +100,10 @@ FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
 
 @torch.no_grad()
 def surface_points(
-    gaussians: Parameters, shading: ShadingModel, views: Iterable[View], rasterize: Rasterize
+    gaussians: Parameters,
+    shading: ShadingModel,
+    views: Iterable[View],
+    rasterize: Rasterize,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Positions, outward unit normals and linear diffuse colors, each [M, 3], of opaque Gaussians that a view sees.
 

@@ -1,4 +1,4 @@
-"""A run as its presentation shows it, for whatever leaves it: cropped, placed, balanced, with its origin."""
+"""A run as its presentation shows it, for whatever leaves it: cropped, placed, with its origin."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from polarguide.capture.presentation import balanced
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.camera import Camera
 from polarguide.results.export.placement import Origin, Placement, comments
@@ -51,10 +50,6 @@ class Presented:
             f"{run.recipe.name}, {run.steps} steps, scene sha256 {scene}, polarization {run.polarization}"
         )
         self.origin = Origin(self.presentation, made_of)
-
-    def balanced(self, radiance: Tensor) -> Tensor:
-        """Linear radiance [..., 3] as it is shown."""
-        return balanced(radiance, self.presentation.gains)
 
     def upright(self, run: OpenedRun) -> Placement:
         """The placement in formats whose up is +y."""

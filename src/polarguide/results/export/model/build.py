@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from polarguide.capture.presentation import Presentation, balanced
+from polarguide.capture.presentation import Presentation, colored, colored_reflectance
 from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.options import BaseColor, ModelOptions
 from polarguide.core.progress import Reporter
@@ -107,13 +109,12 @@ def textured_model(
         f"{unwrapped.charts:,} charts, {len(texels.index) / options.texture**2:.0%} of the texture used; "
         f"{1 - baked.seen.mean():.1%} of the surface is in no view and has the nearest color"
     )
-    color = baked.color
+    light = None
     if kind == "delit":
-        light = _irradiance(run, mesh, inside, reporter)[unwrapped.source]
-        color = delit(color, texels.interpolated(unwrapped.faces, light), _index(run))
-        color = _within_white(baked.filled(color), baked, reporter)
-    else:
-        color = balanced(torch.from_numpy(color), presentation.gains).numpy()
+        light = texels.interpolated(
+            unwrapped.faces, _irradiance(run, mesh, inside, reporter)[unwrapped.source]
+        )
+    color, baked = _presented(baked, light, presentation.color, _index(run), reporter)
     axes = run.frame.panorama_axes().numpy()
     textures = _textures(run, baked, texels, options.albedo_scale * color, lit=not options.unlit)
     return Textured(
@@ -124,6 +125,20 @@ def textured_model(
         *textures,
         _index(run),
     )
+
+
+def _presented(
+    baked: Baked, light: NDArray[np.float32] | None, color: Tensor | None, index: float, reporter: Reporter
+) -> tuple[NDArray[np.float32], Baked]:
+    """Base color [M, 3] of linear sRGB, divided by the irradiance ``light`` [M, 3] if there is one; and texels with the
+    reflectance of metals in it. Radiance and irradiance get the color of the presentation before they are divided.
+    """
+    metal = colored_reflectance(torch.from_numpy(baked.reflectance), color).numpy()
+    shown = colored(torch.from_numpy(baked.color), color).numpy()
+    if light is not None:
+        shown = delit(shown, colored(torch.from_numpy(light), color).numpy(), index)
+        shown = _within_white(baked.filled(shown), baked, reporter)
+    return shown, replace(baked, reflectance=metal)
 
 
 def _within_white(color: NDArray[np.float32], baked: Baked, reporter: Reporter) -> NDArray[np.float32]:
