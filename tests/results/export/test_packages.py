@@ -30,7 +30,9 @@ from polarguide.runs.model import write_run_ply
 
 trimesh = pytest.importorskip("trimesh")
 SMALL = ModelOptions(triangles=500, texture=128)
-CREDIT = Presentation(None, (0.0, 0.3, 1.0), 0.5, title="A thing", author="Somebody", license="CC0")
+CREDIT = Presentation(
+    up_axis=(0.0, 0.3, 1.0), meters_per_unit=0.5, title="A thing", author="Somebody", license="CC0"
+)
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]])
 
 
@@ -133,7 +135,7 @@ def mean_color(folder: Path, kind: ExportFormat, out: Path) -> np.ndarray:
 @pytest.mark.parametrize("kind", ["ply", "mesh"])
 def test_white_balance_reaches_colors(kind: ExportFormat, credited: Path, tmp_path: Path) -> None:
     before = mean_color(credited, kind, tmp_path / "a")
-    write_presentation(credited, Presentation((1.0, 0.5, 0.25)))
+    write_presentation(credited, Presentation(white_balance=(1.0, 0.5, 0.25)))
     np.testing.assert_allclose(mean_color(credited, kind, tmp_path / "b"), before * [1, 0.5, 0.25], rtol=0.05)
 
 
@@ -163,6 +165,7 @@ def test_a_package_tells_of_itself(credited: Path, tmp_path: Path) -> None:
     }
     about = (record["title"], record["author"], record["license"], record["units"], record["scale_of_scene"])
     assert about == ("A thing", "Somebody", "CC0", "meters", 0.5)
+    assert record["color"] is None
     assert "absolute brightness" in record["not_known"][0]
     # Its cameras look at its model: both are in the same axes and units.
     model = trimesh.load(out / "model.glb", process=False).to_geometry()
