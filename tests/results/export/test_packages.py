@@ -165,6 +165,7 @@ def test_a_package_tells_of_itself(credited: Path, tmp_path: Path) -> None:
     }
     about = (record["title"], record["author"], record["license"], record["units"], record["scale_of_scene"])
     assert about == ("A thing", "Somebody", "CC0", "meters", 0.5)
+    assert record["color"] is None
     assert "absolute brightness" in record["not_known"][0]
     # Its cameras look at its model: both are in the same axes and units.
     model = trimesh.load(out / "model.glb", process=False).to_geometry()

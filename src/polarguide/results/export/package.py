@@ -40,6 +40,7 @@ def package_record(run: OpenedRun, placement: Placement, origin: Origin, base_co
     ]
     if not placement.metric:
         unknown.append("how long a unit is")
+    color = origin.presentation.color  # on linear RGB, as photographed
     cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
     scored = (run.folder / METRICS_FILE).exists()
     return {
@@ -49,7 +50,7 @@ def package_record(run: OpenedRun, placement: Placement, origin: Origin, base_co
         "up_axis": "+y",
         "rotation_of_scene": placement.rotation.flatten().tolist(),
         "scale_of_scene": placement.scale,
-        "white_balance": list(origin.presentation.white_balance or (1.0, 1.0, 1.0)),
+        "color": None if color is None else color.tolist(),
         "base_color": base_color,
         "not_known": unknown,
         "scores": dict(shown_metrics(read_metrics(run.folder), scores_only=True)) if scored else {},
