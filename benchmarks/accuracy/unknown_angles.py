@@ -30,7 +30,7 @@ from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.view import View
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
-from polarguide.runs.defaults import resolve
+from polarguide.runs.folder import resolve
 from polarguide.training.angles.polarizers import Judgment
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.recipe import Recipe

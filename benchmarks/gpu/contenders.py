@@ -14,7 +14,7 @@ from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
 from polarguide.optics.color import srgb_encode
 from polarguide.raster import Backend, ScreenStatistic, Splats
 from polarguide.recipes import RECIPES
-from polarguide.runs.defaults import resolve
+from polarguide.runs.folder import resolve
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.training.losses import Weights
 from polarguide.training.photometric import photometric_loss

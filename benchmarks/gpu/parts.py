@@ -27,8 +27,7 @@ from polarguide.raster import Backend, choose_backend
 from polarguide.raster.cuda import has_gsplat
 from polarguide.recipes import RECIPES
 from polarguide.results.evaluation.metrics import psnr
-from polarguide.runs.defaults import resolve
-from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
+from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint
 from polarguide.shading.gbuffer import render
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState

@@ -37,7 +37,7 @@ except ImportError:
     use_threads = torch.set_num_threads
 from polarguide.recipes import RECIPES
 try:
-    from polarguide.runs.defaults import resolve
+    from polarguide.runs.folder import resolve
 except ImportError:
     resolve = lambda settings, *of: settings
 try:

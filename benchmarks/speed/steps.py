@@ -27,8 +27,7 @@ from polarguide.core.system import keep_freed_memory
 from polarguide.gaussians.gaussians import Trained
 from polarguide.raster import choose_backend, use_threads
 from polarguide.recipes import recipe_named
-from polarguide.runs.defaults import resolve
-from polarguide.runs.folder import CONFIGURATION, load_checkpoint
+from polarguide.runs.folder import CONFIGURATION, load_checkpoint, resolve
 from polarguide.training.feed import Feed
 from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer

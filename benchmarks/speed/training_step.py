@@ -24,7 +24,7 @@ from polarguide import _native
 from polarguide.capture import Scene, load_scene
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
-from polarguide.runs.defaults import resolve
+from polarguide.runs.folder import resolve
 from polarguide.training.recipe import Recipe, Stage
 from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer

@@ -16,7 +16,7 @@ from heard import Heard
 from tiny_capture import NAMES, TinyCapture
 
 from polarguide.capture import load_scene
-from polarguide.capture.split import TEST_EVERY, chosen_views, far_from_training, held_out_band
+from polarguide.capture.scene import TEST_EVERY, chosen_views, far_from_training, held_out_band
 from polarguide.geometry.camera import Camera, look_at
 
 
@@ -249,11 +249,11 @@ def test_unknown_view_names_its_neighbors(capture: TinyCapture) -> None:
 @pytest.mark.parametrize(
     ("arguments", "fault"),
     [
-        ({"downscale": 0}, Fault("downscale", "a whole number from 1 up", "0")),
+        ({"downscale": 0}, Fault("downscale", "1 or more", "0")),
         ({"downscale": 1.5}, Fault(found="1.5")),
         ({"downscale": True}, Fault(found="True")),
         ({"downscale": 11}, Fault("downscale", "at most 10 for pictures of 12x10", "11")),
-        ({"transfer": "gamma"}, Fault("transfer", "'linear' or 'srgb'", "'gamma'")),
+        ({"transfer": "gamma"}, Fault("transfer", "one of linear, srgb", "gamma")),
         ({"views": []}, Fault("views", "at least one view name", "an empty list")),
     ],
 )

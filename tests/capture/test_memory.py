@@ -19,7 +19,7 @@ from tiny_capture import NAMES, TinyCapture, write_tiny_capture
 from polarguide.capture import load_scene, view_reader
 from polarguide.capture.formats.integrity import declared_size
 from polarguide.capture.formats.pictures import decode_stored, read_picture, stated_size
-from polarguide.capture.memory import KEPT, READ, SHARE
+from polarguide.capture.layout import KEPT, READ, SHARE
 from polarguide.core.system import free_memory
 from polarguide.preparation.mosaic_source import WORKED
 from polarguide.preparation.prepare import prepare_scene
@@ -62,7 +62,7 @@ def test_pictures_that_do_not_fit_are_refused(capture: TinyCapture) -> None:
 def test_without_a_wish_most_of_what_is_free_may_be_taken(
     capture: TinyCapture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("polarguide.capture.memory.free_memory", lambda: 1000)
+    monkeypatch.setattr("polarguide.capture.layout.free_memory", lambda: 1000)
     Fault(expected="80% of what is free").raised_by(load_scene, capture.root)
 
 
@@ -208,9 +208,9 @@ def test_mosaics_that_do_not_fit_are_refused_by_their_headers(
         (0.99 * free, "a mosaic of 4000x3000 that take"),
         (1.01 * free, "one that cannot be decoded"),
     ):
-        monkeypatch.setattr("polarguide.capture.memory.free_memory", lambda room=room: int(room))
+        monkeypatch.setattr("polarguide.capture.layout.free_memory", lambda room=room: int(room))
         Fault(found=words).raised_by(prepare_scene, tmp_path / "raw", tmp_path / "out", settings)
-    monkeypatch.setattr("polarguide.capture.memory.free_memory", lambda: 1000)
+    monkeypatch.setattr("polarguide.capture.layout.free_memory", lambda: 1000)
     Fault(found="a mosaic of 4000x3000").raised_by(
         read_shot, tmp_path / "raw/a.png", ShotOptions(sensor="IMX250MYR", demosaic=mode)
     )
@@ -220,7 +220,7 @@ def test_datasets_that_do_not_fit_are_refused_by_their_headers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     WRITERS["nersp"](tmp_path / "data")
-    monkeypatch.setattr("polarguide.capture.memory.free_memory", lambda: 100_000)
+    monkeypatch.setattr("polarguide.capture.layout.free_memory", lambda: 100_000)
     Fault(".npy", found="Stokes vectors of 64x48").raised_by(
         prepare_scene, tmp_path / "data", tmp_path / "out", PrepareSettings(format="nersp")
     )

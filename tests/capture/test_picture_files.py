@@ -20,7 +20,7 @@ from PIL import Image
 from tiny_capture import TinyCapture, encode_srgb, ideal_intensities, write_picture
 
 from polarguide.capture import load_scene
-from polarguide.capture.filter.exif import orientation, taken
+from polarguide.capture.filter.camera_files import orientation, taken
 from polarguide.capture.formats import pictures
 from polarguide.capture.formats.integrity import declared_size, find_damage
 from polarguide.capture.formats.pictures import decode_picture, linear_codes

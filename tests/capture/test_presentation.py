@@ -15,7 +15,7 @@ from polarguide.capture.presentation import (
     PRESENTATION_FILE,
     Crop,
     Presentation,
-    balanced,
+    colored,
     parse_length,
     read_presentation,
     shown_length,
@@ -57,7 +57,7 @@ def test_what_is_written_is_read_and_what_is_missing_is_left_out(tmp_path: Path)
         ('{"crop": {"low": [0, 0, 0], "high": [1, 0, 1]}}', Fault("(crop)", expected="a low side less than")),
         ('{"crop": {"low": [0, 0, 0], "high": [1, 1, 1e9]}}', Fault("(crop)")),
         ('{"author": "two\\nlines"}', Fault("(author)", expected="one line")),
-        ('{"licence": "CC0"}', Fault(expected="only white_balance, up_axis", found="licence")),
+        ('{"licence": "CC0"}', Fault(expected="only white_balance, chart", found="licence")),
         ('{"title": "' + 1001 * "x" + '"}', Fault("(title)")),
         ("[]", Fault(expected="JSON object")),
     ],
@@ -120,6 +120,6 @@ def test_lengths_are_told_with_a_unit() -> None:
 
 def test_white_balance_is_a_factor_on_light() -> None:
     light = torch.rand(4, 3, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(balanced(light, WHOLE.gains), light * torch.tensor([1.5, 1.0, 0.75]))
-    assert balanced(light, None) is light
-    assert not math.isnan(float(balanced(light, WHOLE.gains).sum()))
+    torch.testing.assert_close(colored(light, WHOLE.color), light * torch.tensor([1.5, 1.0, 0.75]))
+    assert colored(light, None) is light
+    assert not math.isnan(float(colored(light, WHOLE.color).sum()))

@@ -21,10 +21,14 @@ from camera_files import ANGLES, behind, read_invalid, read_polar, smooth_light
 from faults import Fault
 
 from polarguide.capture.calibration import Calibration
-from polarguide.capture.exposures import Angle, angle_labels, turned
-from polarguide.capture.filter.camera_raw import read_camera_raw
-from polarguide.capture.filter.exif import apply_orientation, orientation_calibration, read_taken, taken
-from polarguide.capture.filter.names import split_name
+from polarguide.capture.exposures import Angle, angle_labels, split_name, turned
+from polarguide.capture.filter.camera_files import (
+    apply_orientation,
+    orientation_calibration,
+    read_camera_raw,
+    read_taken,
+    taken,
+)
 from polarguide.capture.filter.ring_scale import BAND, place, ring_scale
 from polarguide.geometry.polarizer import malus
 from polarguide.preparation.prepare import prepare_scene

@@ -23,6 +23,7 @@ METADATA = [
     "no-such-package==1.*; python_version >= '3' and extra == 'synth'",
     "pillow-heif>=0.18; extra == 'heic'",
     "xatlas; extra == 'model'",
+    "usd-core; extra == 'usd'",
     "dask-jobqueue>=0.9; extra == 'cluster'",
     "furo; extra == 'docs'",
 ]

@@ -10,7 +10,7 @@ import pytest
 from single_shots import single_shots
 
 from polarguide.cli.app import run
-from polarguide.inspection.layers import LAYERS
+from polarguide.inspection.report import LAYERS
 
 VOID = {"meta", "input", "img", "br"}
 

@@ -11,7 +11,7 @@ import torch
 from faults import Fault
 from other_device import BACKEND, OtherDevice, unfused_adam
 
-from polarguide.api import Run, open_run
+from polarguide.api.runs import Run, open_run
 from polarguide.capture import load_scene
 from polarguide.capture.presentation import Crop
 from polarguide.cli.app import run
@@ -20,7 +20,7 @@ from polarguide.cli.render import render
 from polarguide.core.options import ComputeOptions
 from polarguide.experiments.record import read_results
 from polarguide.geometry.scene_frame import scene_frame
-from polarguide.inspection.short_run import short_run, surface_of
+from polarguide.inspection.evidence import short_run, surface_of
 from polarguide.results.evaluation.metrics import HAZE_DEPTH
 from polarguide.results.evaluation.perceptual import load_package
 from polarguide.results.evaluation.scores import ErrorsByObject, score_view

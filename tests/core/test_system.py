@@ -150,7 +150,7 @@ print(faults(), (64 << 20) // resource.getpagesize())
 @pytest.mark.parametrize(
     ("first", "kept"),
     [
-        ("import polarguide.api", False),
+        ("import polarguide.api.runs", False),
         ("from polarguide.__main__ import main; sys.argv[1:] = ['--version']; main()", True),
         ("from polarguide.experiments.worker import main; main()", True),
     ],

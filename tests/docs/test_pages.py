@@ -82,13 +82,30 @@ def test_files_and_links_exist(path):
             continue
         if not found.exists() or (anchor and anchor not in anchors(text_of(found))):
             missing.append(target)
-    assert missing == []
+    served = re.findall(r'(?:href|src)="([^"#:]+)"', text)
+    assert missing + [name for name in served if not (DOCS / "extra" / name).exists()] == []
 
 
 def anchors(text):
     """The anchors of a page's headings, as GitHub and MyST make them."""
     headings = re.findall(r"^#+ (.+)$", FENCE.sub("", text), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", h.lower().replace("`", "")).replace(" ", "-") for h in headings}
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_pictures_say_what_they_show(path):
+    text = text_of(path)
+    blocks = re.findall(r"^```\{(?:image|figure|code-cell)\}.*?^```", text, re.MULTILINE | re.DOTALL)
+    pictured = [
+        block
+        for block in blocks
+        if re.search(r"\{(?:image|figure)\}|^show\(|^figure, axes", block, re.MULTILINE)
+    ]
+    assert re.findall(r"!\[\s*\]\([^)]+\)", text) == []
+    assert re.findall(r'<img(?![^>]* alt="[^"]+)[^>]*>', text) == []
+    assert [block for block in pictured if not re.search(r"alt: \S", block)] == []
+    for drawing in re.findall(r":file: (\S+\.svg)", text):
+        assert "aria-label=" in text_of(path.parent / drawing)
 
 
 @pytest.mark.parametrize("code", list(python_blocks()))

@@ -25,8 +25,7 @@ from polarguide.fields.state import FieldState
 from polarguide.fields.trainer import FieldTrainer
 from polarguide.geometry.vectors import dot, unit
 from polarguide.recipes.gnerp import ABLATIONS_GNERP, RECIPE_GNERP
-from polarguide.runs.defaults import resolve
-from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint, trained_steps
+from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint, trained_steps
 from polarguide.runs.train import train
 from polarguide.training.settings import TrainSettings
 

@@ -8,7 +8,7 @@ import torch
 from faults import Fault
 from plyfile import PlyData
 
-from polarguide.gaussians.ply import read_ply, refit_sh_to_display, write_ply
+from polarguide.gaussians.ply import read_ply, refit_sh, write_ply
 from polarguide.geometry.vectors import spread_directions
 
 COUNT = 7
@@ -184,50 +184,48 @@ def release_color(dc, rest, directions):
     return 0.5 + torch.einsum("kd,ndc->nkc", basis, torch.cat((dc, rest), 1).double())
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_refit_reproduces_harmonics(degree):
+UP = torch.tensor([[0.0, 0.0, 1.0]])
+
+
+def test_refit_reproduces_harmonics(monkeypatch):
+    """Whatever the weights are, and however many Gaussians are fitted at a time."""
+    monkeypatch.setattr("polarguide.gaussians.ply.TOGETHER", 7)
     dc, rest = rand(1, 20, 1, 3) * 0.3, rand(2, 20, 15, 3) * 0.3
-    rest[:, (degree + 1) ** 2 - 1 :] = 0
-    got_dc, got_rest = refit_sh_to_display(lambda d: release_color(dc, rest, d), 20, degree)
-    assert torch.allclose(got_dc, dc, atol=1e-5)
-    assert torch.allclose(got_rest, rest, atol=1e-5)
+    normals = torch.nn.functional.normalize(rand(5, 20, 3), dim=-1)
+    for slope in (None, lambda colors: 1 + colors.square()):
+        found = refit_sh(lambda part, d: release_color(dc[part], rest[part], d), normals, slope)
+        assert torch.allclose(found[0], dc, atol=1e-4)
+        assert torch.allclose(found[1], rest, atol=1e-4)
 
 
-def highlight(directions):
+def highlight(part, directions):
     """A narrow bright spot over a flat color, clipped to the display's range: [5, K, 3]."""
-    axes = torch.nn.functional.normalize(rand(3, 5, 3), dim=-1)
+    axes = torch.nn.functional.normalize(rand(3, 5, 3), dim=-1)[part]
     spot = torch.exp(8 * (axes @ directions.T.to(axes) - 1))
     return (0.2 + 0.9 * spot[..., None] * torch.tensor([1.0, 0.8, 0.6])).clamp(0, 1)
 
 
-def test_refit_gets_closer_with_every_degree():
+def errors_of(slope, seen):
+    """Of the fit to highlights on Gaussians in the plane z = 0, from directions with |z| in a range: shown values."""
     probe = torch.nn.functional.normalize(rand(4, 4000, 3), dim=-1)
-    errors = []
-    for degree in range(4):
-        dc, rest = refit_sh_to_display(highlight, 5, degree)
-        errors.append(float((release_color(dc, rest, probe) - highlight(probe)).square().mean().sqrt()))
-    assert errors[0] > errors[1] > errors[2] > errors[3]
-    assert errors[3] < errors[0] / 2
+    probe = probe[(probe[:, 2].abs() > seen[0]) & (probe[:, 2].abs() < seen[1])]
+    true = highlight(slice(None), probe) ** 2.2
+    dc, rest = refit_sh(lambda part, d: highlight(part, d) ** 2.2, UP.expand(5, 3), slope)
+    found = release_color(dc, rest, probe).clamp(min=0)
+    return float((found ** (1 / 2.2) - true ** (1 / 2.2)).square().mean().sqrt())
 
 
-def test_refit_in_small_pieces_is_the_same(monkeypatch):
-    whole = refit_sh_to_display(highlight, 5)
-    asked = []
+def test_refit_is_nearest_where_it_is_seen():
+    assert errors_of(None, (0.5, 1.0)) < 0.75 * errors_of(None, (0.0, 0.2))
 
-    def counting(directions):
-        asked.append(len(directions))
-        return highlight(directions)
 
-    monkeypatch.setattr("polarguide.gaussians.ply.CHUNK_NUMBERS", 100)
-    pieces = refit_sh_to_display(counting, 5)
-    assert max(asked) == 6
-    for a, b in zip(whole, pieces, strict=True):
-        assert torch.allclose(a, b, atol=1e-6)
+def test_slopes_make_the_shown_error_small():
+    assert errors_of(lambda y: y ** (1 / 2.2 - 1), (0.0, 1.0)) < 0.9 * errors_of(None, (0.0, 1.0))
 
 
 def test_refit_refuses_colors_of_another_shape():
     with pytest.raises(ValueError, match=r"colors: .*\[6, 64, 3\].*\[5, 64, 3\]"):
-        refit_sh_to_display(highlight, 6)
+        refit_sh(highlight, UP.expand(6, 3))
 
 
 def test_directions_are_spread_evenly():

@@ -48,12 +48,14 @@ class Gui:
 
     def __init__(self) -> None:
         self.controls: dict[str, Control] = {}
+        self.folders: dict[str, bool] = {}  # whether each is open
 
     def configure_theme(self, **_: Any) -> None:
         pass
 
     @contextmanager
-    def add_folder(self, label: str, **_: Any):
+    def add_folder(self, label: str, expand_by_default: bool = True):
+        self.folders[label] = expand_by_default
         yield
 
     def _add(self, label: str, value: Any) -> Control:

@@ -13,8 +13,7 @@ import torch.distributed as dist
 from tiny import make_busy_recipe, make_scene
 
 from polarguide.raster import choose_backend
-from polarguide.runs.defaults import resolve
-from polarguide.runs.folder import load_checkpoint, save_checkpoint
+from polarguide.runs.folder import load_checkpoint, resolve, save_checkpoint
 from polarguide.training.distributed import SeveralRanks
 from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from polarguide.capture import Scene
 from polarguide.raster import Backend, choose_backend
-from polarguide.runs.defaults import resolve
+from polarguide.runs.folder import resolve
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState

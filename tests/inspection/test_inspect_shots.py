@@ -13,9 +13,8 @@ from single_shots import single_shots
 
 import polarguide
 from polarguide.capture.exposures import Exposure
-from polarguide.inspection.settings import InspectSettings
+from polarguide.inspection.settings import Check, InspectSettings
 from polarguide.inspection.shots import ShotFindings, shot_checks
-from polarguide.inspection.verdict import Check
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.training.angles.polarizers import Judgment

@@ -14,7 +14,7 @@ from polarguide.geometry.polarizer import ANGLES
 from polarguide.inspection.angles import PAIRINGS
 from polarguide.inspection.capture import measure_view, read_capture
 from polarguide.inspection.picture_checks import find_pairing, picture_checks
-from polarguide.inspection.verdict import Check
+from polarguide.inspection.settings import Check
 
 
 def checked(root: Path) -> dict[str, Check]:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from polarguide.capture import load_scene
-from polarguide.inspection.short_run import photograph_digest, short_run, surface_of
+from polarguide.inspection.evidence import photograph_digest, short_run, surface_of
 from polarguide.raster import choose_backend
 
 

@@ -12,6 +12,8 @@ from faults import Fault
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
+from polarguide.capture.checks import measured_gains, pair_moments
+from polarguide.capture.filter.camera_files import stated_exponent
 from polarguide.capture.filter.develop import (
     align_shots,
     decide_transfer,
@@ -19,10 +21,8 @@ from polarguide.capture.filter.develop import (
     require_known_encoding,
 )
 from polarguide.capture.filter.shots import Shots
-from polarguide.capture.formats.icc import stated_exponent
 from polarguide.capture.formats.pictures import decode_mask, decode_picture
-from polarguide.capture.pair_sums import measured_gains, pair_moments
-from polarguide.capture.sensor.defects import defects
+from polarguide.capture.sensor.demosaic import defects
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
 from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
 from polarguide.optics.color import srgb_encode_array as srgb_encode

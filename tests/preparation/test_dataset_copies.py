@@ -26,11 +26,10 @@ from faults import Fault
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.datasets.dataset import Dataset, read_mask
 from polarguide.capture.datasets.readers import detect_dataset, open_dataset
-from polarguide.capture.datasets.sense import RimAgreement, rim_agreement, sense_of_rims
 from polarguide.core.errors import PolarguideWarning
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.preparation.source import StokesSource
+from polarguide.preparation.source import RimAgreement, StokesSource, rim_agreement, sense_of_rims
 
 Change = Callable[[Path], object]
 

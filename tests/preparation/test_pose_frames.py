@@ -25,9 +25,8 @@ from test_prepare_filter import with_orientation
 from polarguide.capture import load_scene
 from polarguide.capture.colmap.files import PosedCamera
 from polarguide.capture.colmap.poses import Geometry, Poses
-from polarguide.capture.filter.exif import apply_orientation
-from polarguide.preparation.open_source import known_poses
-from polarguide.preparation.pose_frames import settle_pose_frames
+from polarguide.capture.filter.camera_files import apply_orientation
+from polarguide.preparation.open_source import known_poses, settle_pose_frames
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Source, Stored

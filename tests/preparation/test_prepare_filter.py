@@ -14,8 +14,8 @@ from camera_files import ANGLES, behind, busy_light, read_invalid, read_polar, s
 from faults import Fault
 from tiny_capture import encode_srgb, write_picture
 
+from polarguide.capture.filter.camera_files import apply_orientation, orientation
 from polarguide.capture.filter.develop import Shift, estimate_shifts
-from polarguide.capture.filter.exif import apply_orientation, orientation
 from polarguide.capture.filter.shots import find_shots
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings

@@ -24,7 +24,7 @@ from tiny_capture import encode_srgb, write_picture
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import read_model
-from polarguide.capture.filter.exif import TURNS, apply_orientation
+from polarguide.capture.filter.camera_files import TURNS, apply_orientation
 from polarguide.geometry.polarizer import malus
 from polarguide.preparation import prepare as prepare_module
 from polarguide.preparation.prepare import prepare_scene

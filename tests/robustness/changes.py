@@ -162,7 +162,7 @@ def filled(name: str, value: float) -> Change:
 @deferred
 def small_machine(then: Change) -> None:
     """As on a machine with 2 GiB of free memory."""
-    importlib.import_module("polarguide.capture.memory").free_memory = lambda: 2 << 30
+    importlib.import_module("polarguide.capture.layout").free_memory = lambda: 2 << 30
     then()
 
 

@@ -23,7 +23,8 @@ IMPORTED = (
     "torch._dynamo",  # which the first optimizer of a process imports
     "trimesh",
     "typeguard",
-    "polarguide.api",
+    "polarguide.api.captures",
+    "polarguide.api.runs",
     "polarguide.experiments.compare",
     "polarguide.preparation.prepare",
 )

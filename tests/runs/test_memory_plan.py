@@ -19,7 +19,7 @@ from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.runs import forecast as forecasts
 from polarguide.runs import train as training
-from polarguide.runs.defaults import MOST_GAUSSIANS, resolve
+from polarguide.runs.folder import MOST_GAUSSIANS, resolve
 from polarguide.runs.forecast import GIBIBYTE, MemoryPlan, plan_field_memory, plan_memory
 from polarguide.training.flat import Flat
 from polarguide.training.settings import STEPS, ResolvedSettings, TrainSettings

@@ -11,7 +11,7 @@ import polarguide
 SOURCES = Path(polarguide.__file__).parent
 SETTINGS = {"refractive_index", "background", "steps", "views_per_step", "gaussians", "memory"}
 CONSTANTS = {"INDEX", "STEPS"}
-DECIDES = {"options.py", "runs/defaults.py", "training/settings.py"}
+DECIDES = {"options.py", "runs/folder.py", "training/settings.py"}
 EXCEPT = {
     ("optics", "default of refractive_index"): "formulas, which know no scene",
     ("shading/model.py", "default of refractive_index"): "of a recipe; ``bind`` gives it the run's",

@@ -13,7 +13,7 @@ from faults import Fault
 
 import polarguide
 from polarguide.capture import load_scene
-from polarguide.capture.split import chosen_views, far_from_training
+from polarguide.capture.scene import chosen_views, far_from_training
 from polarguide.core.options import SceneOptions
 from polarguide.core.progress import Reporter
 from polarguide.core.system import MemoryBound

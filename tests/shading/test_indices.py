@@ -16,7 +16,7 @@ from polarguide.capture import Scene
 from polarguide.raster import choose_backend
 from polarguide.raster.surface import surface_picture
 from polarguide.recipes import recipe_named
-from polarguide.runs.defaults import resolve
+from polarguide.runs.folder import resolve
 from polarguide.shading.deferred import INDEX_NOTE, DeferredShading
 from polarguide.shading.gbuffer import RenderRequest, render, splatting
 from polarguide.shading.model import PLAIN

@@ -25,7 +25,7 @@ from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.harmonics import evaluate_sh, sh_basis
 from polarguide.gaussians.ply import read_ply
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.runs.model import shown_colors, write_run_ply
+from polarguide.runs.model import gaussian_colors, write_run_ply
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import render
 from polarguide.shading.metal import (
@@ -144,9 +144,9 @@ def test_the_point_cloud_says_what_metals_are(tmp_path: Path) -> None:
     torch.testing.assert_close(read["roughness"], gltf_roughness(rough, side))
     # Ordinary viewers show what the metals mirror, not the base color that does not count.
     directions = spread_directions(12).float()
-    shown = shown_colors(state, shading, directions)
+    shown = gaussian_colors(state.gaussians, state.light, shading, directions)
     state.gaussians.overwrite("sh_dc", state.gaussians["sh_dc"] + 1.0)
-    after = shown_colors(state, shading, directions)
+    after = gaussian_colors(state.gaussians, state.light, shading, directions)
     assert torch.equal(after[metal], shown[metal])
     assert not torch.equal(after[~metal], shown[~metal])
 

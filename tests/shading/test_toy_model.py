@@ -23,8 +23,7 @@ from polarguide.results.evaluation.target import ViewTarget
 from polarguide.results.export.mesh import surface_points
 from polarguide.results.export.share import BAKED, share_page
 from polarguide.results.rendering.relight import needs_radiance
-from polarguide.runs.defaults import resolve
-from polarguide.runs.folder import load_checkpoint, save_checkpoint
+from polarguide.runs.folder import load_checkpoint, resolve, save_checkpoint
 from polarguide.runs.model import write_run_ply
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.result import LAYERS, RenderResult

@@ -18,8 +18,7 @@ import polarguide
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.geometry.polarizer import malus
 from polarguide.shots.maps import ShotMaps
-from polarguide.shots.measurement.options import MeasureOptions
-from polarguide.shots.options import ShotOptions
+from polarguide.shots.options import MeasureOptions, ShotOptions
 from polarguide.shots.read import read_shot
 
 ROI = MeasureOptions(roi=("pin=8,8,16,12", "rim=40,20,20,20"))

@@ -11,9 +11,10 @@ from faults import Fault
 
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.polarizer import ANGLES
-from polarguide.shots.exposures import ExposureSet, find_shots
+from polarguide.shots.exposures import find_shots
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import read_shot
+from polarguide.shots.sets import ExposureSet
 from polarguide.shots.write import write_shots
 from tests.shots.test_read import CUP, MONO, PLAIN, write_four, write_mosaic
 

@@ -12,9 +12,10 @@ from faults import Fault
 
 import polarguide
 from polarguide.capture.calibration import Calibration
-from polarguide.shots.exposures import ExposureSet, find_shots
+from polarguide.shots.exposures import find_shots
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import read_shot
+from polarguide.shots.sets import ExposureSet
 from polarguide.shots.write import write_shots
 from tests.helpers.heard import Heard
 from tests.shots.test_read import CUP, MONO, write_four, write_mosaic

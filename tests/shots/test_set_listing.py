@@ -13,11 +13,11 @@ from faults import Fault
 import polarguide
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.shots.exposures import ExposureSet, find_shots, list_shots
+from polarguide.shots.exposures import find_shots, list_shots
 from polarguide.shots.measurement.fields import KEYS
-from polarguide.shots.measurement.options import WatchOptions
-from polarguide.shots.options import ShotOptions
+from polarguide.shots.options import ShotOptions, WatchOptions
 from polarguide.shots.read import read_shot
+from polarguide.shots.sets import ExposureSet
 from polarguide.shots.write import write_shots
 from tests.helpers.picture_sets import photographed, sphere, write_set
 

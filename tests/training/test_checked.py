@@ -19,8 +19,7 @@ import polarguide
 from polarguide.capture import Scene
 from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.recipes import RECIPES
-from polarguide.runs.defaults import resolve
-from polarguide.runs.folder import CHECKPOINT, load_checkpoint
+from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings

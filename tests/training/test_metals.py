@@ -12,8 +12,7 @@ from trainings import CPU, different, run
 from polarguide.capture import Scene
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.recipes import RECIPES
-from polarguide.runs.defaults import resolve
-from polarguide.runs.folder import load_checkpoint, save_checkpoint
+from polarguide.runs.folder import load_checkpoint, resolve, save_checkpoint
 from polarguide.shading.metal import any_nonzero
 from polarguide.training.metals.evidence import Evidence, evidence, residuals
 from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights

@@ -10,8 +10,7 @@ from polarguide.capture import Scene
 from polarguide.raster import Backend, Rasterized, choose_backend
 from polarguide.raster.cuda import has_gsplat
 from polarguide.recipes import RECIPES
-from polarguide.runs.defaults import resolve
-from polarguide.runs.folder import load_checkpoint, save_checkpoint
+from polarguide.runs.folder import load_checkpoint, resolve, save_checkpoint
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer

@@ -16,7 +16,6 @@ from polarguide.capture.presentation import (
     PRESENTATION_FILE,
     Crop,
     Presentation,
-    balanced,
     read_presentation,
     write_presentation,
 )
@@ -113,7 +112,7 @@ def test_a_picked_white_is_gray_in_the_picture_and_no_click_is_asked_for_any_mor
     (found,) = visit.pick("white", place)
     gains = gains_of(found.color)
     assert visit.chosen.white_balance == gains
-    gray = balanced(found.color, torch.tensor(gains))
+    gray = found.color * torch.tensor(gains)
     torch.testing.assert_close(gray, gray[1].expand(3))
     result = visit.seen.render(visit.camera, depth=False)
     expected = figures.radiance_to_rgb(result.final * torch.tensor(gains))

@@ -18,7 +18,7 @@ from polarguide.geometry.camera import quaternion
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.trajectory import read_path
 from polarguide.raster.magnification import footprints
-from polarguide.runs.defaults import resolve
+from polarguide.runs.folder import resolve
 from polarguide.runs.train import train
 from polarguide.shading.result import LAYERS, POLARIZED
 from polarguide.training.settings import TrainSettings

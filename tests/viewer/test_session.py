@@ -87,6 +87,15 @@ def test_a_session_begins_at_the_first_photograph_and_sees_what_render_gives(vie
     assert viewing.client.control("Go to").value == "v0"
 
 
+def test_the_controls_begin_folded_in_a_window_that_is_higher_than_wide(viewing):
+    client = FakeClient()
+    client.camera.image_width, client.camera.image_height = 390, 844
+    options = PanelOptions(LAYERS, turns=True, views=("v0",), trains=True)
+    Session(client, viewing.photographs, frame_of_scene(), options, lambda: None)
+    assert client.gui.folders["Controls"] is False
+    assert "Controls" not in viewing.client.gui.folders
+
+
 def test_coarse_jpegs_while_moving_and_a_png_at_rest(viewing):
     viewing.rest()
     viewing.client.camera.drag((1.0, -1.0, -4.0))

@@ -199,6 +199,9 @@ def test_a_key_lies_over_the_lower_left_corner():
     assert (keyed[:70] == 0).all()
     assert (keyed[:, 140:] == 0).all()
     assert (picture == 0).all()
+    ball = figures.with_key(picture, figures.normal_ball(), 128)
+    assert (ball[-1, :34] == 255).all()
+    assert (ball[:, 40:] == 0).all(), "it is as wide as the ball"
 
 
 def test_scale_bar_runs_through_the_colors_of_its_map():

@@ -76,17 +76,15 @@ class _Scene(msgspec.Struct):
     objects: list[SceneObject] | None = None
 
 
-def objects_of(path: Path, data: bytes | None) -> tuple[SceneObject, ...]:
+def objects_of(path: Path, data: bytes) -> tuple[SceneObject, ...]:
     """The table of objects in ``scene.json``; empty if there is none.
 
     Args:
-        path: ``scene.json``, for messages. data: its content, or None if there is no such file.
+        path: ``scene.json``, for messages. data: its content.
 
     Raises:
         PolarguideError: an object has no number or name, or shares it with another.
     """
-    if data is None:
-        return ()
     objects = decode(data, _Scene, path, remedy=_REMEDY).objects or []
     for field in ("id", "name"):
         counts = Counter(getattr(item, field) for item in objects)

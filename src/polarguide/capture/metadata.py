@@ -107,18 +107,16 @@ def held_out(path: Path, data: bytes, names: list[str]) -> tuple[str, ...]:
     return tuple(sorted(set(test)))
 
 
-def refractive_index_of(path: Path, data: bytes | None) -> float | None:
+def refractive_index_of(path: Path, data: bytes) -> float | None:
     """The one index in ``scene.json``, or None: ``refractive_index``, else the ``ior`` its objects agree on, between 1
     and 4.
 
     Args:
-        path: ``scene.json``, for messages. data: its content, or None if there is no such file.
+        path: ``scene.json``, for messages. data: its content.
 
     Raises:
         PolarguideError: the index is not a number between 1 and 4.
     """
-    if data is None:
-        return None
     remedy = "Correct it, or remove it to use the default."
     scene = decode(data, _Scene, path, remedy=remedy)
     if scene.refractive_index is not None:
@@ -129,18 +127,16 @@ def refractive_index_of(path: Path, data: bytes | None) -> float | None:
     return index if index is not None and LEAST_INDEX < index < LARGEST_INDEX else None
 
 
-def indices_of(path: Path, data: bytes | None) -> dict[int, float]:
+def indices_of(path: Path, data: bytes) -> dict[int, float]:
     """Refractive indices of the dielectrics that ``materials/`` names by numbers from 3 on: ``materials`` in
     ``scene.json``, as ``{"3": {"refractive_index": 1.33}}``.
 
     Args:
-        path: ``scene.json``, for messages. data: its content, or None if there is no such file.
+        path: ``scene.json``, for messages. data: its content.
 
     Raises:
         PolarguideError: a number or an index is out of range.
     """
-    if data is None:
-        return {}
     remedy = 'Write {"materials": {"3": {"refractive_index": 1.33}}}, or remove materials.'
     table = decode(data, _Materials, path, remedy=remedy).materials
     numbers = {str(number) for number in range(FIRST_LISTED, MOST_MATERIAL + 1)}
@@ -155,26 +151,24 @@ def indices_of(path: Path, data: bytes | None) -> dict[int, float]:
     return {int(key): item.refractive_index for key, item in table.items()}
 
 
-def mount_of(path: Path, data: bytes | None) -> Mount:
+def mount_of(path: Path, data: bytes) -> Mount:
     """Where the polarizer was: ``polarizer`` in ``scene.json``, "sensor" where it says nothing.
 
     Args:
-        path: ``scene.json``, for messages. data: its content, or None if there is no such file.
+        path: ``scene.json``, for messages. data: its content.
 
     Raises:
         PolarguideError: it says something else than "sensor" or "filter".
     """
-    if data is None:
-        return "sensor"
     remedy = 'Write "sensor" for polarizers behind the lens, "filter" for a sheet before it.'
     return decode(data, _Polarizer, path, remedy=remedy).polarizer
 
 
-def applied_calibration(path: Path, data: bytes | None) -> Calibration | None:
+def applied_calibration(path: Path, data: bytes) -> Calibration | None:
     """Order, sense and zero that the pictures of a prepared scene were made with, corrections included.
 
     Args:
-        path: ``scene.json``, for messages. data: its content, or None if there is no such file.
+        path: ``scene.json``, for messages. data: its content.
 
     Returns:
         None for a scene that ``prepare`` did not write.
@@ -182,7 +176,7 @@ def applied_calibration(path: Path, data: bytes | None) -> Calibration | None:
     Raises:
         PolarguideError: ``prepare`` wrote it, and its calibration is damaged.
     """
-    if data is None or decode(data, _Scene, path, remedy="Prepare the scene again.").prepare is None:
+    if decode(data, _Scene, path, remedy="Prepare the scene again.").prepare is None:
         return None
     scene = decode(data, _Prepared, path, remedy="Prepare the scene again.")
     found: Calibration | None = (scene.calibration or _Angles()).calibration()
@@ -194,14 +188,12 @@ def applied_calibration(path: Path, data: bytes | None) -> Calibration | None:
 Origin = Literal["mosaics", "stokes", "other"]
 
 
-def origin_of(path: Path, data: bytes | None) -> Origin:
+def origin_of(path: Path, data: bytes) -> Origin:
     """The files that ``prepare`` made a scene of: mosaics of a sensor, a dataset's Stokes vectors, or others.
 
     Args:
-        path: ``scene.json``, for messages. data: its content, or None if there is no such file.
+        path: ``scene.json``, for messages. data: its content.
     """
-    if data is None:
-        return "other"
     scene = decode(data, _Scene, path, remedy="Prepare the scene again.")
     if scene.prepare is None:
         return "other"

@@ -1,4 +1,4 @@
-"""How a capture is presented: white, up, scale and crop box, and whom it is owed to.
+"""How a capture is presented: color, up, scale and crop box, and whom it is owed to.
 
 ``presentation.json`` beside a scene or a run holds it. Whatever shows or exports a run uses it; pictures, training and
 scores never do. A run's own file goes before that of its scene, field by field.
@@ -34,9 +34,12 @@ LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3, "in": 0.0254
 LEAST_METERS, MOST_METERS = 1e-9, 1e9
 """A nanometer, and eighty Earths: single precision of files that are exported ends beyond."""
 WIDEST_CROP = 100.0
+STOPS = 8.0
+"""Of exposure, to either side: as much as the steps of an 8-bit picture."""
 
 Vector = tuple[float, float, float]
 Gain = Annotated[float, Meta(ge=0.02, le=50)]
+Factor = Annotated[float, Meta(ge=-50, le=50)]
 Text = Annotated[str, Meta(max_length=1000)]
 
 
@@ -85,11 +88,35 @@ class Crop(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
         return ((local >= low) & (local <= high)).all(dim=1)
 
 
+class Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a color chart in a photograph says of the camera under the light of the capture.
+
+    Attributes:
+        matrix: [3][3], from the camera's linear RGB (S0 / 2) to linear sRGB (D65), white balance and exposure included.
+        delta_e, delta_e_worst: mean and largest CIEDE2000 of the patches, each by the matrix that the others give.
+        patches: how many were used. view: the photograph.
+    """
+
+    matrix: tuple[tuple[Factor, Factor, Factor], tuple[Factor, Factor, Factor], tuple[Factor, Factor, Factor]]
+    delta_e: Annotated[float, Meta(ge=0, le=1000)]
+    delta_e_worst: Annotated[float, Meta(ge=0, le=1000)]
+    patches: Annotated[int, Meta(ge=1, le=24)]
+    view: Text
+
+    def __post_init__(self) -> None:
+        if not abs(float(torch.tensor(self.matrix, dtype=torch.float64).det())) > 1e-9:
+            raise PolarguideError(
+                "matrix", expected="a matrix with an inverse", found=str(self.matrix), remedy=REMEDY
+            )
+
+
 class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """What ``presentation.json`` holds; each field may be missing.
 
     Attributes:
         white_balance: factors on linear R, G and B for display, 0.02 to 50; the data stay as they are.
+        chart: what a color chart says, in place of a white balance; there cannot be both.
+        exposure: stops by which radiance is shown brighter, -8 to 8.
         up_axis: [3] direction in the scene's axes, of any length; without it, up is as the cameras say.
         meters_per_unit: how long one unit of the scene is.
         crop: what is shown and exported of the scene.
@@ -98,6 +125,8 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     """
 
     white_balance: tuple[Gain, Gain, Gain] | None = None
+    chart: Chart | None = None
+    exposure: Annotated[float, Meta(ge=-STOPS, le=STOPS)] | None = None
     up_axis: Vector | None = None
     meters_per_unit: Annotated[float, Meta(ge=LEAST_METERS, le=MOST_METERS)] | None = None
     crop: Crop | None = None
@@ -108,6 +137,9 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
     def __post_init__(self) -> None:
         _check_direction("up_axis", self.up_axis)
+        if self.white_balance is not None and self.chart is not None:
+            found = "both"
+            raise PolarguideError("white_balance", expected="it, or a chart", found=found, remedy=REMEDY)
         for name in CREDITS:
             text = getattr(self, name)
             if not text.isprintable():
@@ -121,13 +153,25 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         return ", ".join(text for text in (self.author, self.license) if text)
 
     @property
-    def gains(self) -> Tensor | None:
-        """The white balance as a tensor [3] float32, or None."""
-        return None if self.white_balance is None else torch.tensor(self.white_balance)
+    def color(self) -> Tensor | None:
+        """From the camera's linear RGB to what is shown, linear sRGB: [3, 3] float32; None: as photographed.
+
+        It holds for radiance: each row mixes the camera's channels, as light adds up. Stokes vectors, DoLP and AoLP are
+        ratios within one channel, and stay the camera's.
+        """
+        if self.white_balance is None and self.chart is None and not self.exposure:
+            return None
+        matrix = torch.diag(torch.tensor(self.white_balance or (1.0, 1.0, 1.0)))
+        if self.chart is not None:
+            matrix = torch.tensor(self.chart.matrix)
+        return matrix * 2.0 ** (self.exposure or 0.0)
 
     def over(self, other: Presentation) -> Presentation:
-        """This, with another's fields where this one has none."""
-        return Presentation(**{**_given(other), **_given(self)})
+        """This, with another's fields where this one has none; white balance and chart are one of them."""
+        own, above = _given(self), _given(other)
+        if not own.keys().isdisjoint(WHITE):
+            above = {name: value for name, value in above.items() if name not in WHITE}
+        return Presentation(**{**above, **own})
 
     def upright(self, around: SceneFrame) -> SceneFrame:
         """A frame of cameras with the up axis that was chosen, if one was."""
@@ -137,6 +181,10 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         """As the file holds it, without what is missing."""
         found: dict[str, Any] = msgspec.to_builtins(self)
         return found
+
+
+WHITE = ("white_balance", "chart")
+"""Fields of which one takes the place of the other."""
 
 
 def _given(presentation: Presentation) -> Mapping[str, Any]:
@@ -207,6 +255,21 @@ def shown_length(units: float, meters_per_unit: float | None) -> str:
     return f"{meters / 1e-3:.3g} mm"
 
 
-def balanced(radiance: Tensor, gains: Tensor | None) -> Tensor:
-    """Linear radiance [..., 3] as it is shown: times the gains [3] of a white balance, if there is one."""
-    return radiance if gains is None else radiance * gains.to(radiance)
+def colored(radiance: Tensor, color: Tensor | None) -> Tensor:
+    """Linear radiance [..., 3] as it is shown, by ``Presentation.color``, not negative."""
+    return radiance if color is None else (radiance @ color.T.to(radiance)).clamp(min=0)
+
+
+def in_camera(radiance: Tensor, color: Tensor | None) -> Tensor:
+    """The inverse of ``colored``: radiance of linear sRGB as the camera's channels would have it."""
+    return radiance if color is None else colored(radiance, torch.linalg.inv(color))
+
+
+def colored_reflectance(reflectance: Tensor, color: Tensor | None) -> Tensor:
+    """Reflectance [..., 3] of the camera's channels as that of linear sRGB: what it makes of the light that is white
+    there, ``M (r * M^-1 1)``. A white balance and an exposure leave it as it is.
+    """
+    if color is None:
+        return reflectance
+    matrix = color.to(reflectance)
+    return colored(reflectance * torch.linalg.solve(matrix, matrix.new_ones(3)), matrix)

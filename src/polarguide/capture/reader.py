@@ -17,16 +17,13 @@ from polarguide.capture import checks
 from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unseen_points, unused_poses
 from polarguide.capture.formats.pictures import TRANSFERS
 from polarguide.capture.ground_truth import GroundTruth, objects_of
-from polarguide.capture.layout import Layout, find_layout, select_views
-from polarguide.capture.memory import check_memory, stated_size
+from polarguide.capture.layout import Layout, check_memory, find_layout, select_views, stated_size
 from polarguide.capture.metadata import held_out, indices_of, mount_of, refractive_index_of
-from polarguide.capture.scene import Scene
-from polarguide.capture.split import chosen_views, far_from_training, held_out_band
-from polarguide.capture.stored import StoredViews
+from polarguide.capture.scene import Scene, chosen_views, far_from_training, held_out_band
 from polarguide.capture.view import listed
-from polarguide.capture.view_reader import Files, ViewData, ViewFiles, check_materials, read_view
+from polarguide.capture.view_reader import Files, StoredViews, ViewData, ViewFiles, check_materials, read_view
 from polarguide.core.errors import PolarguideError
-from polarguide.core.options import Split, check_choice
+from polarguide.core.options import Split, check_choice, check_count
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.geometry.camera import Camera
 
@@ -60,7 +57,7 @@ def load_scene(
         transfer: how the files are encoded: "linear", or "srgb" for display-encoded pictures.
         views: names of the views to read; all if None. The split is that of the whole capture.
         memory: GiB that the pictures may take; None: 80 % of what is free.
-        split: which views are held out where there is no ``split.json``, see ``split.chosen_views``.
+        split: which views are held out where there is no ``split.json``, see ``scene.chosen_views``.
         test_views: names of the views to hold out, whatever else says so, as far as there are such views.
         hold: whether pictures stay in memory; otherwise views load theirs from the files when they are read.
         reporter: receives the progress.
@@ -72,14 +69,8 @@ def load_scene(
         PolarguideError: a file of the capture cannot be used; the message names it and the remedy.
     """
     root = Path(path)
-    if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
-        raise PolarguideError(
-            "downscale",
-            expected="a whole number from 1 up",
-            found=repr(downscale),
-            remedy="1 keeps the full size.",
-        )
-    check_transfer(transfer)
+    check_count("downscale", downscale)
+    check_choice("transfer", transfer, TRANSFERS)
     layout = find_layout(root)
     names = select_views(layout, views)
     model = read_model(root)
@@ -87,7 +78,7 @@ def load_scene(
     for file in (*model.files, *([layout.table] if layout.table is not None else [])):
         files.read(file)
     tests, stray = _held_out(root / "split.json", files, layout, model, split, test_views)
-    about = files.read_if_there(root / "scene.json")
+    about = files.read_if_there(root / "scene.json", b"{}")
     index = refractive_index_of(root / "scene.json", about)
     indices = indices_of(root / "scene.json", about)
     mount = mount_of(root / "scene.json", about)
@@ -155,7 +146,7 @@ def _held_out(
 ) -> tuple[tuple[str, ...], list[str]]:
     """The names of the test views, and a warning where some are far from what is trained on, or a ring of them is."""
     check_choice("split", split, get_args(Split))
-    data, posed = files.read_if_there(path), frozenset(model.names)
+    data, posed = files.read_if_there(path, None), frozenset(model.names)
     cameras = {name: model.camera(name) for name in layout.names if name in posed}
     if asked is not None:  # whoever asks has been told
         return tuple(name for name in sorted(asked) if name in layout.names), []
@@ -225,21 +216,6 @@ def _without_pictures(data: ViewData) -> ViewData:
     told_apart = truth is not None and truth.object_ids is not None
     stub = GroundTruth(object_ids=torch.empty(0)) if told_apart else None
     return replace(data, codes=checks.sampled(data.codes), ground_truth=stub)
-
-
-def check_transfer(transfer: str) -> None:
-    """Check the name of an encoding.
-
-    Raises:
-        PolarguideError: it is neither "linear" nor "srgb".
-    """
-    if transfer not in TRANSFERS:
-        raise PolarguideError(
-            "transfer",
-            expected="'linear' or 'srgb'",
-            found=repr(transfer),
-            remedy="Use srgb for display-encoded pictures, linear for all others.",
-        )
 
 
 def _content_warnings(layout: Layout, stored: StoredViews, invalid: list[str]) -> list[str]:

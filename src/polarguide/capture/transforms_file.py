@@ -16,13 +16,57 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from polarguide.capture.camera_sizes import Size, Sizes, settled_size
 from polarguide.capture.colmap.files import PosedCamera
 from polarguide.capture.colmap.model import view_of_name
 from polarguide.capture.datasets.dataset import checked_intrinsics, checked_pose, require_known_names
 from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
 from polarguide.capture.view import listed
 from polarguide.core.records import decode, read_record
+
+Size = tuple[int, int]
+Sizes = Callable[[str], tuple[Size, ...]]
+"""View -> sizes (width, height) that its camera may have been made for, the likeliest first; none where unknown."""
+# Share of a side by which principal points lie off the middle: lenses miss it by some percent, while those of pictures
+# of half the size lie a quarter off.
+_OFF_CENTER = 0.125
+
+
+def is_centered(size: Size, center: tuple[float | None, float | None]) -> bool:
+    """Whether a principal point, as far as it is known, lies near the middle of a picture."""
+    return all(
+        place is None or abs(place - side / 2) <= _OFF_CENTER * side
+        for place, side in zip(center, size, strict=True)
+    )
+
+
+def settled_size(
+    where: object, sizes: Sequence[Size], center: tuple[float | None, float | None], *, in_pixels: bool
+) -> Size:
+    """The size whose middle the principal point lies near.
+
+    Args:
+        where: for messages.
+        sizes: that it may be, the likeliest first.
+        center: the principal point, as far as it is known.
+        in_pixels: whether other numbers of the camera are in pixels, too, and mean nothing without the right size.
+
+    Raises:
+        PolarguideError: no size is known, the principal point fits none, or several fit.
+    """
+    expected = "width and height of the pictures that the camera was made for, w and h"
+    if not sizes:
+        raise wrong_camera(where, expected, "none")
+    fitting = [size for size in sizes if is_centered(size, center)]
+    named = " or ".join(f"{width}x{height}" for width, height in sizes)
+    if not fitting:
+        raise wrong_camera(
+            where, f"a principal point near the middle of {named}", f"{center[0]}, {center[1]}"
+        )
+    areas = {width * height for width, height in fitting}
+    if len(areas) > 1 and in_pixels:
+        raise wrong_camera(where, expected, f"none, for pictures of {named}")
+    return fitting[0]
+
 
 _SQUARE = ((3, 4), (4, 4))
 # The cameras look along -z with y up.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -265,9 +265,6 @@ class SmallerViews(Sequence[View]):
         if place not in self._made:
             self._made[place] = smaller_view(self._views[place], self._factor, self._latest)
         return self._made[place]
-
-    def __iter__(self) -> Iterator[View]:
-        return (self[k] for k in range(len(self)))
 
 
 def smaller(scene: Scene, longest: int) -> Scene:

@@ -1,4 +1,4 @@
-"""Read the files of one view."""
+"""Read the files of views; what their stored values say of all of them together."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import checks
-from polarguide.capture.exposures import Exposure
+from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.formats.integrity import declared_size
 from polarguide.capture.formats.pictures import (
     MATERIAL_REMEDY,
@@ -35,6 +35,8 @@ from polarguide.core.files import LARGEST_FILE, read_file
 from polarguide.core.records import LARGEST_RECORD
 from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
+
+T = TypeVar("T")
 
 
 class Files:
@@ -62,10 +64,10 @@ class Files:
         )
         return hashlib.sha256("".join(lines).encode()).hexdigest()
 
-    def read_if_there(self, path: Path) -> bytes | None:
-        """The bytes of a JSON file, or None if there is no such file."""
+    def read_if_there(self, path: Path, otherwise: T) -> bytes | T:
+        """The bytes of a JSON file; ``otherwise`` if there is no such file."""
         there = os.path.lexists(path)  # a link to nowhere is no absence
-        return self.read(path, LARGEST_RECORD) if there else None
+        return self.read(path, LARGEST_RECORD) if there else otherwise
 
 
 @dataclass(frozen=True, eq=False)
@@ -358,3 +360,58 @@ def _read_beside(
     pixels = decode(path, data)
     _require_same(path, (pixels.shape[1], pixels.shape[0]), size)  # of a format whose header says nothing
     return pixels
+
+
+@dataclass(frozen=True, eq=False)
+class StoredViews:
+    """The views of a capture as read, with a pose or without.
+
+    Attributes:
+        data: the views, sorted by name.
+        cameras: of each view at the size of its averaged pictures; None where the model has no pose.
+        measures: ``checks.measure`` of each view.
+        largest_value: the largest value that the files can store, 255 or 65535.
+        full_scale: the stored value at which the capture saturates; None if nothing is saturated.
+    """
+
+    data: tuple[ViewData, ...]
+    cameras: tuple[Camera | None, ...]
+    measures: tuple[checks.Measures, ...]
+    largest_value: int
+    full_scale: int | None
+
+    @classmethod
+    def of(cls, data: Sequence[ViewData], cameras: Sequence[Camera | None]) -> StoredViews:
+        """Measure views, and find where they saturate.
+
+        Raises:
+            PolarguideError: they differ in depth.
+        """
+        largest_value = _largest_value(data)
+        scale = checks.full_scale(np.sum([item.histogram for item in data], axis=0), largest_value)
+        measures = [
+            checks.measure(item.codes, ~(item.invalid | item.saturated(scale)), four=item.exposures == FOUR)
+            for item in data
+        ]
+        return cls(tuple(data), tuple(cameras), tuple(measures), largest_value, scale)
+
+    def picture_warnings(self, transfer: str) -> list[str]:
+        """Warnings about the exposure, encoding and order of the pictures."""
+        names, scale = [item.name for item in self.data], self.full_scale
+        blown = [0.0 if scale is None else float((item.peak >= scale).mean()) for item in self.data]
+        largest = max(int(item.peak.max()) for item in self.data)
+        warnings = checks.exposure_warnings(names, self.measures, blown, largest, self.largest_value)
+        return warnings + checks.polarization_warnings(names, self.measures, transfer)
+
+
+def _largest_value(data: Sequence[ViewData]) -> int:
+    """The largest value of the views' common type, 255 or 65535."""
+    first = {item.peak.dtype.itemsize: item.name for item in reversed(data)}
+    if len(first) > 1:
+        raise PolarguideError(
+            "pictures",
+            expected="one number of bits for all views",
+            found=f"8 bits in view {first[1]} and 16 in view {first[2]}",
+            remedy="Export all pictures alike.",
+        )
+    return int(np.iinfo(data[0].peak.dtype).max)

@@ -12,7 +12,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
+from rich.table import Column, Table
 
 import polarguide
 from polarguide.cli.console import console, say, warn
@@ -23,7 +23,8 @@ EXTRAS = {
     "cuda": "train and render on an NVIDIA GPU",
     "lpips": "the metric lpips",
     "heic": "HEIC photographs",
-    "model": "textured models (export --format glb, obj)",
+    "model": "textured models (export --format glb, obj, usdz, stl, all)",
+    "usd": "USDZ packages (export --format usdz, splat-usdz)",
     "cluster": "compare, ablate, bench and batch on SLURM or PBS",
     "synth": "synth and bench: scenes with ground truth",
 }
@@ -156,7 +157,7 @@ def _notes(torch: dict[str, Any], extras: dict[str, Any]) -> list[str]:
 
 def _print(report: dict[str, Any]) -> None:
     kernels, torch, machine = report["kernels"], report["torch"], report["machine"]
-    table = Table(box=None, show_header=False, pad_edge=False)
+    table = Table("", Column(overflow="fold"), box=None, show_header=False, pad_edge=False)
     table.add_row("polarguide", f"{report['polarguide']['version']}  {report['polarguide']['folder']}")
     table.add_row("Python", f"{report['python']['version']}  {report['python']['executable']}")
     table.add_row("system", f"{machine['system']}, {machine['cores']} cores")

@@ -48,7 +48,7 @@ def inspect(
     folder = inspection.inspection_folder(scene, out)
     backend = importlib.import_module("polarguide.raster").choose_backend(compute.device, say=reporter.say)
     inspected = inspection.inspect_scene(scene, folder, settings, backend, reporter)
-    page, record = importlib.import_module("polarguide.inspection.record").write_inspection(
+    page, record = importlib.import_module("polarguide.inspection.report").write_inspection(
         inspected, folder, reporter
     )
     _print_checks(inspected.checks)

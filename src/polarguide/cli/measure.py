@@ -15,8 +15,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.options import ThreadOptions
 from polarguide.core.system import StopSignals
 from polarguide.preparation.settings import CalibrationOptions
-from polarguide.shots.measurement.options import MeasureOptions, WatchOptions
-from polarguide.shots.options import ShotOptions
+from polarguide.shots.options import MeasureOptions, ShotOptions, WatchOptions
 
 
 def measure(

@@ -17,6 +17,8 @@ def present(
     /,
     *,
     white_balance: str = "",
+    chart: str = "",
+    exposure: str = "",
     up_axis: str = "",
     points: tuple[str, ...] = (),
     distance: str = "",
@@ -28,7 +30,7 @@ def present(
     provenance: str = "",
     compute: ComputeOptions = ComputeOptions(),
 ) -> None:
-    """Set how a scene or a run is shown and exported: white, up, scale, crop box, credit. Data and scores stay.
+    """Set how a scene or a run is shown and exported: color, up, scale, crop box, credit. Data and scores stay.
 
     What is set stands in presentation.json in the folder. A scene's holds for all its runs; a run's goes before it.
     What is not given stays as it is, "none" removes it, and without an option it is printed. `polarguide view RUN` lets
@@ -38,6 +40,9 @@ def present(
         folder: Folder of a scene or a run.
         white_balance: gray (the photographs' mean becomes gray), gains such as 1.9,1,1.6, or VIEW,X,Y where something
             white or gray is.
+        chart: VIEW,X,Y,X,Y,X,Y,X,Y: the centers of the corner patches of a 24-patch color chart in a photograph, around
+            it; or the folder of another scene, whose chart it takes. It replaces a white balance.
+        exposure: Stops by which all is shown brighter, such as 0.5.
         up_axis: An axis such as z or --up-axis=-y, three numbers, or VIEW,X,Y where a level surface is. Without it, up
             is as the cameras say.
         points: Two points of known distance: X,Y,Z in the scene, VIEW,X,Y on a surface, or VIEW for a camera's place.
@@ -54,6 +59,8 @@ def present(
     presented = presenting.present(
         folder,
         white_balance=white_balance or None,
+        chart=chart or None,
+        exposure=exposure or None,
         up_axis=up_axis or None,
         points=points,
         distance=distance or None,

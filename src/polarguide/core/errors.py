@@ -42,7 +42,7 @@ class PolarguideWarning(UserWarning):
     """Something that the user should know before relying on a result."""
 
 
-DISTRIBUTIONS = {"skimage": "scikit-image", "websockets": "viser"}
+DISTRIBUTIONS = {"pxr": "usd-core", "skimage": "scikit-image", "websockets": "viser"}
 """What to install for a module of another name: viser works with some versions of websockets only, and brings one."""
 _NAME = re.compile(r"[A-Za-z0-9._-]+")
 _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")

@@ -20,18 +20,36 @@ Transfer = Literal["linear", "srgb"]
 Split = Literal["directions", "every-8th"]
 Exposures = Literal["captured", "four", "three", "two", "one", "unknown", "mixed", "sparse", "none"]
 EXPOSURES: tuple[Exposures, ...] = get_args(Exposures)
-ExportFormat = Literal["ply", "spz", "sog", "mesh", "glb", "obj", "points", "environment", "cameras"]
+ExportFormat = Literal[
+    "ply",
+    "spz",
+    "sog",
+    "splat-glb",
+    "splat-usdz",
+    "mesh",
+    "glb",
+    "obj",
+    "usdz",
+    "stl",
+    "points",
+    "environment",
+    "cameras",
+    "all",
+]
 BaseColor = Literal["delit", "diffuse", "photographs", "picture"]
 PictureFormat = Literal["png", "exr", "npy"]
 EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
     "spz": ("gaussforge",),
     "mesh": ("skimage", "trimesh"),
-    **dict.fromkeys(("glb", "obj"), ("skimage", "xatlas", "fast_simplification")),
+    **dict.fromkeys(("glb", "obj", "all"), ("skimage", "xatlas", "fast_simplification")),
+    "usdz": ("pxr", "skimage", "xatlas", "fast_simplification"),
+    "splat-usdz": ("pxr",),
+    "stl": ("skimage", "fast_simplification"),
     "environment": ("OpenEXR",),
 }
 """The packages that formats need: looked for before a run is loaded."""
-EXPORT_EXTRAS = {"glb": "model", "obj": "model"}
-"""The extra that brings those of a format; others come with polarguide."""
+EXPORT_EXTRAS = {"xatlas": "model", "fast_simplification": "model", "pxr": "usd"}
+"""The extras that bring packages of formats; others come with polarguide."""
 PathLike = str | os.PathLike[str]
 INDEX = 1.5
 """Refractive index of glass, plastic and glaze, for scenes that name none."""
@@ -128,7 +146,7 @@ class SceneOptions:
 
 @dataclass(frozen=True)
 class ModelOptions:
-    """A textured model (formats glb and obj).
+    """A textured model (formats glb, obj and usdz), or its surface (stl).
 
     Attributes:
         triangles: Triangles to simplify the surface to, about.
@@ -139,6 +157,8 @@ class ModelOptions:
         albedo_scale: Factor on the base color. The learned light has no absolute scale, so that one factor of a delit
             base color is not known: give what makes a gray card right.
         unlit: For viewers without light: the color is shown as it is.
+        close_bottom: Close flat what no camera saw, such as the bottom of what stood on a table; always in an STL.
+        masked: Only what most of the scene's masks show, besides the crop box.
     """
 
     triangles: int = 50_000
@@ -147,6 +167,8 @@ class ModelOptions:
     base_color: BaseColor | None = None
     albedo_scale: float = 1.0
     unlit: bool = False
+    close_bottom: bool = False
+    masked: bool = False
 
     def __post_init__(self) -> None:
         check_count("triangles", self.triangles, 100, 10_000_000)

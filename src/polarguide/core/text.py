@@ -25,6 +25,14 @@ def number_or_nan(text: str) -> float:
         return math.nan
 
 
+def decimals(text: str) -> tuple[float, ...]:
+    """The numbers of a list such as 1.9,1,1.6; none if it is something else."""
+    try:
+        return tuple(decimal(part) for part in text.split(","))
+    except ValueError:
+        return ()
+
+
 def printable(text: str, *, lines: bool = False) -> str:
     """Escape control characters in a text, such as names of files, before it is printed.
 

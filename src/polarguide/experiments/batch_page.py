@@ -14,7 +14,7 @@ from polarguide.core.files import write_text
 from polarguide.experiments.collection import INSPECTION, RUN, SHARE, CaptureRecord
 from polarguide.experiments.tables import formatted
 from polarguide.experiments.writing import csv_text
-from polarguide.inspection.page_html import FILE as INSPECTION_PAGE
+from polarguide.inspection.report import FILE as INSPECTION_PAGE
 from polarguide.results.evaluation.record import read_metrics
 from polarguide.results.evaluation.table import COLUMNS, Metric
 from polarguide.runs.health import Health

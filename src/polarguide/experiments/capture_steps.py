@@ -27,7 +27,7 @@ from polarguide.experiments.collection import (
     prepare_settings,
 )
 from polarguide.inspection.inspect import inspect_scene
-from polarguide.inspection.record import write_inspection
+from polarguide.inspection.report import write_inspection
 from polarguide.inspection.settings import InspectSettings
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.raster import choose_backend

@@ -25,9 +25,8 @@ from polarguide.recipes.registry import ablations_of
 from polarguide.results.evaluation.record import read_metrics
 from polarguide.results.evaluation.sources import code_digest, model_digest
 from polarguide.results.evaluation.target import SceneFacts
-from polarguide.runs.defaults import compared_steps
 from polarguide.runs.families import family_of
-from polarguide.runs.folder import CONFIGURATION, RunConfiguration, trained_steps
+from polarguide.runs.folder import CONFIGURATION, RunConfiguration, compared_steps, trained_steps
 from polarguide.runs.opened import read_scene
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import TrainSettings

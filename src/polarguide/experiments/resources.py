@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
-from polarguide.capture.memory import SHARE
+from polarguide.capture.layout import SHARE
 from polarguide.core.system import free_memory
 from polarguide.experiments.options import ClusterOptions
 from polarguide.experiments.plan import PlannedRun

@@ -28,7 +28,8 @@ from polarguide.geometry.vectors import spread_directions
 
 REST_COUNT = 15
 DIRECTIONS = 64
-CHUNK_NUMBERS = 1 << 24
+TOGETHER = 8192
+"""Gaussians fitted at a time: about 100 MB."""
 
 RELEASE_FIELDS = (
     *("x", "y", "z", "nx", "ny", "nz"),
@@ -154,40 +155,43 @@ def read_ply(path: str | Path) -> dict[str, Any]:
     }
 
 
-def refit_sh_to_display(
-    color_fn: Callable[[Tensor], Tensor], count: int, degree: int = 3
+def refit_sh(
+    color_fn: Callable[[slice, Tensor], Tensor],
+    normals: Tensor,
+    slope: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Spherical harmonics of display colors, ``color = 0.5 + sum``, by least squares for each Gaussian.
+    """Harmonics of degree 3 of the colors of Gaussians, ``color = 0.5 + sum``, by weighted least squares for each.
 
-    The colors are sampled in directions spread evenly over the sphere, a few at a time, so that memory stays
-    near that of the result.
+    The colors are sampled in directions spread evenly over the sphere. A direction counts as much as a flat Gaussian
+    shows of itself there: by the cosine to its normal, on either side.
 
     Args:
-        color_fn: maps directions [K, 3] (unit, from the camera to the Gaussian, as harmonics take them) to
-            sRGB-encoded colors [count, K, 3].
-        count: number of Gaussians.
-        degree: 0 to 3.
+        color_fn: maps some of the Gaussians and directions [K, 3] (unit, from the camera to the Gaussian, as harmonics
+            take them) to colors [P, K, 3].
+        normals: [N, 3] unit.
+        slope: of the display curve at colors, where they are not encoded by it: their errors count as they are seen.
 
     Returns:
-        dc [count, 1, 3] and rest [count, 15, 3] float32, zero beyond ``degree``.
+        dc [N, 1, 3] and rest [N, 15, 3] float32.
 
     Raises:
         ValueError: ``color_fn`` returns another shape.
     """
-    directions = spread_directions(DIRECTIONS)
-    basis = sh_basis(directions, degree)
-    solve = torch.linalg.pinv(basis)
-    fitted = torch.zeros(count, 1 + REST_COUNT, 3)
-    step = max(1, CHUNK_NUMBERS // max(1, 3 * count))
-    for begin in range(0, DIRECTIONS, step):
-        chunk = slice(begin, min(begin + step, DIRECTIONS))
-        some = directions[chunk].to(torch.float32)
-        colors = color_fn(some).detach().to("cpu", torch.float32)
-        if colors.shape != (count, len(some), 3):
-            raise ValueError(f"colors: expected {[count, len(some), 3]}, found {list(colors.shape)}")
-        fitted[:, : solve.shape[0]] += torch.einsum(
-            "dk,nkc->ndc", solve[:, chunk].to(torch.float32), colors - 0.5
-        )
+    directions = spread_directions(DIRECTIONS).to(torch.float32)
+    basis = sh_basis(directions, 3)
+    fitted = torch.empty(len(normals), 1 + REST_COUNT, 3)
+    for begin in range(0, len(normals), TOGETHER):
+        part = slice(begin, min(begin + TOGETHER, len(normals)))
+        colors = color_fn(part, directions).detach().to("cpu", torch.float32)
+        cosine = normals[part].to("cpu", torch.float32) @ directions.T
+        if colors.shape != (*cosine.shape, 3):
+            raise ValueError(f"colors: expected {[*cosine.shape, 3]}, found {list(colors.shape)}")
+        weights = cosine.abs()[..., None]
+        if slope is not None:
+            weights = weights * slope(colors).square()
+        weighted = weights.movedim(-1, 1)[..., None] * basis  # [P, 1 or 3, K, 16]
+        right = weighted.mT @ (colors - 0.5).movedim(-1, 1)[..., None]
+        fitted[part] = torch.linalg.solve(basis.T @ weighted, right)[..., 0].mT
     return fitted[:, :1].clone(), fitted[:, 1:].clone()
 
 

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from polarguide.capture.calibration import Calibration, combined
 from polarguide.capture.view import ANGLES
-from polarguide.inspection.verdict import Check, Verdict
+from polarguide.inspection.settings import Check, Verdict
 
 FileOrder = tuple[int, int, int, int]
 

@@ -18,7 +18,7 @@ from polarguide.capture import checks
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import ColmapModel, read_model
 from polarguide.capture.exposures import FOUR, Exposure
-from polarguide.capture.formats.pictures import decode_picture, read_picture
+from polarguide.capture.formats.pictures import TRANSFERS, decode_picture, read_picture
 from polarguide.capture.layout import Layout, find_layout, select_views
 from polarguide.capture.metadata import (
     Origin,
@@ -27,9 +27,11 @@ from polarguide.capture.metadata import (
     origin_of,
     refractive_index_of,
 )
-from polarguide.capture.reader import StoredViews, check_transfer, read_views
+from polarguide.capture.reader import read_views
 from polarguide.capture.view import FULL_CODE
+from polarguide.capture.view_reader import StoredViews
 from polarguide.core.files import read_file
+from polarguide.core.options import check_choice
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import LARGEST_RECORD
 from polarguide.geometry.camera import Camera
@@ -132,13 +134,13 @@ def read_capture(
     Raises:
         PolarguideError: a file cannot be used.
     """
-    check_transfer(transfer)
+    check_choice("transfer", transfer, TRANSFERS)
     root = Path(path)
     layout = find_layout(root)
     names = select_views(layout, None)
     model = read_model(root) if (root / "sparse").exists() else None
     metadata = root / "scene.json"
-    said = read_file(metadata, largest=LARGEST_RECORD) if metadata.exists() else None
+    said = read_file(metadata, largest=LARGEST_RECORD) if metadata.exists() else b"{}"
     factor = downscale or _fitting_factor(layout, names[0])
     stored = read_views(layout, names, model, downscale=factor, transfer=transfer, reporter=reporter)
     lines = sorted(f"{p.relative_to(root)} {d}" for item in stored.data for p, d in item.digests.items())

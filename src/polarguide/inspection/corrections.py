@@ -32,7 +32,7 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import decode, read_record, shortened, to_json
 from polarguide.inspection.angles import AngleFindings, swaps
 from polarguide.inspection.capture import Capture, InspectedView
-from polarguide.inspection.verdict import Check
+from polarguide.inspection.settings import Check
 
 COPIED = ("sparse", "masks", "invalid", "gt", "split.json", PRESENTATION_FILE)
 """Files and folders that are copied unchanged."""

@@ -25,16 +25,18 @@ from polarguide.inspection.angles import (
 from polarguide.inspection.capture import Capture, InspectedView, ViewMeasurements, measure_view, read_capture
 from polarguide.inspection.corrections import analyzer_check, corrected
 from polarguide.inspection.evidence import (
+    LONGEST,
     Surface,
     SurfaceSamples,
     normal_evidence,
     point_evidence,
     sample_surfaces,
+    short_run,
+    surface_of,
 )
 from polarguide.inspection.picture_checks import dielectric_check, find_pairing, light_checks, picture_checks
 from polarguide.inspection.pose_checks import coverage_check, pose_check
-from polarguide.inspection.settings import InspectSettings
-from polarguide.inspection.short_run import LONGEST, short_run, surface_of
+from polarguide.inspection.settings import Check, InspectSettings, Verdict, worst
 from polarguide.inspection.shots import (
     ShotFindings,
     agreement_checks,
@@ -42,7 +44,6 @@ from polarguide.inspection.shots import (
     pictures_check,
     shot_checks,
 )
-from polarguide.inspection.verdict import Check, Verdict, worst
 from polarguide.raster import Backend
 
 SURE = 0.98

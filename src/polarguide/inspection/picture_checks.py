@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from polarguide import optics
 from polarguide.capture import checks
-from polarguide.capture.pair_sums import MeasuredGains, measured_gains, pair_moments
+from polarguide.capture.checks import MeasuredGains, measured_gains, pair_moments
 from polarguide.capture.view import ANGLES, FULL_CODE, listed
 from polarguide.inspection.angles import PAIRINGS, swaps
 from polarguide.inspection.capture import POLARIZED, Capture, ViewMeasurements
 from polarguide.inspection.evidence import ZENITH_MARGIN, SurfaceSamples
-from polarguide.inspection.verdict import Check, Verdict
+from polarguide.inspection.settings import Check, Verdict
 
 PAIR_ERROR = 0.05
 """Median |I0 + I90 - I45 - I135| / S0 of a view above which its four pictures are inconsistent."""

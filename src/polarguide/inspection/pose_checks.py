@@ -15,7 +15,7 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.vectors import unit_array
 from polarguide.inspection.capture import Capture, InspectedView
-from polarguide.inspection.verdict import Check, Verdict
+from polarguide.inspection.settings import Check, Verdict
 
 NEIGHBORS = 4
 FEATURES = 3000

@@ -18,8 +18,8 @@ from polarguide.capture import Scene
 from polarguide.capture.exposures import Exposure, determine_stokes
 from polarguide.capture.view import FULL_CODE, View, listed
 from polarguide.inspection.capture import Capture
-from polarguide.inspection.short_run import short_run
-from polarguide.inspection.verdict import Check, Verdict
+from polarguide.inspection.evidence import short_run
+from polarguide.inspection.settings import Check, Verdict
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
 from polarguide.shots.judge import chosen_pixels, judge

@@ -46,6 +46,12 @@ def shown(linear: Tensor) -> Tensor:
     return srgb_encode(linear.clamp(0.0, 1.0))
 
 
+def srgb_slope(linear: Tensor) -> Tensor:
+    """Derivative of ``srgb_encode`` at linear values, at least that at 1: how visible an error there is."""
+    curved = 1.055 / 2.4 * linear.clamp(0.0031308, 1.0) ** (1 / 2.4 - 1)
+    return torch.where(linear <= 0.0031308, 12.92, curved)
+
+
 def srgb_encode_array(linear: NDArray[Any]) -> NDArray[Any]:
     """``srgb_encode`` for NumPy arrays in [0, 1]."""
     curved = 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055

@@ -180,7 +180,11 @@ def write_exposure_table(folder: SceneFolder, *, estimate: bool, posed: bool, re
     pictures = [
         _Exposure(view, Path(name).name, record)
         for view in sorted(folder.views)
-        for name, record in _named(view, folder.views[view]["exposures"])
+        for name, record in zip(
+            picture_names(view, [shot["angle"] for shot in folder.views[view]["exposures"]]),
+            folder.views[view]["exposures"],
+            strict=True,
+        )
     ]
     if estimate:
         _estimate(folder.root, pictures, posed, reporter)
@@ -195,19 +199,14 @@ def write_exposure_table(folder: SceneFolder, *, estimate: bool, posed: bool, re
     write_whole(folder.root / TABLE, _table(pictures).encode())
 
 
-def _named(view: str, exposures: list[dict[str, Any]]) -> list[tuple[str, dict[str, Any]]]:
-    """The exposures of a view with the paths of their pictures."""
-    return list(zip(picture_names(view, [item["angle"] for item in exposures]), exposures, strict=True))
-
-
 def _table(pictures: list[_Exposure]) -> str:
     """The table of a scene: files are named exactly, as they are read again."""
+    rows = [
+        (picture.file, picture.view, angle_text(picture.record["angle"]), f"{picture.record['gain']:.6g}")
+        for picture in pictures
+    ]
     text = io.StringIO()
-    lines = csv.writer(text, lineterminator="\n")
-    lines.writerow(("file", "view", "angle", "gain"))
-    for picture in pictures:
-        angle, gain = angle_text(picture.record["angle"]), f"{picture.record['gain']:.6g}"
-        lines.writerow((picture.file, picture.view, angle, gain))
+    csv.writer(text, lineterminator="\n").writerows([("file", "view", "angle", "gain"), *rows])
     return text.getvalue()
 
 

@@ -25,7 +25,14 @@ from polarguide.capture.calibration import (
 )
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.exposures import Angle, angle_text, turned
-from polarguide.capture.filter.camera_raw import is_camera_raw, stored_frame
+from polarguide.capture.filter.camera_files import (
+    apply_orientation,
+    is_camera_raw,
+    orientation,
+    orientation_calibration,
+    read_taken,
+    stored_frame,
+)
 from polarguide.capture.filter.develop import (
     CAMERA_RAW,
     Shift,
@@ -38,7 +45,6 @@ from polarguide.capture.filter.develop import (
     rounding_of_bytes,
     transfer_of_kind,
 )
-from polarguide.capture.filter.exif import apply_orientation, orientation, orientation_calibration, read_taken
 from polarguide.capture.filter.shots import (
     Shots,
     SingleShot,
@@ -49,7 +55,7 @@ from polarguide.capture.filter.shots import (
     require_four_shots,
 )
 from polarguide.capture.formats.pictures import is_lossy, read_picture, stated_size
-from polarguide.capture.memory import require_memory_of_each
+from polarguide.capture.layout import require_memory_of_each
 from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.write import EXACT, Rounding
@@ -60,9 +66,9 @@ from polarguide.preparation.shot_exposures import (
     ShotExposures,
     exposure_notes,
     exposures_of_view,
+    levels_of_shots,
     stated_exposures,
 )
-from polarguide.preparation.shot_levels import levels_of_shots
 from polarguide.preparation.source import DevelopedView, Source, Stored
 
 _JUDGED_VIEWS = 8
@@ -109,10 +115,8 @@ class ShotsSource(Source):
         Raises:
             PolarguideError: the largest is too large.
         """
-        pixel, remedy = (
-            max(map(len, self._of_view.values())) * _WORKED,
-            "Make all pictures smaller by the same factor.",
-        )
+        pixel = max(map(len, self._of_view.values())) * _WORKED
+        remedy = "Make all pictures smaller by the same factor."
         require_memory_of_each(self._shots, pixel, what, remedy=remedy)
 
     def _rounding(self, transfer: str, smallest: float) -> Rounding:
@@ -168,9 +172,7 @@ class ShotsSource(Source):
 
 @dataclass
 class _Linear:
-    """Linear shots of a view [K, H, W, 3], unusable pixels [H, W], shifts, notes for the user, and the orientation that
-    turns them into what is used.
-    """
+    """Linear shots of a view [K, H, W, 3], unusable pixels [H, W], shifts, notes, and the orientation to turn them."""
 
     shots: Shots
     linear: NDArray[np.float32]
@@ -224,9 +226,8 @@ class FilterSource(ShotsSource):
         room = math.sqrt(1.0 - LARGEST_IMBALANCE)
         if gains is None and asked.gains == "auto":
             notes.append(UNIDENTIFIED)
-        scale = (min(1.0, *gains) if gains is not None else room if asked.gains == "auto" else 1.0) / (
-            asked.calibration.peak
-        )
+        scale = min(1.0, *gains) if gains is not None else room if asked.gains == "auto" else 1.0
+        scale /= asked.calibration.peak
         smallest = scale / (max(gains) if gains is not None else 1.0 / room)
         every = [value for of_view in stated.values() for value in of_view] or [1.0]
         return {

@@ -39,7 +39,7 @@ from polarguide.core.progress import Reporter
 from polarguide.core.records import decode, read_record, shortened, to_json
 from polarguide.core.system import hold_folder
 from polarguide.preparation.settings import PrepareSettings, known_intrinsics
-from polarguide.preparation.source import Source
+from polarguide.preparation.source import Source, developed
 
 JOURNAL = "prepare.json"
 SCENE = "scene.json"
@@ -412,7 +412,7 @@ class Workshop:
             for count, view in enumerate(views, 1):
                 path = images / f"{view}.png"
                 if view not in known or not path.exists():
-                    done = self._pictures.develop(view, measured)
+                    done = developed(self._pictures, view, measured)
                     if done.mask is not None:
                         write_png(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
                     write_png(path, tone_mapped(done.intensities, self._settings.sfm_pictures))

@@ -16,12 +16,10 @@ from polarguide.capture.calibration import UNIDENTIFIED, UNIT_GAINS, balancing_g
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.datasets.dataset import Dataset, resized_mask
 from polarguide.capture.formats.pictures import stated_size
-from polarguide.capture.layout import index_files
-from polarguide.capture.memory import require_memory, require_memory_of_each
+from polarguide.capture.layout import index_files, require_memory, require_memory_of_each
 from polarguide.capture.sensor.analyzer_file import read_analyzers
-from polarguide.capture.sensor.analyzers import spread_to_cells
-from polarguide.capture.sensor.defects import defects, defects_note
-from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
+from polarguide.capture.sensor.analyzers import imbalance_notes, spread_to_cells
+from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic
 from polarguide.capture.sensor.pattern import (
     FULL_16,
     SENSOR_NAMES,
@@ -144,8 +142,8 @@ def sample_blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
     """A regular subset of a mosaic's blocks, [N, size, size]."""
     rows, columns = values.shape[0] // size, values.shape[1] // size
     grid = values[: rows * size, : columns * size].reshape(rows, size, columns, size)
-    found = grid.swapaxes(1, 2).reshape(-1, size, size)
-    return found[:: max(1, len(found) // _BLOCKS)].copy()
+    row, column = np.divmod(np.arange(0, rows * columns, max(1, rows * columns // _BLOCKS)), max(columns, 1))
+    return grid.swapaxes(1, 2)[row, column]
 
 
 def block_intensities(
@@ -197,10 +195,6 @@ def gray_world(colors: NDArray[np.float64]) -> tuple[float, float, float]:
     """Gains that make the mean of [3, N] colors gray; green keeps its own."""
     mean = np.maximum(colors.mean(axis=1) if colors.size else np.ones(3), 1e-6)
     return float(mean[1] / mean[0]), 1.0, float(mean[1] / mean[2])
-
-
-CALIBRATED_IMBALANCE = 0.01
-"""Of the pair sums of a calibrated sensor; more is a sign of another camera's calibration."""
 
 
 class MosaicSource(Source):
@@ -386,12 +380,7 @@ class MosaicSource(Source):
         """Gains of the angles, and notes about them."""
         asked = self._settings
         if self._analyzers is not None:
-            if ratio is None:
-                return UNIT_GAINS, []
-            notes = [f"With the calibration, I0 + I90 is {ratio - 1:+.2%} off I45 + I135."]
-            if abs(ratio - 1) > CALIBRATED_IMBALANCE:
-                notes.append("That is more than a calibration of this camera leaves: is it one of another?")
-            return UNIT_GAINS, notes
+            return UNIT_GAINS, imbalance_notes(ratio)
         if asked.calibration.gains is not None:
             return asked.calibration.gains, []
         if asked.gains == "none":

@@ -1,17 +1,23 @@
-"""Detect the format of a folder, and the origin of its poses."""
+"""Detect the format of a folder, and the origin of its poses: whether they are of the pictures as stored, or as EXIF
+turns them for display.
+"""
 
 from __future__ import annotations
 
 import os
 import shlex
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from polarguide.capture.colmap.model import view_of_name
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
-from polarguide.capture.exposures import TABLE
-from polarguide.capture.filter.names import angles_of_names, folders_of_angles
+from polarguide.capture.exposures import TABLE, angles_of_names, folders_of_angles
+from polarguide.capture.filter.camera_files import QUARTER_TURNS, TURNS
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
+from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.layout import angle_folders, describe_contents, index_files, list_files
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import read_pose_file
@@ -23,7 +29,43 @@ from polarguide.core.files import require_folder
 from polarguide.preparation.filter_source import FilterSource, SinglesSource
 from polarguide.preparation.mosaic_source import MosaicSource
 from polarguide.preparation.settings import PrepareSettings, check_format
-from polarguide.preparation.source import MaskedSource, Source, StokesSource
+from polarguide.preparation.source import Source, StokesSource
+
+
+def _views_of_masks(files: Iterable[Path], views: Sequence[str]) -> dict[str, Path]:
+    """Masks by view: called like it, as COLMAP and Metashape name masks (``cup.jpg.png``, ``cup_mask.png``), or so."""
+    found: dict[str, Path] = {}
+    pictures = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
+    for shorten in (str, view_of_name, lambda name: name.removesuffix("_mask")):
+        for path in pictures:
+            view = shorten(path.stem)
+            if view in views:
+                found.setdefault(view, path)
+    return found
+
+
+def _found_masks(folder: Path, views: Sequence[str]) -> dict[str, Path]:
+    """The object masks of a folder, by view.
+
+    Raises:
+        PolarguideError: there is no such folder, or none of its pictures is named like a view.
+    """
+    if not folder.is_dir():
+        raise PolarguideError(
+            "--masks",
+            expected="a folder of masks named like the views",
+            found=f"{folder}, which is not a folder",
+            remedy="Give the folder that holds <view>.png.",
+        )
+    masks = _views_of_masks(folder.iterdir(), views)
+    if not masks:
+        raise PolarguideError(
+            folder,
+            expected=f"masks named like the views ({listed(list(views), 3)})",
+            found=listed(sorted(path.name for path in folder.iterdir()), 3) or "no file",
+            remedy="Rename them; views without a mask are used whole.",
+        )
+    return masks
 
 
 def open_source(root: Path, settings: PrepareSettings) -> Source:
@@ -54,7 +96,9 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
             found=describe_contents(root),
             remedy="See docs/reference/formats.md for the layouts.",
         )
-    return found if settings.masks is None else MaskedSource(found, settings.masks)
+    if settings.masks is not None:
+        found.masks = _found_masks(settings.masks, found.views)
+    return found
 
 
 def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
@@ -189,3 +233,55 @@ def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto
         found.assumed_sizes = frozenset(assumed)
         return found
     return Poses.read(path, pictures.views)
+
+
+def settle_pose_frames(pictures: Source, poses: Poses, asked: str) -> str:
+    """Decide which views are used as stored, because the poses are of the stored pixels, and tell the source.
+
+    COLMAP, Metashape and nerfstudio read pixels as stored and leave the orientation tag alone; other programs turn the
+    pictures first. Where a quarter turn exchanges width and height, the size of the pose's camera tells. Views whose
+    sizes tell nothing (half a turn, a mirror image, a square) are as those that do; where none does, as stored.
+
+    Args:
+        pictures: the source, which has not developed a view yet.
+        poses: from outside; their cameras have sizes.
+        asked: what the user says; ``auto`` decides as above.
+
+    Returns:
+        One line for the user; empty where no picture has an orientation tag.
+    """
+    codes: dict[str, int] = {}
+    by_size: dict[str, bool] = {}
+    for view in poses.views:
+        stored = pictures.stored(view)
+        if stored.orientation == 1:
+            continue
+        codes[view] = stored.orientation
+        if stored.size is not None and stored.orientation in QUARTER_TURNS:
+            (width, height), camera = stored.size, poses.stated_size(view)
+            if camera is not None and width != height and camera[0] != camera[1]:
+                by_size[view] = (width > height) == (camera[0] > camera[1])
+    if not codes:
+        return ""
+    alike = set(by_size.values())
+    others = asked == "stored" if asked != "auto" else alike != {False}
+    as_stored = {view: others if asked != "auto" else by_size.get(view, others) for view in codes}
+    kept = [view for view, keep in as_stored.items() if keep]
+    pictures.use_stored(kept)
+    reason = "as --poses-of says" if asked != "auto" else "as the sizes of the cameras tell"
+    if asked == "auto" and not alike:
+        reason = "as COLMAP, Metashape and nerfstudio read pictures; sizes do not tell"
+    counts = Counter(codes.values())
+    turns = listed([f"{count} {TURNS[code]}" for code, count in sorted(counts.items())])
+    if len(kept) in (0, len(codes)):
+        frame, other = ("stored", "displayed") if kept else ("displayed", "stored")
+        text = f"their poses are taken to be of the {frame} pixels, {reason}"
+    else:
+        frame, other = "stored", "displayed"
+        kind = f"the poses of {len(kept)} are taken to be of the stored pixels"
+        text = f"{kind}, {reason}, those of the others of the displayed ones"
+    used = "Those views, their angles and masks are used as stored. " if kept else ""
+    return (
+        f"EXIF orientation of {len(codes)} of {len(poses.views)} views ({turns}): {text}. {used}"
+        f"If the poses are of the {other} pixels: --poses-of {other}."
+    )

@@ -18,7 +18,7 @@ from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Geometry, Poses
 from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError
-from polarguide.capture.filter.exif import TURNS
+from polarguide.capture.filter.camera_files import TURNS
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, writing
@@ -26,10 +26,15 @@ from polarguide.core.progress import Reporter
 from polarguide.core.records import option_name
 from polarguide.preparation.exposure_table import write_exposure_table
 from polarguide.preparation.folder import PARTIAL, PHOTOGRAPHS, SCENE, SFM, SceneFolder, Workshop
-from polarguide.preparation.open_source import known_poses, open_source, origin_of_poses, poses_beside
-from polarguide.preparation.pose_frames import settle_pose_frames
+from polarguide.preparation.open_source import (
+    known_poses,
+    open_source,
+    origin_of_poses,
+    poses_beside,
+    settle_pose_frames,
+)
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.preparation.source import Source
+from polarguide.preparation.source import Source, developed, measured_source
 
 MOSTLY = 0.5
 """Share of saturated pixels from which on a view is warned of."""
@@ -116,7 +121,7 @@ def prepare_scene(
         )
     if folder.measured is None:
         with reporter.track("measuring", len(pictures.views)) as advance:
-            folder.measured = pictures.measure(advance)
+            folder.measured = measured_source(pictures, advance)
         for note in folder.measured["notes"]:
             reporter.say(note)
     with folder.held():
@@ -214,7 +219,11 @@ def _request(root: Path, pictures: Source, settings: PrepareSettings, poses: Pos
         "source": os.path.realpath(root),
         "format": pictures.kind,
         "settings": settings.record(),
-        "file": {str(path): fingerprint(path) for path in pictures.paths if path.exists()},
+        "file": {
+            str(path): fingerprint(path)
+            for path in (*pictures.paths, *pictures.masks.values())
+            if path.exists()
+        },
     }
     if poses is not None and poses.files:
         request["model"] = {path.name: fingerprint(path) for path in poses.files}
@@ -259,7 +268,7 @@ def _write_view(
 ) -> tuple[list[str], tuple[str, ...]]:
     """Write the pictures of a view; returns what makes it useless, and the notes about it."""
     assert folder.measured is not None
-    done = pictures.develop(view, folder.measured)
+    done = developed(pictures, view, folder.measured)
     intensities, invalid, mask, warped = done.intensities, done.invalid, done.mask, None
     if poses is not None:
         warp = poses.warp(view, done.geometry)

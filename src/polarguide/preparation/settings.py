@@ -15,10 +15,10 @@ from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, Sense, checked, read_calibration
 from polarguide.capture.sensor.analyzer_file import is_analyzer_file
-from polarguide.capture.sensor.pattern import Packing, SensorName
+from polarguide.capture.sensor.pattern import MosaicOptions, Positive
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options, option_name
-from polarguide.core.text import decimal
+from polarguide.core.text import decimals
 from polarguide.geometry.polarizer import ANGLES
 
 Dataset = Literal["pandora", "pisr", "nersp", "neisf", "gnerp", "phygap"]
@@ -37,28 +37,19 @@ _OPTIONS = {
     "singles": ("transfer", "align", "white_balance", "precision", "bits", "saturation", "angles"),
     "gnerp": ("transfer",),
 }
-_NotNegative = Annotated[int, Meta(ge=0, le=1 << 20)]
-_Positive = Annotated[int, Meta(ge=1, le=1 << 31)]
 
 
 @dataclass(frozen=True)
-class PrepareSettings:
+class PrepareSettings(MosaicOptions):
     """What a scene folder is made from, and how.
 
     Attributes:
         format: What the source is; auto looks for datasets, the four shots of a filter, and singles (photographs
             through a filter at any angles, each with a pose of its own), else takes mosaics.
-        sensor: Sensor of raw mosaics: IMX250MYR and IMX264MYR are color, IMX250MZR is monochrome.
-        packing: Packing of .raw files (there are several of 10 and of 12 bits; never guessed).
-        width: Width of .raw files in pixels.
-        height: Height of .raw files in pixels.
         bits: Bits of a sensor value in 16-bit files; without it those of the value at which samples pile up, else 12 if
             no value exceeds 4095, else 16.
         gamma: Gamma that the camera applied to mosaics: stored = light ^ gamma.
         flip: Which way the camera mirrored the mosaics (Reverse X, Reverse Y): undone before anything else.
-        offset_x: Column of the sensor at which the region of interest starts.
-        offset_y: Row of the sensor at which it starts.
-        black_level: Stored value without light.
         dark_frame: Picture with the lens covered, subtracted in place of the black level.
         saturation: Stored value from which the sensor saturates; without it full scale.
         white_balance: none, gray (the mean color becomes gray), or gains of R, G and B such as 1.9,1,1.6.
@@ -88,18 +79,11 @@ class PrepareSettings:
     """
 
     format: Literal["auto", "mosaic", "filter", "singles"] | Dataset = "auto"
-    sensor: SensorName | None = None
-    packing: Packing | None = None
-    width: _Positive | None = None
-    height: _Positive | None = None
     bits: Annotated[int, Meta(ge=8, le=16)] | None = None
     gamma: Annotated[float, Meta(ge=0.1, le=4.0)] = 1.0
     flip: Literal["none", "x", "y", "xy"] = "none"
-    offset_x: _NotNegative = 0
-    offset_y: _NotNegative = 0
-    black_level: Annotated[float, Meta(ge=0)] = 0.0
     dark_frame: Path | None = None
-    saturation: _Positive | None = None
+    saturation: Positive | None = None
     white_balance: str = "none"
     demosaic: Literal["half", "quarter", "full"] = "half"
     interpolation: Literal["bilinear", "guided"] = "bilinear"
@@ -150,7 +134,9 @@ class PrepareSettings:
             white_balance="gray" if self.white_balance == "grey" else self.white_balance,
             dark_frame=_absolute(self.dark_frame),
             analyzers=_absolute(self.analyzers),
-            angles=_table_path(self.angles),
+            angles=os.path.realpath(self.angles)
+            if self.angles and self.angles.lower().endswith(".csv")
+            else self.angles,
             poses=self.poses if self.poses in ORIGINS else os.path.realpath(self.poses),
             masks=_absolute(self.masks),
         )
@@ -249,7 +235,7 @@ def white_gains(text: str) -> tuple[float, float, float] | None:
     """
     if text in ("none", "gray", "grey"):
         return (1.0, 1.0, 1.0) if text == "none" else None
-    gains = _numbers(text)
+    gains = decimals(text)
     if len(gains) != 3 or not all(0.05 <= gain <= 20 for gain in gains):
         raise PolarguideError(
             "--white-balance",
@@ -266,7 +252,7 @@ def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
     Raises:
         PolarguideError: it is neither.
     """
-    numbers = _numbers(text)
+    numbers = decimals(text)
     if len(numbers) not in (4, 8) or not all(map(math.isfinite, numbers)) or min(numbers[:4]) <= 0:
         raise PolarguideError(
             "--intrinsics",
@@ -275,14 +261,6 @@ def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
             remedy="Correct the value; the center of the first pixel is at 0.5.",
         )
     return ("PINHOLE" if len(numbers) == 4 else "OPENCV"), numbers
-
-
-def _numbers(text: str) -> tuple[float, ...]:
-    """The numbers of a list such as 1.9,1,1.6; none if it is something else."""
-    try:
-        return tuple(decimal(part) for part in text.split(","))
-    except ValueError:
-        return ()
 
 
 def _four_angles(text: str) -> tuple[int, int, int, int]:
@@ -296,11 +274,6 @@ def _four_angles(text: str) -> tuple[int, int, int, int]:
             remedy="Name the angle of the pictures called 0, 45, 90 and 135, in this order.",
         ) from None
     return first, second, third, fourth
-
-
-def _table_path(angles: str | None) -> str | None:
-    """``--angles``, with an absolute path where it names a table."""
-    return os.path.realpath(angles) if angles is not None and angles.lower().endswith(".csv") else angles
 
 
 def _absolute(path: Path | None) -> Path | None:

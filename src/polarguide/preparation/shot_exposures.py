@@ -1,4 +1,6 @@
-"""Exposures of the four shots of a view: as their files state, and as their pair sums measure."""
+"""Exposures of the four shots of a view, as their files state and as their pair sums measure; bits and full scale of
+shots whose 16-bit files do not state them.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.calibration import Gains
-from polarguide.capture.filter.exif import read_taken
-from polarguide.capture.pair_sums import measured_gains, pair_moments
+from polarguide.capture.checks import measured_gains, pair_moments
+from polarguide.capture.filter.camera_files import is_camera_raw, read_taken
+from polarguide.capture.filter.shots import read_stack
+from polarguide.capture.formats.pictures import may_use_fewer_bits
+from polarguide.capture.sensor.pattern import FULL_16, Levels, estimate_levels, level_notes
 from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES
+from polarguide.preparation.settings import PrepareSettings
 
 # Logarithm of a ratio of exposures that are the same: files state three digits.
 _EQUAL = 1e-3
@@ -114,3 +120,35 @@ def exposures_of_view(
 def _gains(logs: NDArray[np.float64]) -> Gains:
     first, second, third, fourth = (float(value) for value in np.exp(logs))
     return first, second, third, fourth
+
+
+def levels_of_shots(
+    paths: Sequence[Path], white: tuple[float, float, float], settings: PrepareSettings
+) -> tuple[Levels | None, list[str]]:
+    """Levels of the stored values where the files do not state them, and notes for the user.
+
+    Args:
+        paths: all files of the capture. white: gains of R, G and B, for camera raw files.
+        settings: ``bits`` and ``saturation``.
+
+    Returns:
+        None where every file states its full scale, and nothing else is given.
+
+    Raises:
+        PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.
+    """
+    wide = [path for path in paths if not is_camera_raw(path) and may_use_fewer_bits(path)]
+    if not wide and settings.bits is None and settings.saturation is None:
+        return None, []
+    counts, container = np.zeros(FULL_16 + 1, np.int64), 8
+    for path in wide or paths:
+        values = read_stack([path], white).pictures
+        container = 8 * values.dtype.itemsize
+        counts += np.bincount(values.ravel(), minlength=len(counts))
+    occurring = np.flatnonzero(counts)
+    levels = estimate_levels(
+        int(occurring[-1]), int(np.bitwise_or.reduce(occurring)), container,
+        bits=settings.bits, black=0.0, saturation=settings.saturation, counts=counts,
+    )  # fmt: skip
+    usual = levels.bits == container and levels.saturation == levels.white
+    return levels, [] if usual else level_notes(levels, counts, container, settings.bits)

@@ -1,11 +1,13 @@
-"""The interface of picture sources, with object masks of the user, and of Stokes vectors."""
+"""The interface of picture sources; that of Stokes vectors, and the sense of their angles by the outlines of masks."""
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import cv2
@@ -14,14 +16,12 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import Sense, oriented
 from polarguide.capture.colmap.files import PosedCamera
-from polarguide.capture.colmap.model import view_of_name
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.datasets.dataset import Dataset, not_as_published, read_mask, resized_mask
-from polarguide.capture.datasets.sense import RimAgreement, rim_agreement, sense_of_rims
 from polarguide.capture.exposures import Angle
-from polarguide.capture.filter.exif import INVERSE, QUARTER_TURNS, apply_orientation
-from polarguide.capture.formats.pictures import SUFFIXES, stated_size
-from polarguide.capture.memory import require_memory_of_each
+from polarguide.capture.filter.camera_files import INVERSE, QUARTER_TURNS, apply_orientation
+from polarguide.capture.formats.pictures import stated_size
+from polarguide.capture.layout import require_memory_of_each
 from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.progress import Advance
@@ -87,7 +87,8 @@ class Source(Protocol):
         kind: name of the format.
         cameras: by view name, if the source has poses, else None.
         views: view names, sorted.
-        paths: all files that are read.
+        paths: all files that are read, but for masks.
+        masks: object masks of the user by view; the object is where one has at least half of its maximum.
         needs: keys of what ``measure`` returns that ``develop`` reads.
     """
 
@@ -96,6 +97,7 @@ class Source(Protocol):
     cameras: Mapping[str, PosedCamera] | None
     views: list[str]
     paths: list[Path]
+    masks: Mapping[str, Path] = MappingProxyType({})
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """Measure what is common to the whole capture, as JSON types; ``notes`` are messages for the user."""
@@ -118,84 +120,28 @@ class Source(Protocol):
         return False
 
 
-def _views_of_masks(files: Iterable[Path], views: Sequence[str]) -> dict[str, Path]:
-    """Masks by view: called like it, as COLMAP and Metashape name masks (``cup.jpg.png``, ``cup_mask.png``), or so."""
-    found: dict[str, Path] = {}
-    pictures = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
-    for shorten in (str, view_of_name, lambda name: name.removesuffix("_mask")):
-        for path in pictures:
-            view = shorten(path.stem)
-            if view in views:
-                found.setdefault(view, path)
-    return found
+def measured_source(pictures: Source, advance: Advance) -> dict[str, Any]:
+    """What ``Source.measure`` gives, with a note of views without a mask."""
+    measured = pictures.measure(advance)
+    bare = [view for view in pictures.views if view not in pictures.masks]
+    if pictures.masks and bare:
+        note = f"{len(bare)} of {len(pictures.views)} views have no mask and are used whole ({listed(bare)})."
+        measured["notes"] = [*measured["notes"], note]
+    return measured
 
 
-class MaskedSource(Source):
-    """A source with object masks from a folder; the object is where a mask has at least half of its maximum."""
+def developed(pictures: Source, view: str, measured: dict[str, Any]) -> DevelopedView:
+    """What ``Source.develop`` gives, with the view's mask.
 
-    def __init__(self, pictures: Source, folder: Path) -> None:
-        """Find the masks, named like the views.
-
-        Args:
-            pictures: the source without them.
-            folder: with one picture for each view that has a mask.
-
-        Raises:
-            PolarguideError: there is no such folder, or none of its pictures is named like a view.
-        """
-        if not folder.is_dir():
-            raise PolarguideError(
-                "--masks",
-                expected="a folder of masks named like the views",
-                found=f"{folder}, which is not a folder",
-                remedy="Give the folder that holds <view>.png.",
-            )
-        self._masks = _views_of_masks(folder.iterdir(), pictures.views)
-        if not self._masks:
-            raise PolarguideError(
-                folder,
-                expected=f"masks named like the views ({listed(pictures.views, 3)})",
-                found=listed(sorted(path.name for path in folder.iterdir()), 3) or "no file",
-                remedy="Rename them; views without a mask are used whole.",
-            )
-        self._pictures = pictures
-        self.needs = pictures.needs
-        self.kind, self.cameras, self.views = pictures.kind, pictures.cameras, pictures.views
-        self.paths = [*pictures.paths, *self._masks.values()]
-
-    def stored(self, view: str) -> Stored:
-        """As the source says."""
-        return self._pictures.stored(view)
-
-    def use_stored(self, views: Collection[str]) -> None:
-        """As of the source; masks are then of the stored pixels, too."""
-        self._pictures.use_stored(views)
-
-    def used_as_stored(self, view: str) -> bool:
-        """As the source says."""
-        return self._pictures.used_as_stored(view)
-
-    def measure(self, advance: Advance) -> dict[str, Any]:
-        """Measure the source, and note views without a mask."""
-        measured = self._pictures.measure(advance)
-        bare = [view for view in self.views if view not in self._masks]
-        if bare:
-            note = f"{len(bare)} of {len(self.views)} views have no mask and are used whole ({listed(bare)})."
-            measured["notes"] = [*measured["notes"], note]
-        return measured
-
-    def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
-        """Read one view, with its mask.
-
-        Raises:
-            PolarguideError: the mask cannot be read, or is neither of the stored nor the developed size.
-        """
-        done = self._pictures.develop(view, measured)
-        path = self._masks.get(view)
-        if path is None:
-            return done
-        code = self.stored(view).orientation
-        return replace(done, mask=_fitted(path, done, INVERSE[code] if self.used_as_stored(view) else code))
+    Raises:
+        PolarguideError: the mask cannot be read, or is neither of the stored nor the developed size.
+    """
+    done = pictures.develop(view, measured)
+    if view not in pictures.masks:
+        return done
+    code = pictures.stored(view).orientation
+    code = INVERSE[code] if pictures.used_as_stored(view) else code
+    return replace(done, mask=_fitted(pictures.masks[view], done, code))
 
 
 def _fitted(path: Path, view: DevelopedView, code: int) -> NDArray[np.bool_]:
@@ -373,3 +319,84 @@ class StokesSource(Source):
         stokes, clipped = self._dataset.read_stokes(view)
         finite = np.asarray(np.isfinite(stokes).all(axis=(0, 3)))
         return np.where(finite[..., None], stokes, 0), finite, clipped
+
+
+# Pixels by which a mask is blurred to take the direction of its outline from its gradient.
+_BLUR = 2.0
+# Width of the band inside of the outline, as a share of the side of a square with the mask's area.
+_BAND = 0.06
+# Fewer pixels of a band tell nothing of a view.
+_LEAST = 50
+# Agreements differ by up to 1, where every pixel agrees in one sense and the outline has all directions. Noise, and
+# outlines that the body does not curve away at, agree with neither.
+_CLEAR = 0.2
+# Share of the views that have to tell the same.
+_MOST = 0.75
+
+
+@dataclass(frozen=True)
+class RimAgreement:
+    """How well the angles at the outline of one view's mask agree with the outline, if they count either way.
+
+    Attributes:
+        ccw, cw: means of cos 4(angle - direction), weighted by the degree of polarization: 1 where the light is
+            polarized across or along the outline everywhere, 0 without a relation.
+    """
+
+    ccw: float
+    cw: float
+
+
+def rim_agreement(
+    stokes: NDArray[np.float32], mask: NDArray[np.bool_], zero: float = 0.0
+) -> RimAgreement | None:
+    """Compare polarization and outline of a view; None where the mask has too little of an outline.
+
+    At the outline of a body that curves away, the surface normal lies in the picture, across the outline. Light from
+    inside the body is polarized along this normal, and light that is mirrored across it. Both agree with the outline if
+    the angles are counted as the outline is; mirrored ones agree with it only where it runs along the axes or the
+    diagonals.
+
+    Args:
+        stokes: [3, H, W, C], in the dataset's own sense.
+        mask: of the object, [H, W].
+        zero: where the angles begin, in radians counter-clockwise from the picture's horizontal.
+    """
+    area = int(mask.sum())
+    if area < _LEAST or mask.all():
+        return None
+    soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _BLUR)
+    across = cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)
+    depth = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    width = max(2.0 * _BLUR, _BAND * math.sqrt(area))
+    # Beside the border of the picture, the outline is that of the picture.
+    edge = math.ceil(2 * _BLUR)
+    inner = np.zeros_like(mask)
+    inner[edge:-edge, edge:-edge] = True
+    size = np.hypot(*across)
+    band = mask & inner & (depth <= width) & (size > 1e-3) & np.isfinite(stokes).all(axis=(0, 3))
+    if int(band.sum()) < _LEAST:
+        return None
+    outline: Any = np.arctan2(-across[1], across[0])[band]  # y down in the picture, angles up
+    s0, s1, s2 = stokes.mean(axis=3)[:, band].astype(np.float64)
+    weight = np.minimum(np.hypot(s1, s2) / np.maximum(s0, 1e-12), 1.0) * (s0 > 0)
+    total = float(weight.sum())
+    if not total > 0:
+        return None
+    angle = np.arctan2(s2, s1) / 2
+    ccw, cw = (
+        float((weight * np.cos(4 * (sign * angle + zero - outline))).sum()) / total for sign in (1, -1)
+    )
+    return RimAgreement(ccw, cw)
+
+
+def sense_of_rims(found: Sequence[RimAgreement]) -> Sense | None:
+    """The sense that the outlines of most views agree with clearly; None where they do not tell."""
+    if not found:
+        return None
+    gains = np.array([view.ccw - view.cw for view in found])
+    mean = float(gains.mean())
+    agreeing = float((np.sign(gains) == np.sign(mean)).mean())
+    if abs(mean) < _CLEAR or agreeing < _MOST:
+        return None
+    return "ccw" if mean > 0 else "cw"

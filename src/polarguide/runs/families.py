@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
@@ -21,16 +21,15 @@ from polarguide.fields.model import FieldModel
 from polarguide.fields.recipe import NeuralRecipe
 from polarguide.fields.trainer import FieldTrainer
 from polarguide.raster import Backend
-from polarguide.runs.folder import CHECKPOINT, PLY, AnyState
+from polarguide.runs.folder import CHECKPOINT, PLY
 from polarguide.runs.forecast import Forecast, MemoryPlan, forecast, plan_field_memory, plan_memory
 from polarguide.runs.health import Evidence, Polarization
 from polarguide.runs.model import GaussianModel, Model, write_run_ply
-from polarguide.shading.model import ShadingModel
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers, predicts_filters
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.distributed import Ranks
 from polarguide.training.recipe import Method, Recipe
-from polarguide.training.settings import ResolvedSettings, StepReport
+from polarguide.training.settings import ResolvedSettings
 from polarguide.training.trainer import warn_of_unused_materials
 from polarguide.training.view_store import ViewStore
 
@@ -126,38 +125,8 @@ def _name(names: dict[str, list[str]], judgment: Judgment) -> str:
     return names[judgment.view][judgment.number]
 
 
-class AnyTrainer(Protocol):
-    """The interface that the training loop uses; see ``training.angles.trainer.AngleTrainer``."""
-
-    scene: Scene
-    settings: ResolvedSettings
-    ranks: Ranks
-
-    @property
-    def whole(self) -> bool:
-        """Whether the state is one between two steps; an exception may leave it in the middle of a change."""
-
-    @property
-    def shading(self) -> ShadingModel:
-        """Which layers there are, and what light is learned."""
-
-    @property
-    def total(self) -> int:
-        """Steps in all, with those before it begins again."""
-
-    @property
-    def done(self) -> int:
-        """Those of them that are done."""
-
-    @property
-    def state(self) -> AnyState:
-        """Between two steps."""
-
-    def step(self) -> StepReport:
-        """One optimizer step."""
-
-    def exchange_statistics(self) -> None:
-        """Before a checkpoint: let every rank know what all have seen."""
+AnyTrainer = AngleTrainer | FieldTrainer
+"""The trainers that the training loop knows: what it asks of them, both have."""
 
 
 class Family(ABC):

@@ -12,8 +12,16 @@ from pathlib import Path
 import torch
 
 from polarguide.capture import Scene
-from polarguide.capture.layout import find_layout, select_views
-from polarguide.capture.memory import GIBIBYTE, KEPT, MASKS, READ, SHARE, stated_pixels
+from polarguide.capture.layout import (
+    GIBIBYTE,
+    KEPT,
+    MASKS,
+    READ,
+    SHARE,
+    find_layout,
+    select_views,
+    stated_pixels,
+)
 from polarguide.core.errors import PolarguideError
 from polarguide.core.system import (
     MEBIBYTE,

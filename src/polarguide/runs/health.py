@@ -284,8 +284,9 @@ def _look(
     psnr = None if bool(error.isnan()) else min(float(-10 * torch.log10(error)), HIGHEST_PSNR)
     burned = ~(result.final <= limit).all(dim=-1) & counted
     photograph, light = local.photograph().mean(dim=-1), result.final.mean(dim=-1)
-    lit = ~black_pixels(view).to(model.device)
-    bare = _inner(lit & counted) & (result.alpha < 0.5) & (light < photograph / 2)
+    unlit = black_pixels(view).to(model.device) | ~counted
+    inner = max_pool2d(unlit.float()[None], 3, stride=1, padding=1)[0] == 0  # edges are blended
+    bare = inner & (result.alpha < 0.5) & (light < photograph / 2)
     fog = None
     if near > 0:
         depth = torch.full_like(result.alpha, near)
@@ -321,11 +322,6 @@ def _beside(views: Sequence[View], psnr: Mapping[str, float | None]) -> dict[str
     return {
         view.name: median(values[place] for place in row) for view, row in zip(scored, nearest, strict=True)
     }
-
-
-def _inner(pixels: Tensor) -> Tensor:
-    """The pixels [H, W] whose neighbors are all among them: edges are blended."""
-    return max_pool2d((~pixels).float()[None], 3, stride=1, padding=1)[0] == 0
 
 
 def _share(pixels: Tensor) -> float:

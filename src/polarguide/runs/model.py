@@ -5,17 +5,20 @@ The PLY holds display values that ordinary 3DGS viewers show right, and our line
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from polarguide.capture.presentation import colored
+from polarguide.fields.model import FieldModel
+from polarguide.gaussians.gaussians import CORE_SHAPES
 from polarguide.gaussians.geometry import shortest_axis_normals
-from polarguide.gaussians.ply import refit_sh_to_display, write_ply
+from polarguide.gaussians.ply import refit_sh, write_ply
 from polarguide.geometry.camera import Camera
-from polarguide.optics.color import srgb_encode
+from polarguide.optics.color import srgb_encode, srgb_slope
 from polarguide.raster import Backend
 from polarguide.raster.magnification import as_trained
 from polarguide.raster.surface import alpha_in_front
@@ -23,54 +26,6 @@ from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.model import Light, Parameters, ShadingModel
 from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
 from polarguide.training.state import TrainingState
-
-
-class Model(Protocol):
-    """The interface of every kind of model: see ``GaussianModel`` and ``fields.model.FieldModel``."""
-
-    @property
-    def shading(self) -> ShadingModel:
-        """Which layers there are, and what light is learned."""
-
-    @property
-    def device(self) -> torch.device:
-        """Where layers are rendered."""
-
-    @property
-    def light(self) -> dict[str, Tensor]:
-        """Parameters of the learned light by name; empty where there is none."""
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """Names of the layers that it renders, in the order of ``LAYERS``; then ``POLARIZED`` where it predicts it."""
-
-    @property
-    def steps(self) -> int:
-        """How many steps it has been trained for."""
-
-    @property
-    def gaussians(self) -> int | None:
-        """How many Gaussians it has; None: it is made of something else."""
-
-    @property
-    def size(self) -> str:
-        """How large it is, for people."""
-
-    def render(
-        self, camera: Camera, *, normals: bool = True, depth: bool = False, surface: bool = False
-    ) -> RenderResult:
-        """All layers.
-
-        Args:
-            camera: any. normals: also where the model can do without them. depth: whether to render it.
-            surface: normals and depth are those of the surface at the pixel's median depth, see ``raster.surface``.
-        """
-
-    def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
-        """The Stokes vectors [3, H, W, 3] that a rendered picture predicts; None: it predicts none."""
-
-    def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Share of each pixel's alpha that lies nearer than a depth [H, W]."""
 
 
 def layers_of(shading: ShadingModel) -> tuple[str, ...]:
@@ -123,7 +78,12 @@ class GaussianModel:
     def render(
         self, camera: Camera, *, normals: bool = True, depth: bool = False, surface: bool = False
     ) -> RenderResult:
-        """All layers: see ``Model``."""
+        """All layers.
+
+        Args:
+            camera: any. normals: also where the model can do without them. depth: whether to render it.
+            surface: normals and depth are those of the surface at the pixel's median depth, see ``raster.surface``.
+        """
         return render(
             self.state.gaussians,
             camera,
@@ -150,6 +110,10 @@ class GaussianModel:
         return alpha_in_front(drawn, camera, depth, self.backend.rasterize)
 
 
+Model = GaussianModel | FieldModel
+"""What was trained: whatever scores, shows or examines a run asks either for the same."""
+
+
 @torch.no_grad()
 def gaussian_colors(gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor) -> Tensor:
     """Linear colors of every Gaussian toward viewing directions, reflections included.
@@ -165,10 +129,35 @@ def gaussian_colors(gaussians: Parameters, light: Light, shading: ShadingModel, 
 
 
 @torch.no_grad()
-def shown_colors(state: TrainingState, shading: ShadingModel, directions: Tensor) -> Tensor:
-    """``gaussian_colors`` of a training for display, [N, K, 3] in [0, 1]."""
-    linear = _toward(state.gaussians, state.light, shading, directions)
-    return torch.stack([srgb_encode(color.clamp(0, 1)) for color in linear], dim=1)
+def baked_harmonics(
+    gaussians: Parameters,
+    light: Light,
+    shading: ShadingModel,
+    *,
+    shown: Callable[[Tensor], Tensor],
+    linear: bool,
+) -> tuple[Tensor, Tensor]:
+    """Harmonics, as of ``refit_sh``, of ``gaussian_colors``.
+
+    Args:
+        gaussians, light, shading: of the run.
+        shown: what becomes of linear colors. linear: whether they are still linear then.
+    """
+    known = {
+        name: values
+        for name in (*CORE_SHAPES, *shading.parameters)
+        if (values := gaussians.get(name)) is not None
+    }
+    means = known["means"].detach()
+    normals = shortest_axis_normals(
+        means, known["quaternions"].detach(), known["log_scales"].detach(), means.new_zeros(3)
+    )
+
+    def colors(part: slice, directions: Tensor) -> Tensor:
+        some = {name: values.detach()[part] for name, values in known.items()}
+        return shown(gaussian_colors(some, light, shading, directions))
+
+    return refit_sh(colors, normals, srgb_slope if linear else None)
 
 
 def _toward(gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor) -> list[Tensor]:
@@ -206,13 +195,28 @@ def learned_normals(gaussians: Parameters, centers: Tensor | None) -> Tensor:
 
 @torch.no_grad()
 def write_run_ply(
-    path: Path, state: TrainingState, shading: ShadingModel, centers: Tensor | None = None
+    path: Path,
+    state: TrainingState,
+    shading: ShadingModel,
+    centers: Tensor | None = None,
+    *,
+    color: Tensor | None = None,
+    linear: bool = False,
 ) -> None:
-    """Write the trained Gaussians; see the module's text, and ``learned_normals`` for the centers of the cameras."""
+    """Write the trained Gaussians; see the module's text, and ``learned_normals`` for the centers of the cameras.
+
+    Args:
+        path: the file. state, shading: of the run. centers: [M, 3] of the cameras.
+        color: [3, 3] of a presentation; it holds for the harmonics that other programs show, never for our own fields.
+        linear: whether the harmonics are of linear colors, for readers that want them.
+    """
     gaussians = state.gaussians
-    dc, rest = refit_sh_to_display(
-        lambda directions: shown_colors(state, shading, directions).cpu(), len(gaussians)
-    )
+
+    def shown(colors: Tensor) -> Tensor:
+        colors = colored(colors, color).clamp(0, 1)
+        return colors if linear else srgb_encode(colors)
+
+    dc, rest = baked_harmonics(gaussians, state.light, shading, shown=shown, linear=linear)
     plain = {
         name: gaussians[name].detach().cpu()
         for name in ("means", "log_scales", "quaternions", "opacity_logits")

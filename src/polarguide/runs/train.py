@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -21,10 +20,10 @@ from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import check_out, make_folder
 from polarguide.core.options import PathLike, SceneOptions, SessionOptions
 from polarguide.core.progress import SILENT, Advance, Reporter
+from polarguide.core.records import first_difference
 from polarguide.core.system import MemoryBound, return_freed_memory
 from polarguide.raster import Backend, use_threads
 from polarguide.recipes import recipe_named
-from polarguide.runs.defaults import most_gaussians, resolve
 from polarguide.runs.families import AnyTrainer, Family, family_of
 from polarguide.runs.folder import (
     CHECKPOINT,
@@ -32,6 +31,8 @@ from polarguide.runs.folder import (
     RunConfiguration,
     RunLog,
     load_checkpoint,
+    most_gaussians,
+    resolve,
     save_checkpoint,
     writing_to,
 )
@@ -378,17 +379,6 @@ def _check_scene(scene: Scene) -> None:
         warnings.warn(fault, PolarguideWarning, stacklevel=2)
 
 
-def _first_difference(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
-    """Where two records differ first, as ``recipe_data.metal_rules.begin``, and both values (None: not recorded)."""
-    if isinstance(a, dict) and isinstance(b, dict):
-        key = next(key for key in {**a, **b} if a.get(key) != b.get(key))
-        return _first_difference(f"{name}.{key}", a.get(key), b.get(key))
-    if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
-        place = next(place for place, (x, y) in enumerate(zip(a, b, strict=True)) if x != y)
-        return _first_difference(f"{name}.{place}", a[place], b[place])
-    return name, a, b
-
-
 def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:
     if old.settings.background == "auto":  # as the first versions recorded it
         old = replace(old, settings=replace(old.settings, background=new.settings.background))
@@ -404,7 +394,7 @@ def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None
     for field in sorted(old.__annotations__.keys() - {"scene", "device"}):
         a, b = getattr(old, field), getattr(new, field)
         if a != b and a is not None:
-            name, a, b = _first_difference(field, a, b)
+            name, a, b = first_difference(field, a, b)
             raise PolarguideError(
                 f"{out}/{CONFIGURATION} ({name})",
                 expected="none recorded" if a is None else json.dumps(a, default=str)[:120],

@@ -5,15 +5,11 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from numpy.typing import NDArray
-
-from polarguide.capture.exposures import TABLE, Angle
+from polarguide.capture.exposures import TABLE
 from polarguide.capture.filter import shots as filter_shots
-from polarguide.capture.filter.names import covers_turn
 from polarguide.capture.layout import (
     Layout,
     angle_folders,
@@ -27,9 +23,8 @@ from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
 from polarguide.core.errors import PolarguideError
 from polarguide.shots import sets
-from polarguide.shots.options import Kind, ShotOptions
-from polarguide.shots.sets import known_places
-from polarguide.shots.video import VIDEO_SUFFIXES
+from polarguide.shots.options import ShotOptions
+from polarguide.shots.sets import VIDEO_SUFFIXES, ExposureSet, known_places
 
 _EXPECTED = "raw mosaics with --sensor, or shots with angles in their names"
 _REMEDY = (
@@ -37,62 +32,6 @@ _REMEDY = (
     "(<shot>_0, _45, _90 and _135; at others <shot>_a10, _a40, ...), folders 0, 45, 90 and 135, or angles.csv with the "
     "columns file,angle."
 )
-
-
-@dataclass(frozen=True)
-class ExposureSet:
-    """The files of one shot.
-
-    Attributes:
-        name: unique among the sets that were found together; usable in a file name.
-        kind: mosaic (one file), filter (one file at 0, 45, 90 and 135 degrees each), set (pictures at any angles) or
-            scene (a view of a scene folder).
-        files: by angle; a mosaic's under 0, none of a set. Angles may be missing: ``read_shot`` says so.
-        root: folder of the scene; else None.
-        view: its name in the scene.
-        fault: why it is no shot: ``read_shot`` raises it, and the shots beside it are not concerned.
-        others: where there is a fault, files that ``files`` has no place for; or the folder that it is in. Of a view of
-            a scene, its pictures where they are not the usual four.
-        pictures: of a set, by angle.
-        table: that states their angles; None where names do.
-        stored: the pictures of a shot in memory, which has no files: [H, W] of a mosaic, else [K, H, W, 3].
-        angles: theirs, as the user counts them; none of a mosaic.
-    """
-
-    name: str
-    kind: Kind
-    files: dict[int, Path]
-    root: Path | None = None
-    view: str = ""
-    fault: PolarguideError | None = None
-    others: tuple[Path, ...] = ()
-    pictures: tuple[sets.SetPicture, ...] = ()
-    table: Path | None = None
-    stored: NDArray[Any] | None = None
-    angles: tuple[Angle, ...] = ()
-
-    @property
-    def paths(self) -> tuple[Path, ...]:
-        """The files, by angle, and the table of a set; at least one, or none of a shot in memory."""
-        of_set = dict.fromkeys(picture.path for picture in self.pictures)
-        more = [] if self.table is None else [self.table]
-        return (*(path for _, path in sorted(self.files.items())), *of_set, *more, *self.others)
-
-    @property
-    def where(self) -> Path | str:
-        """What messages call it: its first file, or its name."""
-        return self.paths[0] if self.paths else self.name
-
-    @property
-    def whole(self) -> bool:
-        """Whether no more pictures of a set are expected: a table lists them, or they cover half a turn evenly."""
-        angles = [picture.angle for picture in self.pictures if not isinstance(picture.angle, str)]
-        return self.table is not None or covers_turn([angle % 180 for angle in angles])
-
-    @property
-    def nothing(self) -> bool:
-        """Whether there is no shot, but only a fault."""
-        return self.fault is not None and not (self.files or self.pictures)
 
 
 def find_shots(
@@ -164,14 +103,14 @@ def mosaics(files: Sequence[Path]) -> list[ExposureSet]:
 def _of_files(files: list[Path], options: ShotOptions) -> list[ExposureSet]:
     if options.sensor is not None:
         return mosaics(files)
-    found = [_of_set(one) for one in sets.videos(files)]
+    found = sets.videos(files)
     files = [path for path in files if path.suffix.lower() not in VIDEO_SUFFIXES]
     for folder in dict.fromkeys(path.parent for path in files if (path.parent / TABLE).is_file()):
         inside = {path.resolve() for path in files if path.parent == folder}
         for one in sets.by_table(folder)[0]:
-            listed = {picture.path.resolve() for picture in one.pictures}
+            listed = {path.resolve() for path in one.paths if path != one.table}
             if listed & inside:
-                found.append(_of_set(one))
+                found.append(one)
             inside -= listed
         files = [path for path in files if path.parent != folder or path.resolve() in inside]
     by_root: dict[Path, filter_shots.Candidates] = {}
@@ -192,17 +131,7 @@ def _by_names(files: Sequence[Path]) -> list[ExposureSet]:
     """The sets, the shots of four and the strangers among files, by their names."""
     found, rest = sets.by_name(files)
     by_name, others = filter_shots.group_files(rest)
-    return [*map(_of_set, found), *_filter_sets(by_name), *_strangers(others)]
-
-
-def _of_set(found: sets.PictureSet) -> ExposureSet:
-    """A set of pictures; one picture each at 0, 45, 90 and 135 degrees are a shot of four."""
-    if found.is_four and found.fault is None:
-        files = {int(p.angle): p.path for p in found.pictures if not isinstance(p.angle, str)}
-        return ExposureSet(found.name, "filter", files, table=found.table)
-    return ExposureSet(
-        found.name, "set", {}, fault=found.fault, pictures=found.pictures, table=found.table
-    )  # fmt: skip
+    return [*found, *_filter_sets(by_name), *_strangers(others)]
 
 
 def _filter_sets(shots: filter_shots.Candidates) -> list[ExposureSet]:
@@ -266,14 +195,14 @@ def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
         files = list_files(root, RAW_SUFFIXES)
         dark = None if options.dark_frame is None else os.path.realpath(options.dark_frame)
         return mosaics([path for path in files if os.path.realpath(path) != dark])
-    found = [_of_set(one) for one in sets.videos(list_files(root, VIDEO_SUFFIXES))]
+    found = sets.videos(list_files(root, VIDEO_SUFFIXES))
     if (root / TABLE).is_file():
         listed, others = sets.by_table(root)
-        return [*found, *map(_of_set, listed), *_strangers(others)]
+        return [*found, *listed, *_strangers(others)]
     files = list_files(root, filter_shots.SHOT_SUFFIXES)
     in_folders = [] if files else sets.by_folder(root)
     if in_folders:
-        return [*found, *map(_of_set, in_folders)]
+        return [*found, *in_folders]
     if not angle_folders(root):
         return found + _by_names(files)
     shots, _ = filter_shots.list_shots(root)

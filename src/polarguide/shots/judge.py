@@ -79,7 +79,12 @@ def judge(samples: SetSamples, gray: Floats) -> Judgment:
     reasons: dict[int, str] = {}
     while gray.shape[1] >= _FEWEST:
         found = {k: _predicted(rows, gray, used, k) for k in np.flatnonzero(used).tolist()}
-        worst = next((k for k in _worst(samples, found) if _contradicts(samples, gray, used, k, found)), None)
+        # The picture without which least is left of the rest, and the one whose angle is off most.
+        doubtful = (
+            max(found, key=lambda k: found[k].residual),
+            max(found, key=lambda k: _off(samples, k, found[k])),
+        )
+        worst = next((k for k in doubtful if _contradicts(samples, gray, used, k, found)), None)
         if worst is None:
             break
         used[worst], reasons[worst] = False, _reason(samples, worst, found[worst])
@@ -94,10 +99,6 @@ def judge(samples: SetSamples, gray: Floats) -> Judgment:
     return Judgment(fits, used, tuple(notes))
 
 
-def _determined(rows: Floats) -> bool:
-    return conditioning(torch.from_numpy(2 * rows[:, 1:])) >= WELL_CONDITIONED
-
-
 def _apart(angle: float, other: float) -> float:
     """Difference of two angles in degrees modulo 180, in [-90, 90)."""
     return (angle - other + 90.0) % 180.0 - 90.0
@@ -110,19 +111,13 @@ def _off(samples: SetSamples, k: int, found: _Angle) -> float:
     return abs(_apart(math.degrees(found.angle), samples.exposures[k].angle or 0.0))
 
 
-def _worst(samples: SetSamples, found: dict[int, _Angle]) -> tuple[int, int]:
-    """The picture without which least is left of the rest, and the one whose angle is off most."""
-    by_angle = max(found, key=lambda k: _off(samples, k, found[k]))
-    return max(found, key=lambda k: found[k].residual), by_angle
-
-
 def _contradicts(
     samples: SetSamples, gray: Floats, used: NDArray[np.bool_], worst: int, found: dict[int, _Angle]
 ) -> bool:
     """Whether the others agree with one another far better than a picture does with them, by angle or residual."""
     rows, rest = samples.rows.astype(np.float64), used.copy()
     rest[worst] = False
-    if rest.sum() < 4 or not _determined(rows[rest]):
+    if rest.sum() < 4 or conditioning(torch.from_numpy(2 * rows[rest, 1:])) < WELL_CONDITIONED:
         return False
     others = {k: _predicted(rows, gray, rest, k) for k in np.flatnonzero(rest).tolist()}
     typical = float(np.median([_off(samples, k, other) for k, other in others.items()]))

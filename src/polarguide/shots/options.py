@@ -1,4 +1,4 @@
-"""How shots are read. Nothing here imports torch or OpenCV."""
+"""How shots are read, what is measured of them, and how a folder is watched. Nothing here imports torch or OpenCV."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import tyro
 from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, checked
-from polarguide.capture.sensor.pattern import Packing, SensorName
+from polarguide.capture.sensor.pattern import MosaicOptions, Positive, SensorName
 from polarguide.core.errors import PolarguideError
+from polarguide.core.options import check_finite
 from polarguide.core.records import check_options, option_name
 from polarguide.preparation.settings import PrepareSettings
 
@@ -45,25 +46,17 @@ _OWNERS: dict[str, tuple[Kind, ...]] = {
 }  # fmt: skip
 """Options that mean something for some kinds of shots only."""
 _OPTION_OF = {"analyzers": "--calibration (of polarguide calibrate)", "align": "--no-align"}
-_NotNegative = Annotated[int, Meta(ge=0, le=1 << 20)]
-_Positive = Annotated[int, Meta(ge=1, le=1 << 31)]
 
 
 @dataclass(frozen=True)
-class ShotOptions:
+class ShotOptions(MosaicOptions):
     """How the files of a shot become intensities, and from when on a pixel counts.
 
     Attributes:
         sensor: Sensor of raw mosaics: IMX250MYR and IMX264MYR are color, IMX250MZR is monochrome. Without it files are
             shots through a filter.
-        packing: Packing of .raw files (there are several of 10 and of 12 bits; never guessed).
-        width: Width of .raw files in pixels; others must have it, too.
-        height: Height of .raw files in pixels.
         bits: Bits of a value in 16-bit files; without it 16 for shots through a filter, for mosaics 12 if no value
             exceeds 4095, else 16.
-        offset_x: Column of the sensor at which the region of interest starts.
-        offset_y: Row of the sensor at which it starts.
-        black_level: Stored value without light.
         dark_frame: Picture with the lens covered, subtracted in place of the black level.
         saturation: Stored value from which the sensor saturates; without it that at which samples pile up, or full
             scale.
@@ -83,15 +76,9 @@ class ShotOptions:
     """
 
     sensor: SensorName | None = None
-    packing: Packing | None = None
-    width: _Positive | None = None
-    height: _Positive | None = None
     bits: Annotated[int, Meta(ge=8, le=16)] | None = None
-    offset_x: _NotNegative = 0
-    offset_y: _NotNegative = 0
-    black_level: Annotated[float, Meta(ge=0)] = 0.0
     dark_frame: Path | None = None
-    saturation: _Positive | None = None
+    saturation: Positive | None = None
     gamma: Annotated[float, Meta(ge=0.1, le=4.0)] = 1.0
     flip: Literal["none", "x", "y", "xy"] = "none"
     demosaic: Literal["half", "quarter", "full"] = "full"
@@ -171,3 +158,48 @@ def _changed(options: Any) -> list[str]:
     """Names of the fields of a dataclass that are not as they are by default."""
     default = type(options)()
     return [f.name for f in fields(options) if getattr(options, f.name) != getattr(default, f.name)]
+
+
+@dataclass(frozen=True)
+class MeasureOptions:
+    """What is measured, and what it has to be.
+
+    Attributes:
+        roi: Region x,y,width,height in pixels of the maps, or the corners of a polygon, x,y;x,y;x,y (in quotes), each
+            also as name=...; repeat it for several. Without any, the whole picture is one.
+        limits: JSON file with a bound per field; shots beyond make the exit status 3 and are drawn.
+        reference: A golden part from the same camera at the same place: difference maps and their figures.
+        threshold: DoLP over which pixels count in dolp_share.
+        overwrite: Begin a new table where the folder has one that was measured with other options.
+    """
+
+    roi: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    limits: Path | None = None
+    reference: Path | None = None
+    threshold: float = 0.05
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        check_finite("threshold", self.threshold, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class WatchOptions:
+    """How a folder is watched.
+
+    Attributes:
+        watch: Folder to work on as files come, until Ctrl-C; each once, also after a restart with the same --out.
+        settle: Seconds for which a file must not have changed.
+        patience: Seconds without a change after which a file that is still not complete counts as unread.
+        idle: Stop after so many seconds in which nothing came; 0 waits for ever.
+    """
+
+    watch: Path | None = None
+    settle: float = 1.0
+    patience: float = 60.0
+    idle: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_finite("settle", self.settle, 0.0, 3600.0)
+        check_finite("patience", self.patience, 0.0, 1e6)
+        check_finite("idle", self.idle, 0.0, 1e9)

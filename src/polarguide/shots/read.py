@@ -1,4 +1,4 @@
-"""``read_shot``: the maps of one exposure set."""
+"""``read_shot``: the maps of one exposure set, of files or of arrays in memory."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any, TypeGuard
 
 import numpy as np
 import torch
@@ -14,21 +15,20 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture.colmap.model import fit_camera, read_model
-from polarguide.capture.exposures import FOUR, Angle
-from polarguide.capture.given_arrays import Array
+from polarguide.capture.exposures import FOUR, Angle, normalized
+from polarguide.capture.given_arrays import Array, as_numpy, exposures_of, kind_of, stored_pictures
 from polarguide.capture.view import ANGLES, View
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import check_finite, index_of
-from polarguide.core.text import decimal
+from polarguide.core.text import decimals
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
 from polarguide.shots.develop import develop, develop_view, samples_of, set_samples
-from polarguide.shots.developed import Developed, Part
-from polarguide.shots.exposures import ExposureSet, find_shots
+from polarguide.shots.exposures import find_shots
 from polarguide.shots.fit import DARK_SNR, maps_of_set
-from polarguide.shots.given import array_shot, is_array, stacked_array
-from polarguide.shots.maps import Map, Reason, ShotMaps
+from polarguide.shots.maps import Developed, Map, Part, Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
+from polarguide.shots.sets import ExposureSet, require_determined
 
 UNREADABLE = (PolarguideError, OSError, MemoryError)
 """What one bad file may raise; others come after it."""
@@ -202,23 +202,17 @@ def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
     Raises:
         PolarguideError: it is something else.
     """
-    try:
-        fx, fy, cx, cy = (decimal(part) for part in text.split(","))
-        # A center may lie outside of a cut picture; beyond these bounds it is a slip.
-        centered = all(abs(c - n / 2) <= 10 * n for c, n in zip((cx, cy), size, strict=True))
-        known = centered and all(0 < f <= 1e6 for f in (fx, fy))
-    except ValueError:
-        known = False
-    if not known:
+    numbers = decimals(text)
+    # A center may lie outside of a cut picture; beyond these bounds it is a slip.
+    centered = all(abs(c - n / 2) <= 10 * n for c, n in zip(numbers[2:], size, strict=False))
+    if len(numbers) != 4 or not centered or not all(0 < f <= 1e6 for f in numbers[:2]):
         raise PolarguideError(
             "--intrinsics",
             expected="fx,fy,cx,cy in pixels of the developed picture",
             found=repr(text),
             remedy="Correct the value; the center of the first pixel is at 0.5.",
         )
-    return Camera(
-        *size, fx, fy, cx, cy, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    )
+    return Camera(*size, *numbers, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
 
 
 def camera_of(shot: ExposureSet, size: tuple[int, int], intrinsics: str | None) -> Camera | None:
@@ -319,3 +313,92 @@ def _chosen_normal(
     axes = zip(*(v.unbind(-1) for v in (x_ref, up_ref, rays)), strict=True)
     # Component by component in memory, as all that follows reads them.
     return zeniths, torch.stack([x * a + y * b - cosine_z * ray for a, b, ray in axes]).movedim(0, -1)
+
+
+NAME = "array"
+"""What a shot in memory is called where nothing else is said."""
+_MOSAIC = "a mosaic [H, W] of uint8 or uint16, as --sensor (ShotOptions.sensor) says"
+
+
+def array_shot(
+    array: Array, options: ShotOptions, angles: Sequence[Angle] = ANGLES, name: str = NAME
+) -> ExposureSet:
+    """A shot in memory.
+
+    Args:
+        array: with a sensor, a raw mosaic [H, W] of uint8 or uint16; else pictures through a filter, [K, H, W] gray or
+            [K, H, W, 3] RGB: uint8 or uint16 as stored, or linear floats from 0 to 1. It is not written to.
+        options: how it is read. name: of the shot.
+        angles: of the K pictures in degrees, counter-clockwise as displayed.
+
+    Raises:
+        PolarguideError: shape, type or angles do not fit; its ``where`` is the name.
+    """
+    values = as_numpy(array)
+    if options.sensor is not None:
+        return ExposureSet(name, "mosaic", {}, stored=_mosaic(values, options, name))
+    if values.ndim == 2:
+        remedy = (
+            "Name the sensor of a mosaic: ShotOptions(sensor=...); stack the pictures of a filter, [K, H, W]."
+        )
+        expected = "pictures [K, H, W] or [K, H, W, 3] through a filter, or a sensor of the mosaic"
+        raise PolarguideError(name, expected=expected, found=kind_of(values), remedy=remedy)
+    if np.issubdtype(values.dtype, np.floating) and options.transfer == "srgb":
+        raise PolarguideError(
+            name,
+            expected="whole numbers, which srgb decodes",
+            found=kind_of(values),
+            remedy="Floats are linear.",
+        )
+    stored = stored_pictures(values, name)
+    exposures_of(angles, len(stored), f"{name} (angles)")
+    known = [angle if isinstance(angle, str) else normalized(float(angle)) for angle in angles]
+    if sorted(map(str, known)) == sorted(str(float(angle)) for angle in ANGLES):
+        order = [known.index(float(angle)) for angle in ANGLES]
+        return ExposureSet(name, "filter", {}, stored=stored[order], angles=tuple(map(float, ANGLES)))
+    require_determined(f"{name} (angles)", known)
+    return ExposureSet(name, "set", {}, stored=stored, angles=tuple(known))
+
+
+def is_array(shot: object) -> TypeGuard[Array | Sequence[Array]]:
+    """Whether something is an array, or a list of them."""
+    first = shot[0] if isinstance(shot, list | tuple) and shot else shot
+    return isinstance(first, np.ndarray | Tensor)
+
+
+def stacked_array(shot: Array | Sequence[Array], name: str = NAME) -> Array:
+    """The array itself, or one of a list of pictures.
+
+    Raises:
+        PolarguideError: the pictures of the list have several shapes or types.
+    """
+    if not isinstance(shot, list | tuple):
+        return shot  # type: ignore[return-value]
+    pictures = [as_numpy(picture) for picture in shot]
+    kinds = list(dict.fromkeys(map(kind_of, pictures)))
+    if len(kinds) > 1:
+        remedy = "Export the pictures of a shot alike."
+        raise PolarguideError(
+            name, expected="pictures of one shape and type", found=" and ".join(kinds), remedy=remedy
+        )
+    return np.stack(pictures)
+
+
+def _mosaic(values: NDArray[Any], options: ShotOptions, name: str) -> NDArray[Any]:
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[..., 0]
+    if values.ndim != 2 or values.dtype not in (np.uint8, np.uint16) or 0 in values.shape:
+        remedy = (
+            "Give what the sensor delivers, before any demosaicing; without a sensor, pictures [K, H, W]."
+        )
+        raise PolarguideError(name, expected=_MOSAIC, found=kind_of(values), remedy=remedy)
+    found = values.shape[1], values.shape[0]
+    wanted = options.width or found[0], options.height or found[1]
+    if found != wanted:
+        raise PolarguideError(
+            name,
+            expected=f"{wanted[0]}x{wanted[1]} pixels, as width and height say",
+            found=f"{found[0]}x{found[1]}",
+            remedy="Leave the two out: an array knows its size.",
+        )
+    return np.ascontiguousarray(values)

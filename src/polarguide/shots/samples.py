@@ -4,29 +4,29 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from polarguide.capture.calibration import ANGLES, Calibration
 from polarguide.capture.exposures import Angle, Exposure, analyzers, nominal, turned
+from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
 from polarguide.capture.filter.develop import kind_of_file, require_known_encoding, transfer_of_kind
-from polarguide.capture.filter.exif import apply_orientation, orientation_calibration
 from polarguide.capture.filter.shots import Shots, read_stack, stacked
 from polarguide.capture.formats.pictures import linear_codes, rescaled
-from polarguide.capture.memory import require_memory
+from polarguide.capture.layout import require_memory
 from polarguide.capture.sensor.pattern import FULL_16, Levels, clipping_bits, estimate_levels
 from polarguide.capture.view import FULL_CODE, View
 from polarguide.capture.view_reader import ViewData, require_alike
 from polarguide.core.errors import PolarguideError
 from polarguide.preparation.shot_exposures import corrected_note, stated_exposures
 from polarguide.shots.options import ShotOptions
-from polarguide.shots.sets import SetPicture, known_places
-from polarguide.shots.video import read_frames
+from polarguide.shots.sets import SetPicture, known_places, read_frames
 
 Mask = NDArray[np.bool_]
 # Compression smears the edge of clipped areas over a few values.
@@ -104,12 +104,12 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
     values: NDArray[Any] | None = None
     lost: NDArray[Any] | None = None
     dark: Mask | None = None
-    code, step, gray, kind = 1, 0.0, True, np.dtype(np.uint16)
+    code, gray, kind = 1, True, np.dtype(np.uint16)
     for place, shot in enumerate(_read_each(pictures)):
         stored = shot.pictures[0]
         gray = gray and bool((stored[..., :1] == stored).all())
         if values is None or lost is None or dark is None:
-            code, step = shot.orientation, 1 / float(np.iinfo(stored.dtype).max)
+            code = shot.orientation
             needed = (count * (2 * (1 if gray else 3) + 1) + _FITTED) * stored[..., 0].size
             remedy = "Make the pictures smaller, all by the same factor."
             require_memory(pictures[0].path, needed, f"{count} pictures of {name}", remedy=remedy)
@@ -125,10 +125,10 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
     assert lost is not None
     assert dark is not None
     gains, words = _gains(pictures)
-    read = _Stored(values, lost, dark, kind, step, code)
+    read = Shots(values, code, lost, dark)
     angles = [_degrees(picture.angle) for picture in pictures]
     labels = tuple(picture.label for picture in pictures)
-    found = _samples(read, labels, angles, gains, transfer, options)
+    found = _samples(read, kind, labels, angles, gains, transfer, options)
     return replace(found, notes=(note, *found.notes, *words, *_unused(unused)))
 
 
@@ -145,51 +145,28 @@ def samples_of_arrays(
     shots = stacked(stored[places])
     gray = bool((shots.pictures[..., :1] == shots.pictures).all())
     values = shots.pictures[..., :1] if gray else shots.pictures
-    read = _Stored(
-        values.astype(np.uint16),
-        shots.clipped.copy(),
-        shots.dark,
-        stored.dtype,
-        1 / float(np.iinfo(stored.dtype).max),
-        1,
-    )
+    read = replace(shots, pictures=values.astype(np.uint16), clipped=shots.clipped.copy())
     transfer = "linear" if options.transfer == "auto" else options.transfer
     labels = tuple(f"picture {k + 1}" for k in places)
     known = [_degrees(angles[k]) for k in places]
-    found = _samples(read, labels, known, [1.0] * len(places), transfer, options)
+    found = _samples(read, stored.dtype, labels, known, [1.0] * len(places), transfer, options)
     note = f"Transfer {transfer}, {'as arrays are' if options.transfer == 'auto' else 'as given'}."
     return replace(found, notes=(note, *found.notes, *_unused(len(angles) - len(places))))
 
 
-@dataclass(frozen=True, eq=False)
-class _Stored:
-    """Pictures of a set as stored.
-
-    Attributes:
-        values: [K, H, W, C] uint16. lost: [K, H, W]. dark: [H, W].
-        kind: of the files' values. step: one of them as a share of full scale. code: EXIF orientation.
-    """
-
-    values: NDArray[Any]
-    lost: Mask
-    dark: Mask
-    kind: np.dtype[Any]
-    step: float
-    code: int
-
-
 def _samples(
-    read: _Stored,
+    read: Shots,
+    kind: np.dtype[Any],
     labels: tuple[str, ...],
     angles: Sequence[float],
     gains: Sequence[float],
     transfer: str,
     options: ShotOptions,
 ) -> SetSamples:
-    """Linear samples of stored ones, upright; ``read`` is used up."""
-    values, lost, dark, kind, step, code = (getattr(read, f.name) for f in fields(read))
+    """Linear samples of stored ones, upright; ``read`` is used up: uint16, whatever ``kind`` the values have."""
+    values, lost, dark, code = read.pictures, read.clipped, read.dark, read.orientation
     levels, said = levels_of_shot(values, 8 * kind.itemsize, options)
-    every = np.arange(np.iinfo(kind).max + 1, dtype=kind)
+    every, step = np.arange(np.iinfo(kind).max + 1, dtype=kind), 1 / float(np.iinfo(kind).max)
     if levels is not None:
         every, step = rescaled(every, levels.white), 1 / levels.white
     linear = linear_codes(every, transfer)
@@ -357,6 +334,15 @@ def samples_of_view(data: ViewData, full: int | None, options: ShotOptions) -> S
     )
 
 
+def behind_lens(view: View, intensities: Tensor, exposures: Sequence[Exposure]) -> Tensor:
+    """Intensities of a view [K, H, W, C] at some exposures, as polarizers behind the lens would have measured them."""
+    if view.mount == "sensor":
+        return intensities
+    rays = view.camera.rays()
+    more = analyzers(exposures, rays, "sensor")[..., None, None] - analyzers(exposures, rays, "filter")
+    return intensities + torch.einsum("ksyx,syxc->kyxc", more, view.stokes()[1:]) / 2
+
+
 def samples_of_loaded(view: View, dark: Mask, saturated: Mask, step: float) -> SetSamples:
     """The samples of a view as loaded: with its mask, its exposures, and rays through a filter before the lens.
 
@@ -365,11 +351,7 @@ def samples_of_loaded(view: View, dark: Mask, saturated: Mask, step: float) -> S
     """
     places = known_places(view.name, view.exposures)
     exposures = [replace(view.exposures[k], gain=1.0) for k in places]
-    intensities = view.intensities()[places]
-    if view.mount == "filter":  # what a polarizer behind the lens would have measured
-        rays, stokes = view.camera.rays(), view.stokes()
-        more = analyzers(exposures, rays, "sensor")[..., None, None] - analyzers(exposures, rays, "filter")
-        intensities = intensities + torch.einsum("ksyx,syxc->kyxc", more, stokes[1:]) / 2
+    intensities = behind_lens(view, view.intensities()[places], exposures)
     invalid = view.invalid.numpy()
     return SetSamples(
         labels=tuple(f"picture {k + 1}" for k in places),

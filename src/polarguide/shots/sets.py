@@ -2,28 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from polarguide.capture.exposures import (
+    FEWEST,
+    LARGEST,
     TABLE,
     WELL_CONDITIONED,
     Angle,
     Exposure,
     Line,
     angle_text,
+    angles_of_names,
     conditioning,
+    covers_turn,
     nominal,
     normalized,
+    parse_angle,
+    read_rows,
     read_table,
 )
-from polarguide.capture.filter.names import FEWEST, angles_of_names
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, group_files
 from polarguide.capture.layout import ambiguous, list_files
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
-from polarguide.shots.video import VIDEO_SUFFIXES, frame_table, read_frame_table
+from polarguide.core.files import require_file
+from polarguide.core.records import shortened
+from polarguide.shots.options import Kind
 
 
 @dataclass(frozen=True)
@@ -49,26 +61,59 @@ class SetPicture:
 
 
 @dataclass(frozen=True)
-class PictureSet:
-    """Pictures of one view at known angles.
+class ExposureSet:
+    """The files of one shot.
 
     Attributes:
-        name: of the view.
-        pictures: sorted by angle.
-        table: that states the angles, if one does.
-        fault: why nothing can be measured with them.
+        name: unique among the sets that were found together; usable in a file name.
+        kind: mosaic (one file), filter (one file at 0, 45, 90 and 135 degrees each), set (pictures at any angles) or
+            scene (a view of a scene folder).
+        files: by angle; a mosaic's under 0, none of a set. Angles may be missing: ``read_shot`` says so.
+        root: folder of the scene; else None.
+        view: its name in the scene.
+        fault: why it is no shot: ``read_shot`` raises it, and the shots beside it are not concerned.
+        others: where there is a fault, files that ``files`` has no place for; or the folder that it is in. Of a view of
+            a scene, its pictures where they are not the usual four.
+        pictures: of a set, by angle.
+        table: that states their angles; None where names do.
+        stored: the pictures of a shot in memory, which has no files: [H, W] of a mosaic, else [K, H, W, 3].
+        angles: theirs, as the user counts them; none of a mosaic.
     """
 
     name: str
-    pictures: tuple[SetPicture, ...]
-    table: Path | None = None
+    kind: Kind
+    files: dict[int, Path]
+    root: Path | None = None
+    view: str = ""
     fault: PolarguideError | None = None
+    others: tuple[Path, ...] = ()
+    pictures: tuple[SetPicture, ...] = ()
+    table: Path | None = None
+    stored: NDArray[Any] | None = None
+    angles: tuple[Angle, ...] = ()
 
     @property
-    def is_four(self) -> bool:
-        """Whether it is one picture each at 0, 45, 90 and 135 degrees, as the four-angle path takes them."""
-        plain = all(p.gain is None and p.frame is None for p in self.pictures)
-        return plain and sorted(str(p.angle) for p in self.pictures) == sorted(str(float(a)) for a in ANGLES)
+    def paths(self) -> tuple[Path, ...]:
+        """The files, by angle, and the table of a set; at least one, or none of a shot in memory."""
+        of_set = dict.fromkeys(picture.path for picture in self.pictures)
+        more = [] if self.table is None else [self.table]
+        return (*(path for _, path in sorted(self.files.items())), *of_set, *more, *self.others)
+
+    @property
+    def where(self) -> Path | str:
+        """What messages call it: its first file, or its name."""
+        return self.paths[0] if self.paths else self.name
+
+    @property
+    def whole(self) -> bool:
+        """Whether no more pictures of a set are expected: a table lists them, or they cover half a turn evenly."""
+        angles = [picture.angle for picture in self.pictures if not isinstance(picture.angle, str)]
+        return self.table is not None or covers_turn([angle % 180 for angle in angles])
+
+    @property
+    def nothing(self) -> bool:
+        """Whether there is no shot, but only a fault."""
+        return self.fault is not None and not (self.files or self.pictures)
 
 
 def require_determined(where: object, angles: Sequence[Angle]) -> None:
@@ -115,15 +160,21 @@ def _made(
     pictures: Iterable[SetPicture],
     table: Path | None = None,
     fault: PolarguideError | None = None,
-) -> PictureSet:
-    """A set with its pictures in order, and its fault if its angles determine nothing."""
+) -> ExposureSet:
+    """A set with its pictures in order, and its fault if its angles determine nothing.
+
+    One picture each at 0, 45, 90 and 135 degrees, without gains, are a shot of four.
+    """
     mine = tuple(sorted(pictures, key=_order))
     if fault is None:
         try:
             require_determined(f"{(table or mine[0].path.parent)} ({name})", [p.angle for p in mine])
         except PolarguideError as error:
             fault = error
-    return PictureSet(name, mine, table, fault)
+    four = {int(p.angle): p.path for p in mine if p.angle in ANGLES and p.gain is None and p.frame is None}
+    if fault is None and len(four) == len(mine) == len(ANGLES):
+        return ExposureSet(name, "filter", four, table=table)
+    return ExposureSet(name, "set", {}, fault=fault, pictures=mine, table=table)
 
 
 def _order(picture: SetPicture) -> tuple[bool, float, str, int]:
@@ -132,12 +183,12 @@ def _order(picture: SetPicture) -> tuple[bool, float, str, int]:
     return word, angle, picture.path.name, picture.frame or 0
 
 
-def by_name(files: Sequence[Path]) -> tuple[list[PictureSet], list[Path]]:
+def by_name(files: Sequence[Path]) -> tuple[list[ExposureSet], list[Path]]:
     """Sets by the names of files, and the files that are none of a set: of four angles at most, or without an angle.
 
     Files named like angles alone are one set, called like their folder, where there is nothing else among the files.
     """
-    sets: list[PictureSet] = []
+    sets: list[ExposureSet] = []
     rest: list[Path] = []
     for folder in dict.fromkeys(path.parent for path in files):
         inside = [path for path in files if path.parent == folder]
@@ -155,7 +206,7 @@ def by_name(files: Sequence[Path]) -> tuple[list[PictureSet], list[Path]]:
     return sets, rest
 
 
-def by_folder(root: Path) -> list[PictureSet]:
+def by_folder(root: Path) -> list[ExposureSet]:
     """Sets by folders named like angles, a file of each view in each; nothing where these are four at most."""
     folders = [path for path in sorted(root.iterdir()) if path.is_dir() and not path.name.startswith(".")]
     stated = angles_of_names([path.name for path in folders], folders=True)
@@ -169,7 +220,7 @@ def by_folder(root: Path) -> list[PictureSet]:
     return [_named_set(root, view, mine) for view, mine in sorted(views.items())]
 
 
-def _any_angles(folder: Path, views: dict[str, list[SetPicture]]) -> tuple[list[PictureSet], list[Path]]:
+def _any_angles(folder: Path, views: dict[str, list[SetPicture]]) -> tuple[list[ExposureSet], list[Path]]:
     """The sets of a folder; and the files of views at 0, 45, 90 and 135 degrees, or some of them."""
     sets, four = [], []
     for view, mine in sorted(views.items()):
@@ -184,7 +235,7 @@ def _any_angles(folder: Path, views: dict[str, list[SetPicture]]) -> tuple[list[
     return sets, four
 
 
-def _named_set(folder: Path, view: str, pictures: Sequence[SetPicture]) -> PictureSet:
+def _named_set(folder: Path, view: str, pictures: Sequence[SetPicture]) -> ExposureSet:
     """A set by names: two files that state the same number are one picture too many."""
     seen: dict[Angle, Path] = {}
     for picture in pictures:
@@ -195,7 +246,7 @@ def _named_set(folder: Path, view: str, pictures: Sequence[SetPicture]) -> Pictu
     return _made(view, pictures)
 
 
-def by_table(root: Path) -> tuple[list[PictureSet], list[Path]]:
+def by_table(root: Path) -> tuple[list[ExposureSet], list[Path]]:
     """Sets that the table ``angles.csv`` of a folder lists, and the pictures of the folder that it does not list.
 
     Lines with one view are a set. Lines without a view are sets by the names of their files where all of these state a
@@ -237,7 +288,7 @@ def _views_of(root: Path, lines: Sequence[Line]) -> list[str]:
     return [of_file[line.file] if line.view is None else line.view for line in lines]
 
 
-def _of_lines(root: Path, table: Path, view: str, lines: Sequence[Line]) -> PictureSet:
+def _of_lines(root: Path, table: Path, view: str, lines: Sequence[Line]) -> ExposureSet:
     pictures = [SetPicture(root / line.file, line.angle, line.gain) for line in lines]
     missing = [picture.path for picture in pictures if not picture.path.is_file()]
     if not missing:
@@ -252,15 +303,86 @@ def _of_lines(root: Path, table: Path, view: str, lines: Sequence[Line]) -> Pict
     return _made(view, there, table, fault)
 
 
-def videos(files: Sequence[Path]) -> list[PictureSet]:
+def videos(files: Sequence[Path]) -> list[ExposureSet]:
     """Each video as a set, with the frames that the table beside it lists."""
     return [_video(path) for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
 
 
-def _video(path: Path) -> PictureSet:
-    table = frame_table(path)
+def _video(path: Path) -> ExposureSet:
+    table = path.with_suffix(".csv")
     try:
         pictures = [SetPicture(path, angle, None, frame) for frame, angle in read_frame_table(table, path)]
     except PolarguideError as error:
         return _made(path.stem, [SetPicture(path, "unknown")], None, error)
     return _made(path.stem, pictures, table)
+
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+_COLUMNS = ["frame", "angle"]
+_REMEDY = "Write a line for each frame to use: its number, counted from 0, and its angle in degrees."
+
+
+def read_frame_table(path: Path, video: Path) -> list[tuple[int, Angle]]:
+    """The lines of a table ``frame,angle``: frames counted from 0, and their angles.
+
+    Raises:
+        PolarguideError: there is no such table, a cell is wrong, or a frame is listed twice.
+    """
+    if not path.is_file():
+        raise PolarguideError(
+            path, expected=f"a table frame,angle of {video.name}", found="no such file", remedy=_REMEDY
+        )
+    rows = read_rows(path, _REMEDY)
+    header = [cell.lower() for cell in rows[0][1]] if rows else []
+    if header != _COLUMNS:
+        found = shortened(",".join(header)) or "an empty file"
+        raise PolarguideError(
+            f"{path} (line 1)", expected="the header frame,angle", found=found, remedy=_REMEDY
+        )
+    frames: dict[int, Angle] = {}
+    for number, row in rows[1:]:
+        angle = parse_angle(row[1]) if len(row) == len(_COLUMNS) else None
+        if angle is None or not row[0].isdecimal() or int(row[0]) in frames:
+            raise PolarguideError(
+                f"{path} (line {number})",
+                expected=f"a frame that no other line has, and its angle up to {LARGEST:g} degrees",
+                found=shortened(",".join(row)),
+                remedy=_REMEDY,
+            )
+        frames[int(row[0])] = angle
+    return sorted(frames.items())
+
+
+def read_frames(path: Path, frames: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
+    """The frames of a video [H, W, 3] uint8 RGB, one after the other.
+
+    Args:
+        path: of the video, whose frames stay as they are stored: angles count from their horizontal. frames: numbers,
+            counted from 0 and rising.
+
+    Raises:
+        PolarguideError: OpenCV cannot read the video, or it ends before the last of them.
+    """
+    require_file(path, expected="a video", remedy="Copy the file there.")
+    video = cv2.VideoCapture(str(path))
+    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+    try:
+        place = -1
+        for frame in frames:
+            # One by one: many formats seek to the nearest key frame only.
+            while place < frame and video.grab():
+                place += 1
+            picture: Any = None
+            if place == frame:
+                _, picture = video.retrieve()
+            if picture is None or np.ndim(picture) != 3:
+                found = f"a video of {place + 1}" if place >= 0 else "a file that OpenCV cannot read"
+                raise PolarguideError(
+                    path,
+                    expected=f"a video with frame {frame}, counted from 0",
+                    found=found,
+                    remedy="Correct the table, or save the frames as pictures.",
+                )
+            yield np.ascontiguousarray(picture[..., ::-1])
+    finally:
+        video.release()

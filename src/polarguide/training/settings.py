@@ -93,7 +93,7 @@ class TrainSettings:
 class ResolvedSettings(TrainSettings):
     """``TrainSettings`` in which nothing is left open: what a training reads and ``run.json`` records.
 
-    ``runs.defaults.resolve`` makes them; ``gaussians`` is 0 of a field, which has none.
+    ``runs.folder.resolve`` makes them; ``gaussians`` is 0 of a field, which has none.
     """
 
     steps: int = field(kw_only=True)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
-from polarguide.capture.presentation import Crop, Presentation, Vector
+from polarguide.capture.presentation import STOPS, Crop, Presentation, Vector
 from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
 from polarguide.viewer.presenting import PresentingControls
 from polarguide.viewer.scenery import MEASURED, Appearance
@@ -16,7 +17,7 @@ STEPS = ("previous", "next")
 NOTHING = Presentation()
 # Ranges of the controls.
 SIDES = ("Left, right", "Down, up", "Front, back")
-EXPOSURE, STRENGTH, TURN, SECONDS, CROP = (-4.0, 4.0), (0.0, 2.0), (-180, 180), (0.5, 10.0), (-150, 150)
+EXPOSURE, STRENGTH, TURN, SECONDS, CROP = (-STOPS, STOPS), (0.0, 2.0), (-180, 180), (0.5, 10.0), (-150, 150)
 WIPE = 0, 100
 
 
@@ -51,14 +52,31 @@ class Panel:
         gui: viser's handle of the session's controls.
         options: the controls to show.
         changed: called after every change that affects the picture.
+        folded: whether the controls begin folded, behind the one word that opens them. On a phone viser's panel begins
+            open and covers half of the picture, and nothing that a server sends can fold it.
     """
 
-    def __init__(self, gui: Any, options: PanelOptions, changed: Callable[[], None]) -> None:
+    def __init__(
+        self, gui: Any, options: PanelOptions, changed: Callable[[], None], *, folded: bool = False
+    ) -> None:
         self._crop: list[Any] = []
         # The box as it was saved, until a slider is moved; its sides are more exact than the sliders' steps.
         self._saved_crop = options.presentation.crop
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._status, self._lines, self._note = gui.add_markdown(""), tuple[str, ...](), ""
+        with gui.add_folder("Controls", expand_by_default=False) if folded else nullcontext():
+            self._add_controls(gui, options)
+        self.accepts = self._accepted([*options.layers, *MEASURED], options.views)
+        controls = (
+            *(self.layer, self.exposure, self.strength, self.turn, self.wipe),
+            *(self._use_crop, *self._crop),
+        )
+        for control in self._crop:
+            control.on_update(lambda _: self._forget_saved())
+        for control in controls:
+            control.on_update(lambda _: changed())
+
+    def _add_controls(self, gui: Any, options: PanelOptions) -> None:
         self.pause = gui.add_checkbox("Pause training", False, visible=options.trains)
         layers = options.layers
         self.layer = gui.add_dropdown(
@@ -66,7 +84,9 @@ class Panel:
             (*layers, *MEASURED),
             hint=f"From {MEASURED[0]} on, a photograph's pose is needed; stokes, dolp and aolp are predicted",
         )
-        self.exposure = gui.add_slider("Exposure", *EXPOSURE, 0.1, 0.0, hint="In stops")
+        self.exposure = gui.add_slider(
+            "Exposure", *EXPOSURE, 0.1, options.presentation.exposure or 0.0, hint="In stops"
+        )
         self.strength = gui.add_slider("Reflection", *STRENGTH, 0.05, 1.0, visible="specular" in layers)
         hint = "Rotates the environment light, in degrees; the scene stays"
         self.turn = gui.add_slider("Environment", *TURN, 1, 0, hint=hint, visible=options.turns)
@@ -90,15 +110,6 @@ class Panel:
             self.seconds = gui.add_slider("Seconds per segment", *SECONDS, 0.5, 2.0)
             self.play = gui.add_button("Play")
             self.save_path = gui.add_button("Save path")
-        self.accepts = self._accepted([*layers, *MEASURED], options.views)
-        controls = (
-            *(self.layer, self.exposure, self.strength, self.turn, self.wipe),
-            *(self._use_crop, *self._crop),
-        )
-        for control in self._crop:
-            control.on_update(lambda _: self._forget_saved())
-        for control in controls:
-            control.on_update(lambda _: changed())
 
     def _forget_saved(self) -> None:
         self._saved_crop = None
@@ -152,6 +163,7 @@ class Panel:
             turn=float(self.turn.value),
             crop=self.crop(chosen.up_axis),
             white_balance=chosen.white_balance,
+            chart=chosen.chart,
             up_axis=chosen.up_axis,
             wipe=float(self.wipe.value) / 100,
         )

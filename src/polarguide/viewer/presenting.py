@@ -17,6 +17,7 @@ from polarguide.results.rendering.picking import SurfacePoint, gains_of
 from polarguide.viewer.messages import Accepts, choice, number, push
 
 AS_PHOTOGRAPHED, GRAY_WORLD, PICKED = WHITES = ("as photographed", "gray world", "picked")
+OF_CHART = "color chart"
 KNOWN_LENGTH = (0.001, 1e8)  # millimeters
 LINE_COLOR = (255, 80, 40)
 ASKS = {
@@ -40,11 +41,14 @@ class PresentingControls:
     """
 
     def __init__(self, gui: Any, presentation: Presentation, *, saves: bool) -> None:
+        charted = presentation.chart is not None
+        whites = (*WHITES, OF_CHART) if charted else WHITES
+        initial = AS_PHOTOGRAPHED if presentation.white_balance is None else PICKED
         with gui.add_folder("White, up, scale", expand_by_default=False):
             self.white = gui.add_dropdown(
                 "White",
-                WHITES,
-                initial_value=AS_PHOTOGRAPHED if presentation.white_balance is None else PICKED,
+                whites,
+                initial_value=OF_CHART if charted else initial,
                 hint="For display; the data stay as they are",
             )
             hint = (
@@ -58,7 +62,7 @@ class PresentingControls:
             hint = "White, up, scale and crop, for pages, exports and renderings"
             self.save = gui.add_button("Save to the run" if saves else "Download them", hint=hint)
         controls: list[tuple[Any, Accepts]] = [
-            (self.white, choice(WHITES)),
+            (self.white, choice(whites)),
             (self.pick, choice(PICKS)),
             (self.up, choice(UPS)),
             (self.length, number(*KNOWN_LENGTH)),
@@ -102,7 +106,7 @@ class Presenting:
         self._client, self._controls, self._gray_world = client, controls, gray_world
         self._changed, self._caught, self._distance = changed, caught, distance
         self.chosen, self.note, self._noted = presentation, "", noted
-        self._picked_white = presentation.white_balance
+        self._picked_white, self._chart = presentation.white_balance, presentation.chart
         self._picking = ""
         self._listener: Callable[[Any], None] | None = None
         self._clicked: tuple[str, float, float] | None = None
@@ -184,7 +188,7 @@ class Presenting:
         except PolarguideError as error:
             self._say(f"Expected {error.expected}")
             return
-        self._choose(white_balance=gains)
+        self._choose(white_balance=gains, chart=self._chart if choice == OF_CHART else None)
 
     def _white_found(self, color: Tensor) -> None:
         try:
@@ -193,7 +197,7 @@ class Presenting:
             self._say(f"Expected {error.expected}")
             return
         self._listen("")
-        self._choose(white_balance=self._picked_white)
+        self._choose(white_balance=self._picked_white, chart=None)
         self._controls.white.value = PICKED
         self._say("White: gains " + ", ".join(f"{gain:.3g}" for gain in self._picked_white))
 

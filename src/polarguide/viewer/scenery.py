@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import View
-from polarguide.capture.presentation import Crop, Presentation, Vector, balanced
+from polarguide.capture.presentation import Chart, Crop, Presentation, Vector, colored
 from polarguide.fields.model import FieldModel
 from polarguide.fields.trainer import FieldTrainer
 from polarguide.gaussians.gaussians import Gaussians
@@ -227,7 +227,7 @@ class Appearance:
         crop: what is shown of the scene; None: all.
         wipe: share of the picture's width, from the left, that shows what was measured (``BESIDE``) in place of the
             layer, at a photograph's pose.
-        white_balance: gains of R, G and B on radiance. up_axis: the axis of turning; None: as the cameras say.
+        white_balance, chart: as of ``Presentation``. up_axis: the axis of turning; None: as the cameras say.
     """
 
     layer: str = "final"
@@ -236,6 +236,7 @@ class Appearance:
     turn: float = 0.0
     crop: Crop | None = None
     white_balance: Vector | None = None
+    chart: Chart | None = None
     up_axis: Vector | None = None
     wipe: float = 0.0
 
@@ -371,6 +372,6 @@ class Painter:
 
 
 def _shown(radiance: Tensor, appearance: Appearance) -> Tensor:
-    """Radiance [H, W, 3] as bright and as white as wanted, linear."""
-    gains = Presentation(white_balance=appearance.white_balance).gains
-    return balanced(radiance, gains) * 2.0**appearance.exposure
+    """Radiance [H, W, 3] as bright and in the color that is wanted, linear."""
+    white, chart, exposure = appearance.white_balance, appearance.chart, appearance.exposure
+    return colored(radiance, Presentation(white_balance=white, chart=chart, exposure=exposure).color)

@@ -315,7 +315,7 @@ def save_to_run(run: OpenedRun, chosen: Presentation) -> str:
     """
     own, above = read_presentation(run.folder), read_presentation(run.scene_folder)
     fields, unchanged = {}, []
-    for name in ("white_balance", "up_axis", "meters_per_unit", "crop"):
+    for name in ("white_balance", "chart", "exposure", "up_axis", "meters_per_unit", "crop"):
         value, inherited = getattr(chosen, name), getattr(above, name)
         fields[name] = None if value == inherited else value
         if value is None and inherited is not None:

@@ -135,7 +135,8 @@ class Session:
         first = next(iter(photographs.values())).view.camera
         self._size = first.width, first.height
         self._keyframes = Keyframes(self._size)
-        self.panel = Panel(client.gui, options, lambda: self._caught(self._changed)(None))
+        upright = client.camera.image_width < client.camera.image_height  # as phones are held
+        self.panel = Panel(client.gui, options, lambda: self._caught(self._changed)(None), folded=upright)
         self._save = save
         self._presenting = Presenting(
             client,
@@ -213,7 +214,11 @@ class Session:
         if self._soon_again("presentation"):
             return "Saved just now"
         chosen = self._presenting.chosen
-        chosen = msgspec.structs.replace(chosen, crop=self.panel.crop(chosen.up_axis))
+        chosen = msgspec.structs.replace(
+            chosen,
+            crop=self.panel.crop(chosen.up_axis),
+            exposure=float(self.panel.exposure.value) or None,
+        )
         if self._save is not None:
             return self._save(chosen)
         content = to_json(chosen.to_record())

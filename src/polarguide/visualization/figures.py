@@ -329,10 +329,16 @@ def shares_to_rgb(shares: Tensor) -> Picture:
 
 
 def with_key(picture: Picture, key: Picture, width: int) -> Picture:
-    """A picture with a key to its colors over its lower left corner, ``width`` pixels wide on a white border."""
-    height = max(1, round(width * key.shape[0] / key.shape[1]))
-    way = cv2.INTER_AREA if width < key.shape[1] else cv2.INTER_LINEAR
-    small = cv2.resize(key, (width, height), interpolation=way)
+    """A picture with a key to its colors over its lower left corner, on a white border.
+
+    The key is ``width`` pixels wide, less what is empty at its sides.
+    """
+    scale = width / key.shape[1]
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    drawn_on = np.flatnonzero((key != BACKGROUND).any(axis=(0, 2)))
+    key = key[:, drawn_on[0] : drawn_on[-1] + 1]
+    size = [max(1, round(scale * side)) for side in (key.shape[1], key.shape[0])]
+    small = cv2.resize(key, size, interpolation=way)
     edge = max(2, width // 40)
     framed = np.pad(small, ((edge, edge), (edge, edge), (0, 0)), constant_values=BACKGROUND)
     framed = framed[: picture.shape[0], : picture.shape[1]]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import View
-from polarguide.capture.presentation import balanced
+from polarguide.capture.presentation import colored
 from polarguide.geometry.camera import Camera
 from polarguide.shading.result import POLARIZED, RenderResult
 from polarguide.visualization import figures
@@ -37,14 +37,14 @@ def layer_picture(
     depths: Depths | None = None,
     *,
     exposed: bool = False,
-    gains: Tensor | None = None,
+    color: Tensor | None = None,
 ) -> Picture | None:
     """One layer as an 8-bit picture, or None where the recipe has no such layer.
 
     Args:
         result, camera: the rendering. name: of the layer. depths: nearest and farthest, for depth's colors.
         exposed: show radiance darker where more than 1 % of the pixels would clip.
-        gains: [3] of a white balance, of layers of radiance.
+        color: of the presentation, [3, 3], of layers of radiance.
     """
     if name in POLARIZED:
         return None if result.predicted is None else polarization_picture(name, result.predicted)
@@ -52,7 +52,7 @@ def layer_picture(
     if values is None:
         return None
     if name in RADIANCE:
-        values = balanced(values, gains)
+        values = colored(values, color)
     if exposed:
         values = values * clipping_exposure(values)
     if name == "depth":
@@ -131,16 +131,16 @@ def true_depths(view: View) -> Tensor | None:
 
 
 def reference_pictures(
-    view: View, gains: Tensor | None = None, depths: Depths | None = None
+    view: View, color: Tensor | None = None, depths: Depths | None = None
 ) -> dict[str, Picture]:
     """What a view knows of layers, by ``NAME, true`` and ``NAME, measured``: the photograph as ``final``, ground truth,
     and the polarization that its pictures measure, as 8-bit pictures.
 
     Args:
-        gains, depths: as for ``layer_picture``.
+        color, depths: as for ``layer_picture``.
     """
     pictures = {
-        f"{name}, true": picture for name, picture in ground_truth_pictures(view, gains, depths).items()
+        f"{name}, true": picture for name, picture in ground_truth_pictures(view, color, depths).items()
     }
     if view.is_determined:
         stokes = view.stokes()
@@ -149,12 +149,12 @@ def reference_pictures(
 
 
 def ground_truth_pictures(
-    view: View, gains: Tensor | None = None, depths: Depths | None = None
+    view: View, color: Tensor | None = None, depths: Depths | None = None
 ) -> dict[str, Picture]:
     """The photograph as ``final``, and the ground truth of the other layers, as 8-bit pictures; of the depth where
     ``depths`` are given.
     """
-    pictures = {"final": figures.radiance_to_rgb(balanced(view.photograph(), gains))}
+    pictures = {"final": figures.radiance_to_rgb(colored(view.photograph(), color))}
     ground_truth = view.ground_truth
     if ground_truth is None:
         return pictures
@@ -162,7 +162,7 @@ def ground_truth_pictures(
         pictures["normal"] = figures.normal_to_rgb(ground_truth.normal, view.camera)
     for name, layer in (("specular", ground_truth.specular), ("diffuse", ground_truth.diffuse)):
         if layer is not None:
-            pictures[name] = figures.radiance_to_rgb(balanced(layer / 2, gains))
+            pictures[name] = figures.radiance_to_rgb(colored(layer / 2, color))
     if ground_truth.depth is not None and depths is not None:
         pictures["depth"] = depth_picture(ground_truth.depth, depths)
     return pictures

@@ -17,7 +17,7 @@ from faults import Fault
 from heard import Heard
 from tiny import make_scene
 
-from polarguide.api import Run, open_run
+from polarguide.api.runs import Run, open_run
 from polarguide.capture import View
 from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.results.evaluation import evaluate

@@ -31,7 +31,7 @@ from polarguide.results.export.model.gltf import Textured, color_pixels, write_g
 from polarguide.results.export.model.irradiance import Surroundings, irradiance
 from polarguide.results.export.model.obj import write_obj
 from polarguide.results.export.model.texels import texels_of
-from polarguide.results.export.model.topology import cleaned, topology
+from polarguide.results.export.model.topology import Topology, cleaned, topology
 from polarguide.results.export.model.unwrap import Unwrapped, unwrap
 from polarguide.results.export.placement import IN_PLACE
 from polarguide.results.rendering.mesh import ColoredMesh, Surface
@@ -86,6 +86,28 @@ def test_large_holes_stay_and_are_counted() -> None:
     counts = topology(half.faces)
     assert counts.boundary_edges > 30
     assert (counts.non_manifold_edges, counts.pieces) == (0, 1)
+
+
+HOLES = {
+    "half of it": POINTS[FACES][..., 2].mean(axis=1) > 0,
+    "two that touch in a vertex": ~np.isin(
+        np.arange(len(FACES)), (FACES[0, 0] == FACES).any(axis=1).nonzero()[0][[0, 3]]
+    ),
+}
+
+
+@pytest.mark.parametrize("hole", HOLES)
+def test_what_is_to_be_closed_has_no_holes(hole: str) -> None:
+    surface = cleaned(POINTS, FACES[HOLES[hole]], closed=True)
+    assert topology(surface.faces) == Topology(0, 0, 1)
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    assert mesh.is_watertight
+    share = 0.5 if hole == "half of it" else 1.0
+    assert mesh.volume == pytest.approx(share * BALL.volume, rel=0.03)
+
+
+def test_a_surface_without_area_is_refused() -> None:
+    Fault(where="the model", found="none").raised_by(cleaned, np.zeros((3, 3)), np.array([[0, 1, 2]]))
 
 
 def test_texels_interpolate_and_textures_are_filled_to_their_end() -> None:

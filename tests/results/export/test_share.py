@@ -195,9 +195,7 @@ def test_credit_scale_and_white_are_in_the_page_as_text() -> None:
     assert not any(key.startswith("on") for key, _ in found.attributes)
     assert [value for key, value in found.attributes if value == EVIL] == [EVIL] * 3  # what machines read
     scene = json.loads(found.scripts["scene"])
-    assert (scene["white"], scene["metersPerUnit"], scene["up"]) == ([0.5, 1.0, 2.0], 0.25, [0.0, 0.0, 1.0])
-    assert (json.loads(plain.scripts["scene"])["white"], "credit" in plain.scripts["scene"]) == (
-        [1, 1, 1],
-        False,
-    )
+    assert scene["color"] == [0.5, 0, 0, 0, 1.0, 0, 0, 0, 2.0]
+    assert (scene["metersPerUnit"], scene["up"]) == (0.25, [0.0, 0.0, 1.0])
+    assert (json.loads(plain.scripts["scene"])["color"], "credit" in plain.scripts["scene"]) == (None, False)
     assert 'class="credit"' not in share_page(*arguments, first="v1", title="t")

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from polarguide.shots.exposures import ExposureSet
 from polarguide.shots.maps import Reason
 from polarguide.shots.measurement.fields import FIELDS, KEYS
 from polarguide.shots.measurement.regions import (
@@ -18,6 +17,7 @@ from polarguide.shots.measurement.regions import (
     difference_figures,
     region_figures,
 )
+from polarguide.shots.sets import ExposureSet
 
 REGION = Region("part", 5, 7, 30, 21)
 

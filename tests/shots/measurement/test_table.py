@@ -14,9 +14,8 @@ from faults import Fault
 
 from polarguide.shots.measurement.fields import FORMAT, KEYS
 from polarguide.shots.measurement.line import measure_shots
-from polarguide.shots.measurement.options import MeasureOptions
 from polarguide.shots.measurement.table import CSV, LINES, Entry, FileStamp, Table, stamps
-from polarguide.shots.options import ShotOptions
+from polarguide.shots.options import MeasureOptions, ShotOptions
 
 SETTINGS = {"threshold": 0.05}
 

@@ -17,10 +17,9 @@ import pytest
 from polarguide.core.progress import Reporter
 from polarguide.geometry.polarizer import ANGLES
 from polarguide.shots.measurement.line import measure_shots
-from polarguide.shots.measurement.options import MeasureOptions, WatchOptions
 from polarguide.shots.measurement.table import CSV, LINES
 from polarguide.shots.measurement.watch import watch_folder
-from polarguide.shots.options import ShotOptions
+from polarguide.shots.options import MeasureOptions, ShotOptions, WatchOptions
 from tests.shots.test_read import PLAIN, write_four
 
 QUICK = WatchOptions(settle=0.1, patience=0.4, idle=0.2)
@@ -108,9 +107,9 @@ def test_a_whole_file_that_is_no_mosaic_is_not_waited_for(tmp_path: Path, readin
 def test_a_file_that_changes_while_it_is_read_is_measured_once(
     folder: Path, tmp_path: Path, reading: ShotOptions, monkeypatch
 ) -> None:
-    from polarguide.shots.measurement import measurer
+    from polarguide.shots.measurement import line
 
-    read, touched = measurer.read_shot, []
+    read, touched = line.read_shot, []
 
     def read_and_touch(shot, options, part):
         maps = read(shot, options, part=part)
@@ -119,7 +118,7 @@ def test_a_file_that_changes_while_it_is_read_is_measured_once(
             os.utime(shot.paths[0], ns=(1, 1))
         return maps
 
-    monkeypatch.setattr(measurer, "read_shot", read_and_touch)
+    monkeypatch.setattr(line, "read_shot", read_and_touch)
     watch_folder(folder, tmp_path / "out", reading=reading, watching=QUICK)
     assert sorted(names(tmp_path / "out")) == ["v000", "v001", "v002"]
 

@@ -13,9 +13,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.features import match_features, pipeline_options, run_step
 from polarguide.capture.colmap.files import PosedCamera, colmap_camera, write_cameras
 from polarguide.capture.colmap.model import load_model
+from polarguide.capture.colmap.sfm import match_features, pipeline_options, run_step
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_picture
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, write_whole, writing

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.camera_sizes import Size, is_centered
 from polarguide.capture.colmap.files import PosedCamera
 from polarguide.capture.datasets.dataset import (
     Dataset,
@@ -31,6 +30,7 @@ from polarguide.capture.formats.arrays import BROKEN, array_kind, unpacked
 from polarguide.capture.formats.integrity import LARGEST_PIXELS, damaged
 from polarguide.capture.formats.pictures import SUFFIXES, decode_stored, read_picture, stated_size
 from polarguide.capture.layout import index_files
+from polarguide.capture.transforms_file import Size, is_centered
 from polarguide.core.errors import PolarguideWarning
 from polarguide.core.files import read_file
 

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture import checks
-from polarguide.capture.filter.camera_raw import is_camera_raw
+from polarguide.capture.filter.camera_files import is_camera_raw, stated_exponent
 from polarguide.capture.filter.shots import Shots
-from polarguide.capture.formats.icc import stated_exponent
 from polarguide.capture.formats.pictures import is_lossy, linear_codes, read_picture
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.write import Rounding, rounding_of

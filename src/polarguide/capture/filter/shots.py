@@ -12,13 +12,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.exposures import TABLE, Angle, Line, angle_text, parse_angle, read_table
-from polarguide.capture.filter.camera_raw import CAMERA_RAW, is_camera_raw, read_camera_raw
-from polarguide.capture.filter.exif import orientation
-from polarguide.capture.filter.names import NAMING, angles_of_names, folders_of_angles
+from polarguide.capture.exposures import (
+    NAMING,
+    TABLE,
+    Angle,
+    Line,
+    angle_text,
+    angles_of_names,
+    folders_of_angles,
+    parse_angle,
+    read_table,
+)
+from polarguide.capture.filter.camera_files import CAMERA_RAW, is_camera_raw, orientation, read_camera_raw
 from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, is_lossy, read_picture, rescaled
-from polarguide.capture.layout import ambiguous, angle_folders, index_files, list_files, require_angle_folders
-from polarguide.capture.memory import require_memory_of_each
+from polarguide.capture.layout import (
+    ambiguous,
+    angle_folders,
+    index_files,
+    list_files,
+    require_angle_folders,
+    require_memory_of_each,
+)
 from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed

@@ -12,10 +12,12 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from polarguide.capture.formats.heif import heif_damage, heif_head, is_heif
-from polarguide.capture.formats.plain import (
+from polarguide.capture.formats.decoders import (
     BMP,
     PNM,
+    heif_damage,
+    heif_head,
+    is_heif,
     is_webp,
     plain_damage,
     plain_head,

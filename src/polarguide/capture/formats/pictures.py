@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.formats.arrays import BROKEN, array_header, exr_size, hdr_size
-from polarguide.capture.formats.heif import heif_pixels, is_heif
+from polarguide.capture.formats.decoders import (
+    UnreadableTiffError,
+    decode_tiff,
+    heif_pixels,
+    is_heif,
+    plain_head,
+    plain_pixels,
+)
 from polarguide.capture.formats.integrity import (
     BIG_TIFF,
     LARGEST_PIXELS,
@@ -26,8 +33,6 @@ from polarguide.capture.formats.integrity import (
     tiff_entries,
     tiff_order,
 )
-from polarguide.capture.formats.plain import plain_head, plain_pixels
-from polarguide.capture.formats.tiff import UnreadableTiffError, decode_tiff
 from polarguide.capture.view import FULL_CODE
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import LARGEST_FILE, read_file

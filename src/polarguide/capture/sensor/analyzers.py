@@ -67,6 +67,18 @@ def correction_matrices(analyzers: list[Array], nominal: NDArray[Any]) -> Array:
     return np.asarray(rows, np.float32)
 
 
+CALIBRATED_IMBALANCE = 0.01
+"""Of the pair sums of a calibrated sensor; more is a sign of another camera's calibration."""
+
+
+def imbalance_notes(ratio: float | None) -> list[str]:
+    """What to tell the user of the ratio of the pair sums that a calibration leaves."""
+    notes = [] if ratio is None else [f"With the calibration, I0 + I90 is {ratio - 1:+.2%} off I45 + I135."]
+    if ratio is not None and abs(ratio - 1) > CALIBRATED_IMBALANCE:
+        notes.append("That is more than a calibration of this camera leaves: is it one of another?")
+    return notes
+
+
 FARTHEST_ANGLE = np.radians(20.0)
 """Of a polarizer from the angle that its position has by design."""
 LEAST_DIATTENUATION = 0.3

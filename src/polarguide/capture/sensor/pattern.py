@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from polarguide.core.errors import PolarguideError
@@ -24,6 +25,33 @@ SENSOR_SIZE = (2464, 2056)
 
 Packing = Literal["8", "16", "16be", "10p", "10packed", "10mipi", "12p", "12packed", "12mipi"]
 """How ``.raw`` files hold values, see ``sensor.raw_file.PACKINGS``."""
+
+
+NotNegative = Annotated[int, Meta(ge=0, le=1 << 20)]
+Positive = Annotated[int, Meta(ge=1, le=1 << 31)]
+
+
+@dataclass(frozen=True)
+class MosaicOptions:
+    """How raw mosaics lie in their files, and on the sensor.
+
+    Attributes:
+        sensor: Sensor of raw mosaics: IMX250MYR and IMX264MYR are color, IMX250MZR is monochrome.
+        packing: Packing of .raw files (there are several of 10 and of 12 bits; never guessed).
+        width: Width of .raw files in pixels; others must have it, too.
+        height: Height of .raw files in pixels.
+        offset_x: Column of the sensor at which the region of interest starts.
+        offset_y: Row of the sensor at which it starts.
+        black_level: Stored value without light.
+    """
+
+    sensor: SensorName | None = None
+    packing: Packing | None = None
+    width: Positive | None = None
+    height: Positive | None = None
+    offset_x: NotNegative = 0
+    offset_y: NotNegative = 0
+    black_level: Annotated[float, Meta(ge=0)] = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -116,7 +116,14 @@ def require_mosaic(where: Path | str, values: NDArray[Any], *, least: int) -> No
             found=f"{values.shape[1]}x{values.shape[0]}",
             remedy="Give the whole picture of the sensor.",
         )
-    _require_one_picture(where, values)
+    if is_tiled(values):
+        raise PolarguideError(
+            where,
+            expected="a raw mosaic, in which the four angles take turns from pixel to pixel",
+            found="the same view four times, side by side",
+            remedy="Save what the sensor delivers (a pixel format such as Mono12 or BayerRG12), not one that shows the "
+            "four angles apart; or cut the file into four shots, NAME_0, NAME_45, NAME_90 and NAME_135.",
+        )
 
 
 def _read_plain(path: Path, raw: RawFormat) -> NDArray[Any]:
@@ -186,29 +193,15 @@ def is_tiled(values: NDArray[Any]) -> bool:
     detail = []
     for row, column in ((0, 0), (0, half[1]), (half[0], 0), (half[0], half[1])):
         part = values[row : row + down * _CELLS, column : column + across * _CELLS]
-        means = part.reshape(down, _CELLS, across, _CELLS).mean(axis=(1, 3))
+        # Sums of 16 values of 16 bits are whole numbers of 20, which single precision holds.
+        rows = part.reshape(down, _CELLS, across * _CELLS).sum(axis=1, dtype=np.float32)
+        means = rows.reshape(down, across, _CELLS).sum(axis=2).astype(np.float64) / _CELLS**2
         around = sum(np.roll(means, (y, x), (0, 1)) for y in (-1, 0, 1) for x in (-1, 0, 1))
         # Logarithms of ratios: a quarter that is brighter everywhere has the same detail.
         fine = np.log((means + 1) / (around / 9 + 1))[1:-1, 1:-1].ravel()
         detail.append(fine - fine.mean())
     first, *others = (fine / max(float(np.linalg.norm(fine)), 1e-12) for fine in detail)
     return min(float(first @ other) for other in others) > _TILED
-
-
-def _require_one_picture(path: Path | str, values: NDArray[Any]) -> None:
-    """Refuse four pictures side by side in place of a mosaic: nothing later would tell.
-
-    Raises:
-        PolarguideError: the file holds them.
-    """
-    if is_tiled(values):
-        raise PolarguideError(
-            path,
-            expected="a raw mosaic, in which the four angles take turns from pixel to pixel",
-            found="the same view four times, side by side",
-            remedy="Save what the sensor delivers (a pixel format such as Mono12 or BayerRG12), not one that shows the "
-            "four angles apart; or cut the file into four shots, NAME_0, NAME_45, NAME_90 and NAME_135.",
-        )
 
 
 _APART = 4

@@ -181,9 +181,9 @@ def _surface(run: OpenedRun) -> Surface:
     return fused
 
 
-def _speed(run: OpenedRun, **layers: bool) -> float | None:
+def _speed(run: OpenedRun, *, normals: bool = True, depth: bool = False) -> float | None:
     def draw(view: View) -> None:
-        run.model.render(view.camera, **layers)
+        run.model.render(view.camera, normals=normals, depth=depth)
         if run.model.device.type == "cuda":
             torch.cuda.synchronize(run.model.device)
 

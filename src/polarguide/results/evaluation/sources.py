@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).parents[2]
 COMMIT = "_commit.txt"
 """Beside the package's modules in a wheel: the commit it was built from, empty where that was not known."""
 DIGITS = 16
-NOT_TRAINING = ("results", "inspection", "viewer", "synth", "experiments", "api.py", "cli", "__main__.py")
+NOT_TRAINING = ("results", "inspection", "viewer", "synth", "experiments", "api", "cli", "__main__.py")
 """Rooms below ``runs`` in the order of imports: no training can reach them."""
 
 

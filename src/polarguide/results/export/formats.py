@@ -2,53 +2,64 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from polarguide.capture import read_model
 from polarguide.capture.layout import refuse_scene
-from polarguide.capture.presentation import balanced
+from polarguide.capture.presentation import colored
 from polarguide.core.errors import PolarguideError, PolarguideWarning
-from polarguide.core.files import holds_files, make_folder, require_inside, temporary_folder, write_text
+from polarguide.core.files import (
+    atomic_folder,
+    holds_files,
+    make_folder,
+    require_inside,
+    temporary_folder,
+    write_text,
+)
 from polarguide.core.options import ExportFormat, ModelOptions, PathLike, check_choice, check_finite
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.fields.model import FieldModel
-from polarguide.geometry.camera import Camera
+from polarguide.optics.color import srgb_encode
 from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
 from polarguide.results.evaluation.table import shown_metrics
 from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
 from polarguide.results.export.model.build import BASE_COLORS, textured_model
 from polarguide.results.export.model.gltf import write_glb
 from polarguide.results.export.model.obj import write_obj
+from polarguide.results.export.model.subject import counted, subject_of, subject_surface, write_stl
+from polarguide.results.export.package import RECORD, about_files, package_record
 from polarguide.results.export.placement import (
-    Origin,
+    GENERATOR,
     Placement,
     comments,
     rewrite_splats,
     write_colmap,
     write_transforms,
 )
+from polarguide.results.export.presented import Presented
 from polarguide.results.export.share import share_page
+from polarguide.results.export.splat_glb import COLOR_SPACES, Encoding, write_splat_glb
 from polarguide.results.export.splats import write_sog, write_spz
+from polarguide.results.export.usd import write_splat_usdz, write_usdz
 from polarguide.results.rendering.mesh import RESOLUTION, implicit_mesh, scene_mesh
 from polarguide.results.rendering.relight import needs_radiance, panorama, write_exr, write_hdr
-from polarguide.runs.model import GaussianModel, write_run_ply
+from polarguide.runs.model import write_run_ply
 from polarguide.runs.opened import OpenedRun
-from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.shading.model import Parameters
-from polarguide.shading.result import RenderResult
 from polarguide.visualization import figures
 
 TRANSFORMS = "transforms.json"
 
 PANORAMA_HEIGHT = 512
-SPLATS = ("ply", "spz", "sog", "points")
+SPLATS = ("ply", "spz", "sog", "splat-glb", "splat-usdz", "points")
 """Formats of Gaussians."""
 
 
@@ -62,14 +73,14 @@ def export(
     model: ModelOptions = ModelOptions(),
     reporter: Reporter = SILENT,
 ) -> list[Path]:
-    """Write a run as the files of other programs, as it is presented: cropped, in meters, upright (see ``Placement``).
+    """Write a run as the files of other programs, as it is presented: in its color, cropped, in meters, upright.
 
     Args:
         run: the run; its scene is read for all but ply, spz and sog.
-        format: ply, spz and sog are ordinary splats, with reflections baked as far as harmonics carry them; mesh (GLB
-            and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb and obj are a
-            textured model; points are opaque Gaussians with normals; environment is the learned light as a panorama
-            (EXR, HDR and PNG); cameras are a COLMAP model and transforms.json.
+        format: ply, spz, sog and splat-glb are ordinary splats, with reflections baked as far as harmonics carry
+            them; mesh (GLB and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb and
+            obj are a textured model; points are opaque Gaussians with normals; environment is the learned light as a
+            panorama (EXR, HDR and PNG); cameras are a COLMAP model and transforms.json.
         out: folder to write; ``export`` in the run's folder by default.
         resolution: voxels of the mesh along its longest side, 16 to 1024.
         spz_version: of the SPZ file, 3 or 4; readers are split between them.
@@ -90,19 +101,24 @@ def export(
         "ply": lambda: [_ply(run, presented, folder / "splats.ply")],
         "spz": lambda: [_spz(run, presented, folder / "splats.spz", spz_version)],
         "sog": lambda: [_sog(run, presented, folder / "splats.sog")],
+        "splat-glb": lambda: _splat_glb(run, presented, folder),
+        "splat-usdz": lambda: _splat_usdz(run, presented, folder / "splats.usdz"),
         "mesh": lambda: _mesh(run, presented, folder, resolution, reporter),
         "glb": lambda: _model(run, presented, folder, resolution, model, reporter, "glb"),
         "obj": lambda: _model(run, presented, folder, resolution, model, reporter, "obj"),
+        "usdz": lambda: _model(run, presented, folder, resolution, model, reporter, "usdz"),
+        "stl": lambda: _stl(run, presented, folder / "model.stl", resolution, model, reporter),
         "points": lambda: _points(run, presented, folder),
         "environment": lambda: _environment(run, presented, folder),
         "cameras": lambda: _cameras(run, presented, folder),
+        "all": lambda: _all(run, presented, folder, resolution, model, reporter),
     }
     check_choice("format", format, writers)
     check_finite("resolution", resolution, 16, 1024)
     check_finite("spz_version", spz_version, 3, 4)
     if format in SPLATS:
         run.gaussian_model(f"format {format}")
-    presented = _Presented(run)
+    presented = Presented(run)
     make_folder(folder)
     with reporter.track(f"writing {format}", None):
         return writers[format]()
@@ -131,7 +147,7 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
             "out", expected="a name that ends in .html", found=str(path), remedy="Choose such a name."
         )
     model = run.gaussian_model("share")
-    presented = _Presented(run)
+    presented = Presented(run)
     assert presented.gaussians is not None
     views = run.scene.test_views + run.scene.train_views
     scored = (run.folder / METRICS_FILE).exists()
@@ -158,50 +174,19 @@ def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", capt
     return path
 
 
-class _Presented:
-    """A run as its presentation shows it: the Gaussians within the crop box, their placement, and the origin of files.
-
-    Raises:
-        PolarguideError: the presentation cannot be read, or nothing lies within its crop box.
-    """
-
-    def __init__(self, run: OpenedRun) -> None:
-        self.presentation = run.presentation
-        model = run.model
-        gaussians = model.state.gaussians if isinstance(model, GaussianModel) else None
-        self.gaussians: Parameters | None = gaussians
-        self.footprints = model.state.footprints if isinstance(model, GaussianModel) else None
-        self.kept: Tensor | None = None
-        if gaussians is not None and (crop := self.presentation.crop) is not None:
-            self.kept = crop.inside(gaussians["means"].detach(), run.camera_frame)
-            if not bool(self.kept.any()):
-                raise PolarguideError(
-                    "the crop box",
-                    expected="Gaussians in it",
-                    found=f"none of {len(self.kept)}",
-                    remedy="Move it: polarguide present RUN --crop, or in polarguide view.",
-                )
-            self.gaussians = {name: gaussians[name].detach()[self.kept] for name in gaussians.names}
-            self.footprints = None if self.footprints is None else self.footprints[self.kept]
-        around = run.frame if self.presentation.up_axis is not None else None
-        self.placement = Placement.of(self.presentation, around)
-        scene = run.configuration.scene_digest[:12]
-        made_of = (
-            f"{run.recipe.name}, {run.steps} steps, scene sha256 {scene}, polarization {run.polarization}"
-        )
-        self.origin = Origin(self.presentation, made_of)
-
-    @property
-    def comments(self) -> list[str]:
-        """For the head of a file."""
-        return comments(self.origin, self.placement)
-
-
-def _ply(run: OpenedRun, presented: _Presented, path: Path, placement: Placement | None = None) -> Path:
+def _ply(
+    run: OpenedRun,
+    presented: Presented,
+    path: Path,
+    placement: Placement | None = None,
+    *,
+    linear: bool = False,
+) -> Path:
     with temporary_folder(path.with_suffix(".whole")) as folder:
         whole = folder / path.name
         model = run.gaussian_model("format ply")
-        write_run_ply(whole, model.state, model.shading, _camera_centers(run))
+        color = presented.presentation.color
+        write_run_ply(whole, model.state, model.shading, _camera_centers(run), color=color, linear=linear)
         selected = None if presented.kept is None else presented.kept.cpu()
         rewrite_splats(path, whole, placement or presented.placement, selected, presented.comments)
     return path
@@ -222,7 +207,7 @@ def _camera_centers(run: OpenedRun) -> Tensor | None:
         return None
 
 
-def _spz(run: OpenedRun, presented: _Presented, path: Path, version: int) -> Path:
+def _spz(run: OpenedRun, presented: Presented, path: Path, version: int) -> Path:
     """From a PLY that is gone afterwards. In units of the scene: its positions are multiples of 1/4096 of a unit."""
     with temporary_folder(path.with_suffix(".ply")) as place:
         ply = _ply(
@@ -232,7 +217,7 @@ def _spz(run: OpenedRun, presented: _Presented, path: Path, version: int) -> Pat
     return path
 
 
-def _sog(run: OpenedRun, presented: _Presented, path: Path) -> Path:
+def _sog(run: OpenedRun, presented: Presented, path: Path) -> Path:
     """From a PLY that is gone afterwards."""
     credit = presented.presentation.credit
     about = {"extras": {**presented.origin.record(), **presented.placement.record()}}
@@ -242,16 +227,38 @@ def _sog(run: OpenedRun, presented: _Presented, path: Path) -> Path:
     return path
 
 
+def _splat_glb(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
+    """From PLY files that are gone afterwards, one for each kind of reader."""
+    place = presented.upright(run)
+    paths: dict[Encoding, Path] = {kind: folder / f"splats-{kind}.glb" for kind in COLOR_SPACES}
+    with temporary_folder(folder / "splats.ply") as parts:
+        for kind, path in paths.items():
+            ply = _ply(run, presented, parts / f"{kind}.ply", place, linear=kind == "linear")
+            write_splat_glb(path, ply, asset_record(place, presented.origin), kind)
+    return [*paths.values()]
+
+
+def _splat_usdz(run: OpenedRun, presented: Presented, path: Path) -> list[Path]:
+    """From a PLY that is gone afterwards; colors are encoded, as USD leaves open."""
+    place = presented.upright(run)
+    with temporary_folder(path.with_suffix(".ply")) as parts:
+        ply = _ply(run, presented, parts / "splats.ply", place)
+        write_splat_usdz(path, ply, asset_record(place, presented.origin))
+    return [path]
+
+
 def _mesh(
-    run: OpenedRun, presented: _Presented, folder: Path, resolution: int, reporter: Reporter
+    run: OpenedRun, presented: Presented, folder: Path, resolution: int, reporter: Reporter
 ) -> list[Path]:
     if isinstance(run.model, FieldModel):
         mesh = implicit_mesh(run.cameras, run.model, resolution=resolution)
     else:
-        mesh = scene_mesh(run.cameras, _surface_view(run, presented, "format mesh"), resolution=resolution)
+        mesh = scene_mesh(run.cameras, presented.surface_view(run, "format mesh"), resolution=resolution)
     if (crop := presented.presentation.crop) is not None:
         inside = crop.inside(torch.from_numpy(mesh.surface.vertices), run.camera_frame).numpy()
         mesh = mesh.within(inside)
+    shown = colored(torch.from_numpy(mesh.colors), presented.presentation.color).clamp(max=1)
+    mesh = replace(mesh, colors=shown.numpy())
     paths = [folder / "mesh.glb", folder / "mesh.ply"]
     for path in paths:
         write_mesh(path, mesh, run.frame, presented.placement, presented.origin)
@@ -261,14 +268,14 @@ def _mesh(
 
 def _model(
     run: OpenedRun,
-    presented: _Presented,
+    presented: Presented,
     folder: Path,
     resolution: int,
     options: ModelOptions,
     reporter: Reporter,
-    kind: Literal["glb", "obj"],
+    kind: Literal["glb", "obj", "usdz"],
 ) -> list[Path]:
-    view = _surface_view(run, presented, f"format {kind}")
+    view = presented.surface_view(run, f"format {kind}")
     place, presentation = presented.placement, presented.presentation
     with temporary_folder(folder / kind) as parts:
         textured = textured_model(run, view, presentation, place, options, resolution, parts, reporter)
@@ -279,52 +286,91 @@ def _model(
         return write_obj(folder, textured, lines, jpeg=options.jpeg)
     asset = asset_record(place, presented.origin)
     asset["extras"]["base_color"] = meaning
-    path = folder / ("model-unlit.glb" if options.unlit else "model.glb")
-    write_glb(path, textured, asset, jpeg=options.jpeg)
+    path = folder / f"model{'-unlit' if options.unlit else ''}.{kind}"
+    (write_glb if kind == "glb" else write_usdz)(path, textured, asset, jpeg=options.jpeg)
     return [path]
 
 
-def _surface_view(run: OpenedRun, presented: _Presented, what: str) -> Callable[[Camera], RenderResult]:
-    """Renders a view of the Gaussians within the crop box, with the surface at the median depth."""
-    model = run.gaussian_model(what)
-    gaussians = presented.gaussians
-    assert gaussians is not None
+MILLIMETERS = 1000.0
+"""In a meter: slicers take the numbers of an STL file for millimeters."""
 
-    @torch.no_grad()
-    def surface_view(camera: Camera) -> RenderResult:
-        return render(
-            gaussians,
-            camera,
-            model.backend.rasterize,
-            RenderRequest(depth=True, at_median_depth=True),
-            shading=model.shading,
-            light=model.light,
+
+def _stl(
+    run: OpenedRun,
+    presented: Presented,
+    path: Path,
+    resolution: int,
+    options: ModelOptions,
+    reporter: Reporter,
+) -> list[Path]:
+    """For 3D printing: closed, in millimeters where the scale is known, and with up along z, as slicers have it."""
+    inside = subject_of(run, presented.presentation.crop, masked=options.masked)
+    view, options = presented.surface_view(run, "format stl"), replace(options, close_bottom=True)
+    surface, _, _ = subject_surface(run, view, inside, options, resolution)
+    reporter.say(counted(surface))
+    right, up, back = run.frame.panorama_axes().numpy().T
+    axes = np.stack([right, -back, up], axis=1)
+    scale = presented.placement.scale * (MILLIMETERS if presented.placement.metric else 1.0)
+    write_stl(
+        path, scale * surface.vertices @ axes, surface.faces, f"{GENERATOR} {presented.presentation.credit}"
+    )
+    return [path]
+
+
+def _all(
+    run: OpenedRun,
+    presented: Presented,
+    folder: Path,
+    resolution: int,
+    options: ModelOptions,
+    reporter: Reporter,
+) -> list[Path]:
+    """A package: the model lit and unlit, splats, the light, a preview, and ``model.json``, which tells of them."""
+    lit = replace(options, unlit=False)
+    radiant = run.model.shading.radiance_cubemap is not None
+    if not radiant and options.base_color is None:
+        lit = replace(lit, base_color="diffuse")
+    unlit = replace(options, unlit=True, base_color=None)
+    with atomic_folder(folder) as parts:
+        for chosen in (lit, unlit):
+            _model(run, presented, parts, resolution, chosen, reporter, "glb")
+        _splat_glb(run, presented, parts)
+        if radiant:
+            _environment(run, presented, parts)
+        view = (run.scene.test_views + run.scene.train_views)[0]
+        shown = colored(run.result(view.camera).to("cpu").final, presented.presentation.color)
+        figures.write_png(parts / "preview.png", figures.radiance_to_rgb(shown))
+        names = sorted(path.name for path in parts.iterdir())
+        record = package_record(
+            run, presented.upright(run), presented.origin, BASE_COLORS[lit.resolved_base_color]
         )
+        write_text(parts / RECORD, json.dumps({**record, "files": about_files(names)}, indent=1) + "\n")
+    return [folder / name for name in [RECORD, *names]]
 
-    return surface_view
 
-
-def _points(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
+def _points(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
     path, model, placement = folder / "points.ply", run.gaussian_model("format points"), presented.placement
     assert presented.gaussians is not None
     views, rasterize = run.scene.views, model.backend.rasterize
-    places, normals, colors = surface_points(presented.gaussians, model.shading, views, rasterize)
+    places, normals, linear = surface_points(presented.gaussians, model.shading, views, rasterize)
+    colors = srgb_encode(colored(linear, presented.presentation.color).clamp(0, 1))
     write_points(path, placement.points(places), placement.directions(normals), colors, presented.comments)
     return [path]
 
 
-def _environment(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
+def _environment(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
     cubemap = needs_radiance(run.model.shading, what="format")
-    picture = panorama(run.light[cubemap.name], cubemap, run.frame, PANORAMA_HEIGHT)
+    learned = panorama(run.light[cubemap.name], cubemap, run.frame, PANORAMA_HEIGHT)
+    picture = colored(learned, presented.presentation.color)
     paths = [folder / f"environment.{kind}" for kind in ("exr", "hdr", "png")]
     credit = presented.presentation.credit
     write_exr(paths[0], picture, {"owner": credit} if credit else {})
     write_hdr(paths[1], picture)
-    figures.write_png(paths[2], figures.radiance_to_rgb(balanced(picture, presented.presentation.gains)))
+    figures.write_png(paths[2], figures.radiance_to_rgb(picture))
     return paths
 
 
-def _cameras(run: OpenedRun, presented: _Presented, folder: Path) -> list[Path]:
+def _cameras(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
     scene, placement = run.scene, presented.placement
     model = folder / "sparse" / "0"
     require_inside(folder, model)

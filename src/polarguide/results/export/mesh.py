@@ -100,9 +100,12 @@ FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
 
 @torch.no_grad()
 def surface_points(
-    gaussians: Parameters, shading: ShadingModel, views: Iterable[View], rasterize: Rasterize
+    gaussians: Parameters,
+    shading: ShadingModel,
+    views: Iterable[View],
+    rasterize: Rasterize,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Positions, outward unit normals and display colors, each [M, 3], of opaque Gaussians that a view sees.
+    """Positions, outward unit normals and linear diffuse colors, each [M, 3], of opaque Gaussians that a view sees.
 
     Raises:
         PolarguideError: there are none.
@@ -123,9 +126,7 @@ def surface_points(
     )
     normals = torch.where((normals * side).sum(dim=1, keepdim=True) < 0, -normals, normals)
     few = {name: gaussians[name][indices] for name in (*CORE_SHAPES, *shading.parameters)}
-    linear = shading.diffuse_colors(few, -normals.contiguous())
-    colors = srgb_encode(linear.clamp(0, 1))
-    return means, normals, colors
+    return means, normals, shading.diffuse_colors(few, -normals.contiguous())
 
 
 def write_points(

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -15,14 +16,13 @@ from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from polarguide import __version__
-from polarguide.capture.presentation import Presentation
+from polarguide.capture.presentation import STOPS, Presentation
 from polarguide.gaussians.geometry import shortest_axis_normals
-from polarguide.gaussians.ply import refit_sh_to_display
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.trajectory import camera_record
 from polarguide.raster.interface import MINIMUM_ALPHA
-from polarguide.runs.model import gaussian_colors
+from polarguide.runs.model import baked_harmonics
 from polarguide.shading.cubemap import ringed_texels
 from polarguide.shading.model import PLAIN_LAYERS, Light, PageShading, Parameters, ShadingModel
 from polarguide.visualization.pages import page, page_part
@@ -229,7 +229,7 @@ def share_page(
         cameras: poses to choose from by name, at least one. first: name of the one to begin with.
         title, caption: any text; it is escaped.
         metrics: labels and values, any text. notes: paragraphs before them, any text.
-        presentation: white balance, up axis, scale and credit.
+        presentation: color, up axis, scale and credit.
         footprints: [N] of the training, see ``raster.magnification``; None: not known.
 
     Returns:
@@ -268,6 +268,8 @@ def share_page(
         version=__version__,
         title=title,
         caption=caption,
+        stops=STOPS,
+        color="white balance" if presentation.chart is None else "color chart",
         notes=(*notes, *shaded.notes),
         metrics=metrics,
         credit=" · ".join(text for text in credit if text),
@@ -285,17 +287,16 @@ def share_page(
 
 def baked_page(gaussians: Parameters, light: Light, shading: ShadingModel) -> PageShading:
     """The page of a model for which there are no shaders: linear harmonics of its Gaussians' own colors, and a note."""
-    count = len(gaussians["means"])
-    dc, rest = refit_sh_to_display(
-        lambda directions: gaussian_colors(gaussians, light, shading, directions).cpu(), count
-    )
+    dc, rest = baked_harmonics(gaussians, light, shading, shown=lambda colors: colors, linear=True)
     return PageShading("plain", {"color": dc[:, 0], "harmonics": rest}, notes=[BAKED])
 
 
 def _frame(cameras: Mapping[str, Camera], first: str, presentation: Presentation) -> dict[str, Any]:
     around = presentation.upright(scene_frame(list(cameras.values())))
+    color = msgspec.structs.replace(presentation, exposure=None).color
     return {
-        "white": list(presentation.white_balance or (1.0, 1.0, 1.0)),
+        "color": None if color is None else color.flatten().tolist(),
+        "exposure": presentation.exposure or 0.0,
         "metersPerUnit": presentation.meters_per_unit,
         "up": around.up.tolist(),
         "center": around.center.tolist(),

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from polarguide.capture.layout import refuse_scene
-from polarguide.capture.memory import require_memory
+from polarguide.capture.layout import refuse_scene, require_memory
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import atomic, make_folder, require_inside
 from polarguide.core.options import PathLike, check_finite
@@ -169,12 +168,12 @@ def _pictures(
 ) -> Iterator[Picture]:
     """Layers side by side, a picture for each camera."""
     depths = rendered_depths(run, cameras) if "depth" in layers else None
-    gains, surface = run.presentation.gains, bool({"normal", "depth"} & {*layers})
+    color, surface = run.presentation.color, bool({"normal", "depth"} & {*layers})
     polarized = not {*layers}.isdisjoint(POLARIZED)
     with reporter.track("rendering", len(cameras)) as advance:
         for number, camera in enumerate(cameras):
             result = run.result(camera, depth="depth" in layers, surface=surface, polarized=polarized)
             run.chosen_layers(result, layers)
-            pictures = [layer_picture(result, name, camera, depths, gains=gains) for name in layers]
+            pictures = [layer_picture(result, name, camera, depths, color=color) for name in layers]
             advance(number + 1)
             yield np.concatenate([picture for picture in pictures if picture is not None], axis=1)

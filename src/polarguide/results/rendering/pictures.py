@@ -90,7 +90,7 @@ def write_pictures(
         views: ``test``, ``train``, ``all``, or names separated by commas.
         layers: names of layers, all of the run's by default; one that the recipe has not is left out, and named to
             the reporter.
-        format: png as a display shows layers, with the white balance of the run's presentation; exr and npy hold their
+        format: png as a display shows layers, in the color of the run's presentation; exr and npy hold their
             linear numbers, in the units that ``layers.json`` beside them states. The contact sheet is PNG.
         transparent: PNG files are transparent where nothing is, by alpha; their colors are those of what is there, so
             that no dark rim shows on another background. Not on the contact sheet.
@@ -115,7 +115,7 @@ def write_pictures(
     make_folder(folder)
     rows: list[tuple[str, dict[str, Picture]]] = []
     missing: set[str] = set()
-    gains = run.presentation.gains
+    color = run.presentation.color
     polarization = run.polarization
     about = {"Polarization": polarization}
     depths = common_depths(run, chosen) if "depth" in names else None
@@ -125,7 +125,7 @@ def write_pictures(
             result = run.result(view.camera, polarized=polarized).to("cpu")
             pictures = {
                 name: layer_picture(
-                    result, name, view.camera, depths, exposed=name == "reflection", gains=gains
+                    result, name, view.camera, depths, exposed=name == "reflection", color=color
                 )
                 for name in names
             }
@@ -135,7 +135,7 @@ def write_pictures(
                 elif format == "png" and transparent:
                     rendered = _unblended(result)
                     exposed = name == "reflection"
-                    whole = layer_picture(rendered, name, view.camera, depths, exposed=exposed, gains=gains)
+                    whole = layer_picture(rendered, name, view.camera, depths, exposed=exposed, color=color)
                     assert whole is not None
                     alpha = (result.alpha.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
                     figures.write_png(folder / f"{view.name}_{name}.png", whole, alpha, about)
@@ -145,7 +145,7 @@ def write_pictures(
                     _write_numbers(folder / f"{view.name}_{name}.{format}", getattr(result, name))
             if len(rows) < SHEET_VIEWS:
                 cells = {name: picture for name, picture in pictures.items() if picture is not None}
-                rows.append((view.name, cells | reference_pictures(view, gains, depths)))
+                rows.append((view.name, cells | reference_pictures(view, color, depths)))
             advance(number + 1)
     if format != "png":
         write_whole(

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import torch
 from torch import Tensor
 
@@ -16,6 +17,8 @@ from polarguide.capture.layout import find_layout
 from polarguide.capture.presentation import (
     CREDITS,
     PRESENTATION_FILE,
+    WHITE,
+    Chart,
     Presentation,
     Vector,
     parse_length,
@@ -29,6 +32,7 @@ from polarguide.core.options import DeviceName, PathLike
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import decode
 from polarguide.core.text import decimal
+from polarguide.results.rendering.chart import chart_of
 from polarguide.results.rendering.picking import gains_of, gray_world, photograph_color, surface_at
 from polarguide.runs.folder import CONFIGURATION
 from polarguide.runs.opened import OpenedRun
@@ -40,6 +44,8 @@ def present(
     folder: PathLike,
     *,
     white_balance: str | None = None,
+    chart: str | None = None,
+    exposure: str | None = None,
     up_axis: str | None = None,
     points: Sequence[str] = (),
     distance: str | None = None,
@@ -61,6 +67,9 @@ def present(
         folder: of a scene, whose runs then have it from there, or of a run.
         white_balance: ``none``, ``gray`` (the mean of the photographs becomes gray), gains of R, G and B such as
             ``1.9,1,1.6``, or VIEW,X,Y: a place in a photograph that should be white or gray.
+        chart: ``none``, or VIEW,X,Y,X,Y,X,Y,X,Y: the centers of the corner patches of a 24-patch color chart, around
+            it; or the folder of another scene or run, whose chart it takes. It replaces a white balance.
+        exposure: stops by which all is shown brighter, -8 to 8, or ``none``.
         up_axis: ``none`` (as the cameras say), an axis such as ``z`` or ``-y``, three numbers, or VIEW,X,Y: a place
             whose surface is level; up is its normal there.
         points: two PLACEs whose distance is known. distance: it, such as ``85mm``.
@@ -81,6 +90,13 @@ def present(
     changes: dict[str, Any] = {}
     if white_balance is not None:
         changes["white_balance"] = None if white_balance == "none" else _white_balance(white_balance, place)
+    if chart is not None:
+        changes["chart"] = None if chart == "none" else _chart(chart, place)
+    if exposure is not None:
+        wanted = "stops such as 0.5, or none"
+        changes["exposure"] = (
+            None if exposure == "none" else _require_numbers(exposure, 1, "exposure", wanted)[0]
+        )
     if up_axis is not None:
         changes["up_axis"] = None if up_axis == "none" else _up_axis(up_axis, place)
     if points or distance is not None or meters_per_unit is not None:
@@ -93,7 +109,8 @@ def present(
         name: "" if (text := texts[name]) == "none" else text for name in CREDITS if texts[name] is not None
     }
     place.refuse_inherited(name for name, value in changes.items() if value in (None, ""))
-    record = {**own.to_record(), **changes}
+    kept = {name: value for name, value in own.to_record().items() if name not in _replaced(changes)}
+    record = {**kept, **{name: msgspec.to_builtins(value) for name, value in changes.items()}}
     decoded = decode(record, Presentation, "presentation", remedy="Correct the value; nothing was written.")
     if changes:
         write_presentation(place.folder, decoded)
@@ -206,6 +223,23 @@ def _white_balance(text: str, place: _Place) -> Vector | None:
     return red, green, blue
 
 
+def _replaced(changes: dict[str, Any]) -> tuple[str, ...]:
+    """White balance and chart, where one of them is given: it takes the other's place."""
+    return WHITE if any(changes.get(name) is not None for name in WHITE) else ()
+
+
+def _chart(text: str, place: _Place) -> Chart:
+    expected = "none, VIEW and the four corners X,Y,X,Y,X,Y,X,Y, or a folder with a chart"
+    name, *numbers = text.rsplit(",", 8)
+    corners = _numbers(",".join(numbers))
+    if len(corners) == 8:
+        return chart_of(place.scene.view(name), corners)
+    other = read_presentation(Path(text)).chart if Path(text).is_dir() else None
+    if other is None:
+        raise _wrong("chart", expected, text)
+    return other
+
+
 def _up_axis(text: str, place: _Place) -> Vector | None:
     if (axis := AXES.get(text.removeprefix("-").removeprefix("+").lower())) is not None:
         sign = -1.0 if text.startswith("-") else 1.0
@@ -272,8 +306,12 @@ def _wrong(where: str, expected: str, found: str) -> PolarguideError:
 
 def described(presentation: Presentation) -> list[str]:
     """The fields that are set, a line each; "nothing is set" for an empty presentation."""
+    chart, exposure = presentation.chart, presentation.exposure
     lines = {
         "white balance": _listed(presentation.white_balance),
+        "color chart": chart
+        and f"{chart.patches} patches in {chart.view}, CIEDE2000 {chart.delta_e:.1f}, up to {chart.delta_e_worst:.1f}",
+        "exposure": f"{exposure:+g} stops" if exposure else "",
         "up axis": _listed(presentation.up_axis),
         "scale": ""
         if presentation.meters_per_unit is None

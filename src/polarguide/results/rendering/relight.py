@@ -2,7 +2,7 @@
 
 A panorama [H, 2 H, 3] is upright in the scene: row i, column j is at latitude ``pi (1/2 - (i + 1/2) / H)`` over the
 cameras' common level and at longitude ``pi ((j + 1/2) / H - 1)`` from the middle, to the right. Files hold linear
-radiance on the scale of the photographs (S0 / 2).
+radiance on the scale of the photographs (S0 / 2), in the color of the run's presentation.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
 from polarguide.capture.formats.arrays import read_radiance
+from polarguide.capture.presentation import in_camera
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import atomic, in_utf8, write_whole
 from polarguide.core.options import PathLike
@@ -55,7 +56,8 @@ def relight(
     light = run.model.light
     around = run.frame
     if panorama is not None:
-        texels = texels_of(read_panorama(Path(panorama)), cubemap, around, RELIT_RESOLUTION)
+        picture = in_camera(read_panorama(Path(panorama)), run.presentation.color)
+        texels = texels_of(picture, cubemap, around, RELIT_RESOLUTION)
         light[cubemap.name] = texels.to(light[cubemap.name].device)
     light[cubemap.name] = turned_cubemap(light[cubemap.name].detach(), around.turn(degrees), RELIT_RESOLUTION)
     if run.model.shading.local_note:

@@ -5,28 +5,26 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from msgspec import Meta
 
 from polarguide.capture.calibration import Sense
-from polarguide.capture.sensor.pattern import Packing, SensorName, sensor_pattern
+from polarguide.capture.sensor.pattern import MosaicOptions, Positive, SensorName, sensor_pattern
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options
-from polarguide.core.text import decimal
+from polarguide.core.text import decimals
 
 NAMES = "names"
 _NUMBER = re.compile(r"(?:^|.*[_ ])(\d+(?:\.\d+)?)(?:deg)?")
 _SIGNED = re.compile(r".*[-+\u2212]\d+(?:\.\d+)?(?:deg)?")
 _IN_DEGREES = re.compile(r"\d ?deg(?![a-z])")
-_NotNegative = Annotated[int, Meta(ge=0, le=1 << 20)]
-_Positive = Annotated[int, Meta(ge=1, le=1 << 31)]
 
 
 @dataclass(frozen=True)
-class CalibrateSettings:
+class CalibrateSettings(MosaicOptions):
     """How the shots of a polarizer were taken, and what is estimated from them.
 
     Attributes:
@@ -40,19 +38,13 @@ class CalibrateSettings:
         polarizer_extinction: Extinction ratio of the polarizer; without it it is taken as ideal.
         flat: Picture of the same light without the polarizer (or a folder of some), which has to be unpolarized.
         dark_frame: Picture with the lens covered (or a folder of some), subtracted in place of the black level.
-        black_level: Stored value without light.
         saturation: Stored value from which the sensor saturates; without it full scale.
         bits: Bits of a sensor value in 16-bit files; without it 12 if no value exceeds 4095, else 16.
-        packing: Packing of .raw files (there are several of 10 and of 12 bits; never guessed).
-        width: Width of .raw files in pixels.
-        height: Height of .raw files in pixels.
-        offset_x: Column of the sensor at which the region of interest starts.
-        offset_y: Row of the sensor at which it starts.
         block: Side in pixels of the blocks that share analyzer vectors; 1 gives each pixel its own; without it blocks
             of 32, or single pixels where these differ by more than their noise.
     """
 
-    sensor: SensorName
+    sensor: SensorName = field()
     lens: Annotated[str, Meta(max_length=200)] = ""
     angles: str | None = None
     sense: Sense = "ccw"
@@ -60,14 +52,8 @@ class CalibrateSettings:
     polarizer_extinction: Annotated[float, Meta(ge=10)] | None = None
     flat: Path | None = None
     dark_frame: Path | None = None
-    black_level: Annotated[float, Meta(ge=0)] = 0.0
-    saturation: _Positive | None = None
+    saturation: Positive | None = None
     bits: Annotated[int, Meta(ge=8, le=16)] | None = None
-    packing: Packing | None = None
-    width: _Positive | None = None
-    height: _Positive | None = None
-    offset_x: _NotNegative = 0
-    offset_y: _NotNegative = 0
     block: Annotated[int, Meta(ge=1, le=4096)] | None = None
 
     def checked(self) -> CalibrateSettings:
@@ -144,11 +130,8 @@ def _angle_of(path: Path) -> float:
 
 
 def _numbers(text: str) -> list[float]:
-    try:
-        numbers = [decimal(part) for part in text.split(",")]
-    except ValueError:
-        numbers = [math.nan]
-    if not all(map(math.isfinite, numbers)):
+    numbers = list(decimals(text))
+    if not numbers or not all(map(math.isfinite, numbers)):
         raise PolarguideError(
             "--angles",
             expected="angles in degrees such as 0,15,30, or names",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -184,21 +184,19 @@ def _wrong(
 
 def faults(figures: Mapping[str, Value], bounds: Mapping[str, Bound]) -> list[str]:
     """Which figures are beyond their bounds, in words. One without a value is: nothing says that it is within."""
-    return list(_faults(figures, bounds))
-
-
-def _faults(figures: Mapping[str, Value], bounds: Mapping[str, Bound]) -> Iterator[str]:
+    beyond = []
     for field, bound in bounds.items():
         value = figures[field]
         if not isinstance(value, int | float):
-            yield f"{field} has no value"
+            beyond.append(f"{field} has no value")
             continue
         low, high = bound.min, bound.max
         if field in AXIAL and low is not None and high is not None and low > high:
             # The allowed angles go through 180.
             if high < value < low:
-                yield f"{field} {value:.5g} outside {low:g} through 180 to {high:g}"
+                beyond.append(f"{field} {value:.5g} outside {low:g} through 180 to {high:g}")
         elif low is not None and value < low:
-            yield f"{field} {value:.5g} under {low:g}"
+            beyond.append(f"{field} {value:.5g} under {low:g}")
         elif high is not None and value > high:
-            yield f"{field} {value:.5g} over {high:g}"
+            beyond.append(f"{field} {value:.5g} over {high:g}")
+    return beyond

@@ -1,4 +1,4 @@
-"""Measure shots, one after the other, into a table."""
+"""Measure shots, one after the other: what regions, limits and a reference make of their maps, into a table or none."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 from polarguide.capture.exposures import Angle
 from polarguide.capture.given_arrays import Array
@@ -16,16 +19,166 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, require_inside
 from polarguide.core.options import PathLike
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.shots.exposures import ExposureSet, find_shots, require_elsewhere
-from polarguide.shots.given import NAME, array_shot, is_array, stacked_array
-from polarguide.shots.measurement.fields import KEYS, Value
-from polarguide.shots.measurement.measurer import Measured, Measurer, unread_entry
-from polarguide.shots.measurement.options import MeasureOptions
+from polarguide.shots.develop import check_files
+from polarguide.shots.exposures import find_shots, require_elsewhere
+from polarguide.shots.maps import ShotMaps
+from polarguide.shots.measurement.fields import FORMAT, KEYS, NO_LIMITS, Value, faults, read_limits
 from polarguide.shots.measurement.pictures import difference_picture, regions_picture
+from polarguide.shots.measurement.regions import (
+    WHOLE,
+    Differences,
+    Reference,
+    Region,
+    box_of,
+    difference_figures,
+    parse_regions,
+    placed,
+    region_figures,
+)
 from polarguide.shots.measurement.table import Entry, FileStamp, Status, Table, stamps
-from polarguide.shots.options import ShotOptions
-from polarguide.shots.read import UNREADABLE
+from polarguide.shots.options import MeasureOptions, ShotOptions
+from polarguide.shots.read import NAME, UNREADABLE, array_shot, fault_of, is_array, read_shot, stacked_array
+from polarguide.shots.sets import ExposureSet
 from polarguide.visualization.figures import write_png
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Measured:
+    """A shot that was measured.
+
+    Attributes:
+        maps: of it. differences: to the reference, None without one.
+        regions: by ``Field.key``, from ``region`` on. status: the worst of them.
+        beyond: all regions with the limits that they are beyond; empty where none is.
+    """
+
+    maps: ShotMaps
+    differences: Differences | None
+    regions: tuple[dict[str, Value], ...]
+    status: Status
+    beyond: Sequence[tuple[Region, Sequence[str]]]
+
+    def entry(self, files: tuple[FileStamp, ...] = (), picture: str = "") -> Entry:
+        """Its line of the table."""
+        maps = self.maps
+        return Entry(FORMAT, maps.name, files, self.status, "", maps.notes, self.regions, picture)
+
+
+class Measurer:
+    """Everything that stays the same from shot to shot."""
+
+    def __init__(self, options: MeasureOptions, reading: ShotOptions) -> None:
+        """Check the options, read limits and reference.
+
+        Raises:
+            PolarguideError: one of them is wrong.
+        """
+        self._reading = reading.checked()
+        check_files(self._reading)
+        self._options = options
+        self._regions = parse_regions(options.roi)
+        names = [region.name for region in self._regions] or [WHOLE]
+        self._limits = NO_LIMITS
+        if options.limits is not None:
+            self._limits = read_limits(options.limits, names, reference=options.reference is not None)
+        self.reference = None
+        if options.reference is not None:
+            self.reference = Reference.read(options.reference, self._reading)
+            placed(self._regions, self.reference.size, options.reference)
+        self._part = None if self.reference is not None else box_of(self._regions)
+
+    @property
+    def reference_files(self) -> tuple[Path, ...]:
+        """Files that are compared with, and not measured where they lie in a watched folder."""
+        return () if self.reference is None else self.reference.shot.paths
+
+    def read(self, shot: ExposureSet, *, whole: bool = False) -> ShotMaps:
+        """The maps of a shot: of all of it where ``whole``, or where it is compared with a reference; else at least of
+        the regions.
+
+        Raises:
+            PolarguideError, OSError, MemoryError: it cannot be read.
+        """
+        return read_shot(shot, self._reading, part=None if whole else self._part)
+
+    def measured(self, shot: ExposureSet, maps: ShotMaps) -> Measured:
+        """What its maps say.
+
+        Raises:
+            PolarguideError: it does not fit the regions or the reference.
+        """
+        regions = placed(self._regions, maps.whole or maps.size, shot.where)
+        differences = None if self.reference is None else self.reference.differences(maps)
+        found = [self._region(maps, region, differences) for region in regions]
+        statuses = [str(figures["status"]) for _, figures, _ in found]
+        status: Status = (
+            "beyond" if "beyond" in statuses else "within" if "within" in statuses else "measured"
+        )
+        beyond = [(region, which) for region, _, which in found] if status == "beyond" else []
+        return Measured(maps, differences, tuple(figures for _, figures, _ in found), status, beyond)
+
+    def entry(self, shot: ExposureSet) -> Entry:
+        """The line of a shot, which says why where it cannot be measured."""
+        try:
+            return self.measured(shot, self.read(shot)).entry()
+        except UNREADABLE as error:
+            return unread_entry(shot, (), error)
+
+    def _region(
+        self, maps: ShotMaps, region: Region, differences: Differences | None
+    ) -> tuple[Region, dict[str, Value], list[str]]:
+        local = dataclasses.replace(region, x=region.x - maps.origin[0], y=region.y - maps.origin[1])
+        figures = {
+            **region_figures(maps, local, self._options.threshold),
+            **difference_figures(differences, local),
+        }
+        bounds = self._limits.of(region.name)
+        beyond = faults(figures, bounds)
+        status = "beyond" if beyond else "within" if bounds else "measured"
+        head: dict[str, Value] = {
+            "region": region.name,
+            "x": region.x,
+            "y": region.y,
+            "width": region.width,
+            "height": region.height,
+            "status": status,
+            "why": ", ".join(beyond),
+        }
+        return region, {**head, **figures}, beyond
+
+    def settings(self) -> dict[str, Any]:
+        """What the figures depend on, as JSON."""
+        reading = {f.name: getattr(self._reading, f.name) for f in dataclasses.fields(self._reading)}
+        named = [value for value in reading.values() if isinstance(value, Path)]
+        made: dict[str, Any] = msgspec.to_builtins(
+            {
+                "reading": reading,
+                "read_files": stamps(tuple(named)),
+                "regions": [
+                    {
+                        name: value
+                        for name, value in dataclasses.asdict(region).items()
+                        if name != "corners" or value
+                    }
+                    for region in self._regions
+                ],
+                "threshold": self._options.threshold,
+                "limits": self._limits,
+                "reference": stamps(self.reference_files),
+            },
+            enc_hook=str,
+        )
+        return made
+
+
+def unread_entry(shot: ExposureSet, files: tuple[FileStamp, ...], error: BaseException) -> Entry:
+    """The line of a shot that cannot be measured.
+
+    Args:
+        shot: the shot. files: ``stamps`` of its files. error: why, one of ``UNREADABLE``.
+    """
+    return Entry(FORMAT, shot.name, files, "unread", str(fault_of(shot, error)), (), ())
+
 
 BEYOND, DIFFERENCES = "beyond", "differences"
 """Folders of pictures beside the table."""
@@ -94,11 +247,6 @@ class Line:
     def __exit__(self, *_: object) -> None:
         self.table.close()
 
-    @property
-    def reference_files(self) -> tuple[Path, ...]:
-        """Files that are compared with, and not measured where they lie in a watched folder."""
-        return self.measurer.reference_files
-
     def measure(self, shot: ExposureSet, files: tuple[FileStamp, ...]) -> Entry:
         """Measure a shot, draw what is to be drawn, and write its line.
 
@@ -138,9 +286,10 @@ class Line:
             maps = maps if maps.whole is None else self.measurer.read(shot, whole=True)
             make_folder(self.out / BEYOND)
             write_png(self.out / BEYOND / f"{name}.png", regions_picture(maps, measured.beyond))
-        if differences is not None:
+        reference = self.measurer.reference
+        if differences is not None and reference is not None:
             make_folder(self.out / DIFFERENCES)
-            picture = difference_picture(differences, maps.name, self.measurer.reference_name)
+            picture = difference_picture(differences, maps.name, reference.name)
             write_png(self.out / DIFFERENCES / f"{name}.png", picture)
         return name
 

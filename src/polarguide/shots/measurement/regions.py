@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from polarguide.capture.layout import angle_of_folder
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import shortened
-from polarguide.shots.exposures import ExposureSet, find_shots
+from polarguide.shots.exposures import find_shots
 from polarguide.shots.maps import Map, Reason, ShotMaps
 from polarguide.shots.measurement.fields import COMPARED, DIFFERENCE_PERCENTILE, PERCENTILES, Value
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import read_shot
+from polarguide.shots.sets import ExposureSet
 
 WHOLE = "all"
 """The region that is measured where none is given."""

@@ -31,7 +31,7 @@ from polarguide.core.files import (
     write_whole,
     writing,
 )
-from polarguide.core.records import decode, read_record, shortened, to_json
+from polarguide.core.records import decode, first_difference, read_record, shortened, to_json
 from polarguide.core.spreadsheet import csv_lines
 from polarguide.core.system import only_writer
 from polarguide.shots.measurement.fields import FORMAT, KEYS, Value
@@ -131,10 +131,9 @@ class Table:
                 )
             )
             self._begin({"format": FORMAT, **settings}, overwrite)
-            stack.callback(self._close_files)
             for name in (LINES, CSV):
                 with writing(folder / name):
-                    self._files.append(open(folder / name, "ab", buffering=0))  # noqa: SIM115, close() does
+                    self._files.append(stack.enter_context(open(folder / name, "ab", buffering=0)))
             self._stack = stack.pop_all()
 
     def __enter__(self) -> Table:
@@ -146,10 +145,6 @@ class Table:
     def close(self) -> None:
         """Let others write the table."""
         self._stack.close()
-
-    def _close_files(self) -> None:
-        for file in self._files:
-            file.close()
 
     def status_of(self, files: tuple[FileStamp, ...]) -> Status | None:
         """The status in the line of these files as they are, None where there is no such line."""
@@ -282,13 +277,9 @@ def _holds_measurements(path: Path) -> bool:
 
 
 def _other_settings(path: Path, before: dict[str, Any], now: dict[str, Any]) -> PolarguideError:
-    name = next(name for name in {**before, **now} if before.get(name) != now.get(name))
-    was, is_now = before.get(name), now.get(name)
-    while isinstance(was, dict) and isinstance(is_now, dict):
-        inner = next(key for key in {**was, **is_now} if was.get(key) != is_now.get(key))
-        name, was, is_now = f"{name}.{inner}", was.get(inner), is_now.get(inner)
+    name, was, is_now = first_difference("", before, now)
     return PolarguideError(
-        f"{path} ({name})",
+        f"{path} ({name[1:]})",
         expected=shortened(was, 200),
         found=shortened(is_now, 200),
         remedy=f"One table has one set of options. {_ANEW}",

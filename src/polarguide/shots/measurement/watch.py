@@ -17,12 +17,12 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_folder
 from polarguide.core.options import PathLike
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.shots.exposures import ExposureSet, list_shots, mosaics, require_elsewhere
+from polarguide.shots.exposures import list_shots, mosaics, require_elsewhere
 from polarguide.shots.measurement.line import ChangedWhileRead, Heard, Line, Outcome, ignore
-from polarguide.shots.measurement.options import MeasureOptions, WatchOptions
 from polarguide.shots.measurement.table import Entry, FileStamp, stamps
-from polarguide.shots.options import ShotOptions
+from polarguide.shots.options import MeasureOptions, ShotOptions, WatchOptions
 from polarguide.shots.read import UNREADABLE
+from polarguide.shots.sets import ExposureSet
 
 _POLL = (0.05, 0.5)
 """Seconds between two looks, at least and at most, unless a look takes long itself."""
@@ -141,7 +141,7 @@ def watch_folder(
     reading.require_kind("filter" if reading.sensor is None else "mosaic", root.name)
     counts: Counter[str] = Counter()
     with Line(Path(out), options, reading) as line:
-        ignored = [*line.reference_files, *([reading.dark_frame] if reading.dark_frame else [])]
+        ignored = [*line.measurer.reference_files, *([reading.dark_frame] if reading.dark_frame else [])]
         there = _Folder(root, reading, reporter, frozenset(map(os.path.realpath, ignored)), watching.patience)
         watch = _Watch(line, watching, reporter)
         step = min(max(watching.settle / 2, _POLL[0]), _POLL[1])

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from polarguide.capture.presentation import Crop, Presentation, balanced
+from polarguide.capture.presentation import Presentation, colored, colored_reflectance
 from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.options import BaseColor, ModelOptions
 from polarguide.core.progress import Reporter
 from polarguide.core.system import free_memory
-from polarguide.geometry.camera import Camera
 from polarguide.results.export.model.bake import Baked, ColorSource, bake
 from polarguide.results.export.model.gltf import Textured, color_pixels, linear_pixels
 from polarguide.results.export.model.irradiance import WHAT, Surroundings, delit, irradiance
+from polarguide.results.export.model.subject import Inside, SurfaceView, counted, subject_of, subject_surface
 from polarguide.results.export.model.texels import Texels, texels_of
-from polarguide.results.export.model.topology import simplified, topology
 from polarguide.results.export.model.unwrap import Unwrapped, unwrap
 from polarguide.results.export.placement import Placement
 from polarguide.results.rendering.mesh import ColoredMesh, Surface, fused_surface, painted
@@ -27,9 +27,7 @@ from polarguide.results.rendering.relight import needs_radiance
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.deferred import DeferredShading
-from polarguide.shading.result import RenderResult
 
-SurfaceView = Callable[[Camera], RenderResult]
 SOURCES: dict[BaseColor, ColorSource] = {
     "delit": "diffuse",
     "diffuse": "diffuse",
@@ -96,26 +94,27 @@ def textured_model(
         needs_radiance(run.model.shading, what=WHAT)
         require_package("embreex", WHAT, extra="model")
     with reporter.track("fusing the surface"):
-        mesh, voxel = _subject(run, surface_view, presentation.crop, options, resolution)
-    reporter.say(_counted(mesh.surface))
+        inside = subject_of(run, presentation.crop, masked=options.masked)
+        surface, views, box = subject_surface(run, surface_view, inside, options, resolution)
+        mesh = painted(surface, views, box)
+    reporter.say(counted(mesh.surface))
     unwrapped = unwrap(mesh.surface.vertices, mesh.surface.faces, options.texture, folder, reporter)
     texels = texels_of(unwrapped, options.texture)
     vertices, normals = (values[unwrapped.source] for values in (mesh.surface.vertices, mesh.surface.normals))
     facing = texels.interpolated(unwrapped.faces, normals)
     facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-9)
     places = texels.interpolated(unwrapped.faces, vertices)
-    baked = bake(run, run.scene.train_views, places, facing, SOURCES[kind], voxel, reporter)
+    baked = bake(run, run.scene.train_views, places, facing, SOURCES[kind], box.size, reporter)
     reporter.say(
         f"{unwrapped.charts:,} charts, {len(texels.index) / options.texture**2:.0%} of the texture used; "
         f"{1 - baked.seen.mean():.1%} of the surface is in no view and has the nearest color"
     )
-    color = baked.color
+    light = None
     if kind == "delit":
-        light = _irradiance(run, mesh, presentation.crop, reporter)[unwrapped.source]
-        color = delit(color, texels.interpolated(unwrapped.faces, light), _index(run))
-        color = _within_white(baked.filled(color), baked, reporter)
-    else:
-        color = balanced(torch.from_numpy(color), presentation.gains).numpy()
+        light = texels.interpolated(
+            unwrapped.faces, _irradiance(run, mesh, inside, reporter)[unwrapped.source]
+        )
+    color, baked = _presented(baked, light, presentation.color, _index(run), reporter)
     axes = run.frame.panorama_axes().numpy()
     textures = _textures(run, baked, texels, options.albedo_scale * color, lit=not options.unlit)
     return Textured(
@@ -126,6 +125,20 @@ def textured_model(
         *textures,
         _index(run),
     )
+
+
+def _presented(
+    baked: Baked, light: NDArray[np.float32] | None, color: Tensor | None, index: float, reporter: Reporter
+) -> tuple[NDArray[np.float32], Baked]:
+    """Base color [M, 3] of linear sRGB, divided by the irradiance ``light`` [M, 3] if there is one; and texels with the
+    reflectance of metals in it. Radiance and irradiance get the color of the presentation before they are divided.
+    """
+    metal = colored_reflectance(torch.from_numpy(baked.reflectance), color).numpy()
+    shown = colored(torch.from_numpy(baked.color), color).numpy()
+    if light is not None:
+        shown = delit(shown, colored(torch.from_numpy(light), color).numpy(), index)
+        shown = _within_white(baked.filled(shown), baked, reporter)
+    return shown, replace(baked, reflectance=metal)
 
 
 def _within_white(color: NDArray[np.float32], baked: Baked, reporter: Reporter) -> NDArray[np.float32]:
@@ -139,15 +152,6 @@ def _within_white(color: NDArray[np.float32], baked: Baked, reporter: Reporter) 
         color = color * np.float32(factor)
     return color * np.minimum(1, WHITEST / np.maximum(color.max(axis=1, keepdims=True), 1e-6)).astype(
         np.float32
-    )
-
-
-def _counted(surface: Surface) -> str:
-    """The counts of a mesh, for people."""
-    counts = topology(surface.faces)
-    return (
-        f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, {counts.pieces} pieces; "
-        f"{counts.boundary_edges:,} boundary edges, {counts.non_manifold_edges} non-manifold edges"
     )
 
 
@@ -167,19 +171,8 @@ def _index(run: OpenedRun) -> float:
     return float(run.model.shading.refractive_index)
 
 
-def _subject(
-    run: OpenedRun, surface_view: SurfaceView, crop: Crop | None, options: ModelOptions, resolution: int
-) -> tuple[ColoredMesh, float]:
-    """The mesh of the subject with learned normals and diffuse colors, and the side of a voxel."""
-    surface, views, box = fused_surface(run.cameras, surface_view, resolution=resolution)
-    if crop is not None:
-        inside = crop.inside(torch.from_numpy(surface.vertices), run.camera_frame).numpy()
-        surface = ColoredMesh(surface, surface.vertices).within(inside).surface
-    return painted(simplified(surface, options.triangles), views, box), box.size
-
-
 def _irradiance(
-    run: OpenedRun, mesh: ColoredMesh, crop: Crop | None, reporter: Reporter
+    run: OpenedRun, mesh: ColoredMesh, inside: Inside | None, reporter: Reporter
 ) -> NDArray[np.float64]:
     """Irradiance [V, 3] at the vertices of the subject."""
     cubemap = needs_radiance(run.model.shading, what=WHAT)
@@ -189,18 +182,17 @@ def _irradiance(
         found = cubemap.radiance(cubemap_lookup(texels, torch.from_numpy(directions).float()))
         return np.asarray(found.double().numpy())
 
-    around = Surroundings(radiance, mesh if crop is None else _joined(mesh, _outside(run, crop)))
+    around = Surroundings(radiance, mesh if inside is None else _joined(mesh, _outside(run, inside)))
     surface = mesh.surface
     with reporter.track("light on the surface", len(surface.vertices)) as progress:
         return irradiance(surface.vertices, surface.normals, around, _index(run), progress)
 
 
-def _outside(run: OpenedRun, crop: Crop) -> ColoredMesh:
-    """What the scene has outside the crop box: it shades the subject and gives light back."""
+def _outside(run: OpenedRun, inside: Inside) -> ColoredMesh:
+    """What the scene has beside the subject: it shades the subject and gives light back."""
     surface, views, box = fused_surface(run.cameras, run.result, resolution=SURROUNDINGS_RESOLUTION)
     mesh = painted(surface, views, box)
-    inside = crop.inside(torch.from_numpy(surface.vertices), run.camera_frame).numpy()
-    faces = surface.faces[~inside[surface.faces].any(axis=1)]
+    faces = surface.faces[~inside(surface.vertices)[surface.faces].any(axis=1)]
     kept, used = mesh.surface.with_faces(faces)
     return ColoredMesh(kept, mesh.colors[used])
 

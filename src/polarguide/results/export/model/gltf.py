@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,13 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.core.files import write_whole
 from polarguide.optics.color import srgb_encode_array
+from polarguide.results.export.glb import ELEMENTS, Binary
 
 QUALITY = 92
 """Of JPEG textures."""
-_ARRAY, _ELEMENTS = 34962, 34963
-_FLOAT, _UNSIGNED = 5126, 5125
 _SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
 """Linear with mip maps; clamped to the edge."""
 Pixels = NDArray[np.uint8]
@@ -74,50 +70,21 @@ def write_glb(path: Path, model: Textured, asset: dict[str, Any], *, jpeg: bool)
         PolarguideError: it cannot be written.
     """
     images, material, extensions = _material(model, jpeg=jpeg)
-    arrays = [
-        *(np.ascontiguousarray(values, "<f4") for values in (model.vertices, model.normals, model.uv)),
-        np.ascontiguousarray(model.faces, "<u4"),
-    ]
-    blob, views = bytearray(), []
-    targets = [_ARRAY, _ARRAY, _ARRAY, _ELEMENTS]
-    for data, target in [
-        *zip((array.tobytes() for array in arrays), targets, strict=True),
-        *((data, None) for _, data in images),
-    ]:
-        blob += bytes(-len(blob) % 4)
-        view = {"buffer": 0, "byteOffset": len(blob), "byteLength": len(data)}
-        views.append(view if target is None else {**view, "target": target})
-        blob += data
-    blob += bytes(-len(blob) % 4)
-    places = arrays[0]
+    binary = Binary()
+    attributes = {
+        "POSITION": binary.array(model.vertices.astype("<f4"), bounds=True),
+        "NORMAL": binary.array(model.normals.astype("<f4")),
+        "TEXCOORD_0": binary.array(model.uv.astype("<f4")),
+    }
+    faces = binary.array(model.faces.reshape(-1).astype("<u4"), ELEMENTS)
     tree = {
-        "asset": {"version": "2.0", **asset},
         **({"extensionsUsed": extensions} if extensions else {}),
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "model"}],
-        "meshes": [
-            {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2}, "indices": 3, "material": 0}]}
-        ],
         "materials": [material],
         "textures": [{"source": k, "sampler": 0} for k in range(len(images))],
         "samplers": [_SAMPLER],
-        "images": [{"bufferView": len(arrays) + k, "mimeType": kind} for k, (kind, _) in enumerate(images)],
-        "accessors": [
-            {"bufferView": 0, "componentType": _FLOAT, "count": len(places), "type": "VEC3",
-             "min": places.min(axis=0).tolist(), "max": places.max(axis=0).tolist()},
-            {"bufferView": 1, "componentType": _FLOAT, "count": len(places), "type": "VEC3"},
-            {"bufferView": 2, "componentType": _FLOAT, "count": len(places), "type": "VEC2"},
-            {"bufferView": 3, "componentType": _UNSIGNED, "count": arrays[3].size, "type": "SCALAR"},
-        ],
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(blob)}],
-    }  # fmt: skip
-    text = json.dumps(tree).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(blob))
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(blob), b"BIN\0") + blob
-    write_whole(path, head + chunks)
+        "images": [{"bufferView": binary.view(data), "mimeType": kind} for kind, data in images],
+    }
+    binary.write(path, asset, {"attributes": attributes, "indices": faces, "material": 0}, tree)
 
 
 def _material(model: Textured, *, jpeg: bool) -> tuple[list[tuple[str, bytes]], dict[str, Any], list[str]]:

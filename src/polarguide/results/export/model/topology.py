@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from polarguide.core.errors import optional_import
-from polarguide.results.rendering.mesh import Surface, largest_pieces
+from polarguide.results.rendering.mesh import NoSurfaceError, Surface, largest_pieces
 
 ISLAND = 0.01
 """Pieces with fewer faces than this share of the largest one's are dropped."""
@@ -58,14 +59,14 @@ def _keys(edges: NDArray[np.int64]) -> NDArray[np.int64]:
     return edges[:, 0] << 32 | edges[:, 1]
 
 
-def simplified(surface: Surface, triangles: int) -> Surface:
+def simplified(surface: Surface, triangles: int, *, closed: bool = False) -> Surface:
     """At most about so many triangles (quadric error, Garland and Heckbert 1997), cleaned; see ``cleaned``.
 
     Raises:
-        PolarguideError: fast-simplification is not installed.
+        PolarguideError: fast-simplification is not installed, or no face is left.
     """
     if len(surface.faces) <= triangles:
-        return cleaned(surface.vertices, surface.faces)
+        return cleaned(surface.vertices, surface.faces, closed=closed)
     simplify: Any = optional_import("fast_simplification", "a textured model", extra="model").simplify
     middle = surface.vertices.mean(axis=0)  # it computes in single precision
     vertices, faces = simplify(
@@ -73,15 +74,28 @@ def simplified(surface: Surface, triangles: int) -> Surface:
         np.ascontiguousarray(surface.faces, np.int32),
         target_count=triangles,
     )
-    return cleaned(vertices.astype(np.float64) + middle, faces.astype(np.int64))
+    return cleaned(vertices.astype(np.float64) + middle, faces.astype(np.int64), closed=closed)
 
 
-def cleaned(vertices: Places, faces: Faces) -> Surface:
-    """The surface of faces whose edges each occur once in each direction at most, without islands and small holes."""
+def cleaned(vertices: Places, faces: Faces, *, closed: bool = False) -> Surface:
+    """The surface of faces whose edges each occur once in each direction at most, without islands and small holes.
+
+    Where it is to be ``closed`` it has no hole at all: each is closed flat, as the bottom of what stood on a table.
+
+    Raises:
+        NoSurfaceError: no face is left.
+    """
     vertices, faces = _welded(vertices, faces)
-    surface = Surface(vertices, consistent(vertices, faces), np.zeros_like(vertices))
-    surface = largest_pieces(surface, ISLAND)
-    vertices, faces = _closed(surface.vertices, surface.faces)
+    faces = consistent(vertices, faces)
+    if not len(faces):
+        raise NoSurfaceError(
+            "the model",
+            expected="a surface",
+            found="none",
+            remedy="Train for more steps, or move the crop box.",
+        )
+    surface = largest_pieces(Surface(vertices, faces, np.zeros_like(vertices)), ISLAND)
+    vertices, faces = _closed(surface.vertices, surface.faces, math.inf if closed else SMALL_HOLE)
     return Surface(vertices, faces, vertex_normals(vertices, faces))
 
 
@@ -118,27 +132,14 @@ def consistent(vertices: Places, faces: Faces) -> Faces:
     return np.concatenate(kept)
 
 
-def _closed(vertices: Places, faces: Faces) -> tuple[Places, Faces]:
-    """Close small holes, each with a fan of triangles about the mean of its vertices."""
+def _closed(vertices: Places, faces: Faces, largest: float) -> tuple[Places, Faces]:
+    """Close holes up to a perimeter, in shares of the diagonal, each with a fan of triangles about its middle."""
     directed = _directed(faces)
     edges = directed[~np.isin(_keys(directed), _keys(directed[:, ::-1]))]
-    starts, count = np.unique(edges[:, 0], return_counts=True)
-    ambiguous = set(
-        starts[count > 1].tolist()
-    )  # where two holes touch, a fan could give an edge a third face
-    following = dict(edges.tolist())
-    limit = SMALL_HOLE * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    limit = largest * float(np.linalg.norm(np.ptp(vertices, axis=0)))
     added: list[Places] = []
     new_faces: list[tuple[int, int, int]] = []
-    done: set[int] = set()
-    for start in following:
-        loop, at = [], start
-        while at in following and at not in done and at not in ambiguous:
-            done.add(at)
-            loop.append(at)
-            at = following[at]
-        if len(loop) < 3 or at != start:
-            continue
+    for loop in _loops(edges.tolist()):
         places = vertices[loop]
         if np.linalg.norm(places - np.roll(places, 1, axis=0), axis=1).sum() > limit:
             continue
@@ -148,6 +149,30 @@ def _closed(vertices: Places, faces: Faces) -> tuple[Places, Faces]:
     if not added:
         return vertices, faces
     return np.concatenate([vertices, added]), np.concatenate([faces, np.array(new_faces, np.int64)])
+
+
+def _loops(edges: list[list[int]]) -> list[list[int]]:
+    """The simple cycles that boundary edges consist of: as many of them end at a vertex as begin there.
+
+    Where holes touch in a vertex, each gets a cycle of its own, so that no edge of a fan has a third face.
+    """
+    following: dict[int, list[int]] = {}
+    for begin, end in edges:
+        following.setdefault(begin, []).append(end)
+    loops = []
+    for start in following:
+        path, place = [start], {start: 0}
+        while following[path[-1]]:
+            at = following[path[-1]].pop()
+            if at in place:
+                loops.append(path[place[at] :])
+                for passed in path[place[at] + 1 :]:
+                    del place[passed]
+                del path[place[at] + 1 :]
+            else:
+                place[at] = len(path)
+                path.append(at)
+    return loops
 
 
 def vertex_normals(vertices: Places, faces: Faces) -> Places:

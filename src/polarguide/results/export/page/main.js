@@ -1,5 +1,6 @@
 // In the order of the indices in shade.frag.
 const LAYERS = ["final", "diffuse", "specular", "base", "strength", "normal", "metalness", "roughness"];
+const AS_PHOTOGRAPHED = [1, 0, 0, 0, 1, 0, 0, 0, 1];
 const byId = (id) => document.getElementById(id);
 
 class Page {
@@ -7,7 +8,7 @@ class Page {
     Object.assign(this, { scene, renderer, orders });
     this.canvas = renderer.canvas;
     this.navigation = new Navigation(scene);
-    this.looks = { layer: 0, turn: 0, gain: 1, exposure: 1, white: scene.white };
+    this.looks = { layer: 0, turn: 0, gain: 1, exposure: 2 ** scene.exposure, color: scene.color || AS_PHOTOGRAPHED };
     this.scale = new ScaleBar(byId("scale"), scene.metersPerUnit);
     this.compare = 0.5;
     this.comparing = false;
@@ -41,7 +42,8 @@ class Page {
         this.looks[name] = name === "exposure" ? 2 ** value : value;
         this.redraw();
       };
-    byId("balance").hidden = scene.white.every((gain) => gain === 1);
+    byId("exposure").value = String(scene.exposure);
+    byId("balance").hidden = !scene.color;
     byId("white").onchange = () => this.setBalanced(byId("white").checked);
     byId("lit").hidden = scene.kind === "plain";
     byId("reset").onclick = () => this.reset();
@@ -73,7 +75,7 @@ class Page {
 
   setBalanced(on) {
     byId("white").checked = on;
-    this.looks.white = on ? this.scene.white : [1, 1, 1];
+    this.looks.color = on && this.scene.color || AS_PHOTOGRAPHED;
     this.redraw();
   }
 
@@ -97,9 +99,9 @@ class Page {
   }
 
   reset() {
-    for (const [name, value] of [["turn", 0], ["gain", 1], ["exposure", 0]]) {
+    for (const [name, value] of [["turn", 0], ["gain", 1], ["exposure", this.scene.exposure]]) {
       byId(name).value = String(value);
-      this.looks[name] = name === "exposure" ? 1 : value;
+      this.looks[name] = name === "exposure" ? 2 ** value : value;
     }
     byId("view").value = String(this.scene.first);
     this.setBalanced(true);

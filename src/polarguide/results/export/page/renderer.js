@@ -170,7 +170,7 @@ class Renderer {
   }
 
   /** Shade the splatted layers into the canvas. */
-  shade(camera, { layer, split, turn, gain, exposure, white }) {
+  shade(camera, { layer, split, turn, gain, exposure, color }) {
     const gl = this.gl;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, camera.width, camera.height);
@@ -178,7 +178,7 @@ class Renderer {
     this.use(this.shader, { ...this.tables, ...targets }, {
       ...this.lens(camera),
       turn: ["mat3", turning(this.scene.up, -turn * Math.PI / 180)],
-      layer: ["1i", layer], split: ["1f", split], gain: ["1f", gain], exposure: ["1f", exposure], white: ["3f", white],
+      layer: ["1i", layer], split: ["1f", split], gain: ["1f", gain], exposure: ["1f", exposure], color: ["mat3", color],
       index: ["1f", this.scene.index], resolution: ["1i", this.scene.resolution], levels: ["1i", this.scene.levels],
       mirror: ["1f", this.scene.mirror || 0],
     });

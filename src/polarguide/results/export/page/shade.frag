@@ -8,14 +8,14 @@ uniform int layer;     // 0 final, 1 diffuse, 2 specular, 3 base, 4 strength, 5 
 uniform float split;   // left of this column stands the diffuse layer
 uniform float gain;    // on the specular layer
 uniform float exposure;
-uniform vec3 white;    // white balance, of what is shown
+uniform mat3 color;    // from the camera's linear RGB to what is shown
 uniform float index;   // refractive
 out vec4 shown;
 
 const float MAXIMUM_LOG = 5.0;
 
 vec3 encode(vec3 linear) {
-  vec3 v = clamp(linear * white * exposure, 0.0, 1.0);
+  vec3 v = clamp(color * linear * exposure, 0.0, 1.0);
   return mix(12.92 * v, 1.055 * pow(max(v, 0.0031308), vec3(1.0 / 2.4)) - 0.055, greaterThan(v, vec3(0.0031308)));
 }
 

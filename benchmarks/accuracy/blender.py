@@ -1,0 +1,153 @@
+"""How exported models look in Blender (Cycles, on the CPU) from held-out cameras, against the photographs.
+
+    python3.11 -m venv ENV && ENV/bin/pip install bpy==5.0.1          # 1 GB, in an environment of its own
+    python benchmarks/accuracy/blender.py RUN MODEL.glb [MODEL.usdz ...] --bpy ENV/bin/python [--room SCENE]
+
+The models are exports of RUN in the scene's own units. They are lit by the run's exported environment, or with --room
+by that of a scene which ``polarguide synth`` has rendered with the same things and cameras in another room, whose
+pictures they are compared with. PSNR is of sRGB values in the mask of the foreground: as it is, and with the factor on
+the light that is best for all views, since its brightness is not known. Files with "unlit" in their names are drawn
+without light. "not black" is of dielectrics with an albedo above 0.05, with their own best factor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from polarguide.api import open_run
+from polarguide.capture.formats.arrays import read_radiance
+from polarguide.geometry.camera import Camera
+from polarguide.optics.color import srgb_encode_array
+from polarguide.results.rendering.relight import write_exr
+from polarguide.runs.opened import read_scene
+from polarguide.visualization import figures
+
+HEIGHT = 512
+BLACK = 0.05
+"""Albedo of bodies of which little more than reflections is seen."""
+FACTORS = np.exp(np.linspace(-1.5, 1.5, 121))
+
+
+def frame_of(camera: Camera, axes: np.ndarray) -> dict[str, Any]:
+    """A camera as Blender takes it: its pose in OpenGL's axes, lens and shift in widths of the picture."""
+    pose = np.eye(4)
+    pose[:3, :3] = axes.T @ camera.rotation.T.numpy() @ np.diag([1.0, -1.0, -1.0])
+    pose[:3, 3] = axes.T @ camera.center.numpy()
+    return {
+        "pose": pose.tolist(),
+        "width": camera.width,
+        "height": camera.height,
+        "lens": camera.fx / camera.width,
+        "stretch": camera.fx / camera.fy,
+        "shift": [0.5 - camera.cx / camera.width, (camera.cy - camera.height / 2) / camera.width],
+    }
+
+
+def room_light(scene: Path, axes: np.ndarray) -> torch.Tensor:
+    """The panorama [H, 2 H, 3] of a rendered scene's true environment, upright in a run's axes (columns of [3, 3])."""
+    exposure = json.loads((scene / "scene.json").read_text())["exposure"]
+    true = read_radiance(scene / "environment.hdr") * exposure / 2  # photographs are S0 / 2
+    height, width = true.shape[:2]
+    latitude = np.pi * (0.5 - (np.arange(HEIGHT)[:, None] + 0.5) / HEIGHT)
+    longitude = np.pi * ((np.arange(2 * HEIGHT)[None] + 0.5) / HEIGHT - 1)
+    local = np.stack([np.cos(latitude) * np.sin(longitude), np.sin(latitude) + 0 * longitude,
+                      -np.cos(latitude) * np.cos(longitude)], axis=-1)  # fmt: skip
+    x, y, z = np.moveaxis(local @ axes.T, -1, 0)
+    row = ((0.5 - np.arcsin(np.clip(z, -1, 1)) / np.pi) * height - 0.5).astype(np.float32)
+    column = (np.mod(-np.arctan2(y, x) / (2 * np.pi), 1) * width - 0.5).astype(np.float32)
+    found = cv2.remap(true.astype(np.float32), column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return torch.from_numpy(found)
+
+
+def psnr(first: np.ndarray, second: np.ndarray) -> float:
+    """In dB, of linear colors as sRGB shows them."""
+    shown = [srgb_encode_array(np.clip(values, 0, 1)) for values in (first, second)]
+    return float(-10 * np.log10(np.mean((shown[0] - shown[1]) ** 2)))
+
+
+def best_factor(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
+    """The PSNR with the best of the factors on the first, and that factor."""
+    return max((psnr(factor * first, second), float(factor)) for factor in FACTORS)
+
+
+def chosen(found: list[np.ndarray], true: list[np.ndarray], masks: list[np.ndarray]) -> list[np.ndarray]:
+    """Both with all pixels of the masks in one row, [N, 3]."""
+    return [np.concatenate([p[m] for p, m in zip(each, masks, strict=True)]) for each in (found, true)]
+
+
+def drawn(
+    path: Path, folder: Path, frames: dict[str, Any], arguments: argparse.Namespace
+) -> list[np.ndarray]:
+    """Blender's pictures [H, W, 3] of a model, of linear radiance; the folder has the light, and gets files."""
+    job = {"model": str(path.resolve()), "environment": str(folder / "environment.exr"),
+           "unlit": "unlit" in path.stem, "samples": arguments.samples, "frames": frames,
+           "out": str(folder)}  # fmt: skip
+    (folder / "job.json").write_text(json.dumps(job))
+    command = [arguments.bpy, Path(__file__).with_name("blender_draw.py"), folder / "job.json"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        sys.exit(done.stderr[-2000:])
+    return [read_radiance(folder / f"{name}.exr")[..., :3] for name in frames]
+
+
+def main() -> None:
+    """Print a table: each model, and our own pictures where the light is that of the run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("models", type=Path, nargs="+")
+    parser.add_argument("--bpy", type=Path, required=True, help="a Python that has bpy")
+    parser.add_argument("--room", type=Path, help="a scene with the same things and cameras in another light")
+    parser.add_argument("--views", type=int, default=4)
+    parser.add_argument("--samples", type=int, default=48)
+    parser.add_argument("--pictures", type=Path, help="folder for Blender's pictures beside the photographs")
+    arguments = parser.parse_args()
+    run = open_run(arguments.run)
+    axes = run.frame.panorama_axes().numpy()
+    scene = read_scene(arguments.room) if arguments.room else run.scene
+    views = [scene.view(view.name) for view in run.scene.test_views[: arguments.views]]
+    photographs = [view.photograph().numpy() for view in views]
+    masks, bodies = [], []
+    for view in views:
+        with np.load(run.scene.root / "gt" / f"{view.name}.npz") as truth:
+            masks.append(truth["mask"] > 0)
+            bodies.append(masks[-1] & (truth["metalness"] == 0) & (truth["albedo"].mean(axis=-1) > BLACK))
+
+    def scored(label: str, pictures: list[np.ndarray]) -> None:
+        inside, colored = (chosen(pictures, photographs, part) for part in (masks, bodies))
+        best, factor = best_factor(*inside)
+        scores = f"{psnr(*inside):9.2f} {best:9.2f} {factor:7.2f} {best_factor(*colored)[0]:9.2f}"
+        print(f"{label:32} {scores}", flush=True)
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        if arguments.room:
+            write_exr(folder / "environment.exr", room_light(arguments.room, axes))
+        else:
+            run.export("environment", folder)
+        frames = {view.name: frame_of(view.camera, axes) for view in views}
+        print(f"{'model':32} {'as it is':>9} {'1 factor':>9} {'factor':>7} {'not black':>9}")
+        for path in arguments.models:
+            found = drawn(path, folder, frames, arguments)
+            label = f"{path.parent.name}/{path.name}"
+            scored(label, found)
+            if arguments.pictures:
+                arguments.pictures.mkdir(parents=True, exist_ok=True)
+                rows = [np.concatenate(pair, axis=1) for pair in zip(found, photographs, strict=True)]
+                picture = figures.radiance_to_rgb(torch.from_numpy(np.concatenate(rows)).float())
+                figures.write_png(arguments.pictures / f"{label.replace('/', '_')}.png", picture)
+        if not arguments.room:
+            scored("our own pictures", [run.result(v.camera).to("cpu").final.numpy() for v in views])
+
+
+if __name__ == "__main__":
+    main()

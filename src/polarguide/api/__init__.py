@@ -1,0 +1,1 @@
+"""The Python interface, as ``import polarguide`` gives it: captures, and runs."""

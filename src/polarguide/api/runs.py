@@ -1,0 +1,141 @@
+"""What the Python interface makes of runs. The command line is a client of it.
+
+Nothing here prints or installs signal handlers: progress and messages go to a ``Reporter``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from polarguide.capture import Scene
+from polarguide.capture.view import figure, table
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import require_folder
+from polarguide.core.options import PathLike, SceneOptions, SessionOptions, VisitorOptions
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.results.evaluation import evaluate
+from polarguide.results.evaluation.record import read_metrics
+from polarguide.results.evaluation.table import shown_metrics
+from polarguide.results.export import formats
+from polarguide.results.rendering import film, pictures, relight
+from polarguide.runs import train as training
+from polarguide.runs.opened import OpenedRun
+from polarguide.training.recipe import Recipe
+from polarguide.training.settings import TrainSettings
+from polarguide.viewer import server
+
+_PICTURED = 3
+"""Views that a notebook shows of a run: each is drawn."""
+
+
+class Run(OpenedRun):
+    """A trained run: its layers from any camera, and everything that can be made of it.
+
+    ``polarguide.train`` and ``polarguide.open_run`` give one.
+
+    Example:
+        >>> run = polarguide.open_run("runs/demo")                       # doctest: +SKIP
+        >>> layers = run.render("v000", layers=["final", "normal"])      # doctest: +SKIP
+        >>> layers["final"].shape                                        # doctest: +SKIP
+        torch.Size([96, 128, 3])
+    """
+
+    evaluate = evaluate.evaluate
+    export = formats.export
+    relight = relight.relight
+    share = formats.share
+    view = server.view_run
+    write_film = film.write_film
+    write_pictures = pictures.write_pictures
+
+    def metrics(self) -> Mapping[str, Any]:
+        """The record that ``evaluate`` wrote: means over the test views, and ``views`` by name.
+
+        Raises:
+            PolarguideError: the run has not been scored, or the file is not such a record.
+        """
+        return read_metrics(self.folder)
+
+    def _repr_html_(self) -> str:
+        """For notebooks: held-out views as drawn, counts, and the verdicts of health and scores."""
+        facts = {"run": str(self), "polarization": self._evidence()}
+        pictures = ""
+        try:  # a run's scene may have moved, and its records may be damaged; the rest is there
+            views = self.scene.test_views or self.scene.views
+            for view in views[:_PICTURED]:
+                drawn = self.render(view.camera)["final"]
+                pictures += figure(drawn.cpu().numpy(), f"{view.name}, as drawn")
+            health = self.health
+            facts["warnings"] = "\n".join(health.warnings) or "none" if health is not None else "not recorded"
+            scores = shown_metrics(self.metrics(), scores_only=True)
+            facts["scores"] = "\n".join(f"{label}: {text}" for label, text in scores)
+        except PolarguideError as error:
+            facts["not there"] = str(error)
+        return f"{pictures}{table(self.folder.name, facts)}"
+
+
+open_run = Run.open
+
+
+def train(
+    scene: Scene | PathLike,
+    out: PathLike,
+    *,
+    recipe: Recipe | str = "polarguide-stokes",
+    settings: TrainSettings = TrainSettings(),
+    session: SessionOptions = SessionOptions(),
+    reading: SceneOptions = SceneOptions(),
+    resume: bool = False,
+    reporter: Reporter = SILENT,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> Run:
+    """Train a recipe on a scene, into a run folder; see ``runs.train.train`` for all arguments.
+
+    Example:
+        >>> run = polarguide.train("scenes/cup", "runs/cup", recipe="polarguide")    # doctest: +SKIP
+        >>> run.evaluate()["psnr"]                                                   # doctest: +SKIP
+        31.4
+
+    Raises:
+        PolarguideError: wrong input, or a folder that does not suit.
+        KeyboardInterrupt: it was stopped; the state is saved, and ``resume=True`` goes on to the same result.
+    """
+
+    looking = partial(
+        server.watched,
+        host=session.viewer_host,
+        port=session.viewer_port,
+        visitors=VisitorOptions(session.allow_host, session.allow_origin),
+        reporter=reporter,
+    )
+    opened = training.train(
+        scene,
+        out,
+        recipe=recipe,
+        settings=settings,
+        session=session,
+        reading=reading,
+        resume=resume,
+        reporter=reporter,
+        should_stop=should_stop,
+        watch=looking if session.viewer else None,
+    )
+    return Run.of(opened)
+
+
+def demo_scene() -> Path:
+    """The folder of the small scene that ships with the package: glossy objects, 50 views, four angles each.
+
+    Example:
+        >>> polarguide.load_scene(polarguide.demo_scene()).view("v000").camera.width    # doctest: +SKIP
+        128
+
+    Raises:
+        PolarguideError: the package is not whole.
+    """
+    scene = Path(__file__).parents[1] / "data" / "demo"
+    require_folder(scene, expected="the demo scene", remedy="Install the package again.")
+    return scene

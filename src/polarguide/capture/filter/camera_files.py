@@ -1,0 +1,371 @@
+"""Files of cameras: developed camera raw, and what files state beside their pixels (EXIF, the color profile).
+
+Camera raw becomes linear pictures with the same processing for every shot. LibRaw (package rawpy) runs without any step
+that depends on the picture: no automatic brightness, white level or white balance, no gamma, no color matrix. The
+remaining steps are the same for every shot: black level, fixed gains, a linear scale and demosaicing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import math
+import struct
+import warnings
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from polarguide.capture.calibration import Calibration
+from polarguide.capture.formats.arrays import array_kind
+from polarguide.capture.formats.decoders import heif_head, heif_tags, is_heif, is_webp, webp_chunks
+from polarguide.capture.formats.integrity import (
+    LARGEST_PIXELS,
+    ORIENTATION,
+    TIFF,
+    jpeg_segments,
+    png_chunks,
+    tiff_entries,
+    tiff_order,
+)
+from polarguide.capture.formats.pictures import read_picture
+from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.files import read_file
+
+CAMERA_RAW = (".dng", ".nef", ".nrw", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
+"""Suffixes that are read as camera raw."""
+_FULL = 65535
+_EXIF_OF_FLIP = {0: 1, 3: 3, 5: 8, 6: 6}
+
+
+def is_camera_raw(path: Path) -> bool:
+    """Whether a file is a camera raw file, by its suffix."""
+    return path.suffix.lower() in CAMERA_RAW
+
+
+def read_camera_raw(
+    path: Path, gains: tuple[float, float, float], *, opener: Callable[[io.BytesIO], Any] | None = None
+) -> tuple[NDArray[np.uint16], int]:
+    """Develop a camera raw file.
+
+    Args:
+        path: the file.
+        gains: of R, G and B; the smallest becomes 1, so that full scale of the sensor is full scale of the picture.
+        opener: takes the file's bytes and returns what ``rawpy.imread`` would; rawpy itself if None.
+
+    Returns:
+        [H, W, 3] linear RGB in the camera's own colors, not turned; and the EXIF orientation, 1 to 8.
+
+    Raises:
+        PolarguideError: rawpy is missing, or the file cannot be read or is damaged.
+    """
+    with _opened(path, opener) as raw:
+        if raw.sizes.raw_width * raw.sizes.raw_height > LARGEST_PIXELS:
+            raise ValueError(f"{raw.sizes.raw_width}x{raw.sizes.raw_height} pixels")
+        flip = int(raw.sizes.flip)  # before user_flip takes its place
+        pixels = np.asarray(raw.postprocess(**libraw_parameters(gains)))
+        reached = _reached(raw)
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint16:
+        raise PolarguideError(
+            path,
+            expected="a camera raw file with three colors",
+            found=array_kind(pixels),
+            remedy="Develop it to 16-bit linear TIFF.",
+        )
+    return _to_full_scale(pixels, reached), _EXIF_OF_FLIP.get(flip, 1)
+
+
+def _reached(raw: Any) -> float:
+    """The code at which LibRaw puts the white level.
+
+    Of files that are no mosaics (linear DNG, such as a telephone's ProRAW) it subtracts the black levels of three
+    channels from the samples, and that of a fourth one, which is 0, from the white level.
+    """
+    if raw.raw_type.name != "Stack":
+        return _FULL
+    black, white = raw.black_level_per_channel, raw.white_level
+    return float((white - max(black[:3])) / (white - min(black)) * _FULL)
+
+
+def _to_full_scale(pixels: NDArray[np.uint16], reached: float) -> NDArray[np.uint16]:
+    """Pixels whose white level is at 65535: what clipped in the camera has to be known. LibRaw rounds down."""
+    if reached < _FULL:
+        pixels = np.minimum(np.rint(pixels * np.float32(_FULL / reached)), _FULL).astype(np.uint16)
+    return np.where(pixels >= _FULL - 1, np.uint16(_FULL), pixels)
+
+
+def stored_frame(path: Path) -> tuple[tuple[int, int], int]:
+    """Width and height of the pixels of a camera raw file as stored, and its EXIF orientation; nothing is developed.
+
+    Raises:
+        PolarguideError: rawpy is missing, or the file cannot be read.
+    """
+    with _opened(path) as raw:
+        return (int(raw.sizes.width), int(raw.sizes.height)), _EXIF_OF_FLIP.get(int(raw.sizes.flip), 1)
+
+
+@contextlib.contextmanager
+def _opened(path: Path, opener: Callable[[io.BytesIO], Any] | None = None) -> Iterator[Any]:
+    """A camera raw file as rawpy opens it; whatever goes wrong with it, then and inside, is the file's fault.
+
+    Raises:
+        PolarguideError: rawpy is missing, or something did.
+    """
+    opened = opener or optional_import("rawpy", str(path)).imread
+    data = read_file(path)
+    try:
+        with opened(io.BytesIO(data)) as raw:
+            yield raw
+    except Exception as error:  # LibRaw's errors have a class each; damaged files raise others, too
+        raise PolarguideError(
+            path,
+            expected="a complete camera raw file",
+            found="an empty file" if not data else f"one that cannot be developed ({_words(error)})",
+            remedy="Copy the file again, or develop it to 16-bit linear TIFF.",
+        ) from error
+
+
+def _words(error: Exception) -> str:
+    """LibRaw's error message, which may be bytes, as one line."""
+    said = error.args[0] if error.args else ""
+    text = said.decode(errors="replace") if isinstance(said, bytes) else str(said)
+    return (text.strip().splitlines() or [type(error).__name__])[0]
+
+
+def libraw_parameters(gains: tuple[float, float, float]) -> dict[str, Any]:
+    """LibRaw's settings, by the names of ``rawpy.Params``."""
+    red, green, blue = (gain / min(gains) for gain in gains)
+    settings: dict[str, Any] = {
+        "gamma": (1.0, 1.0),
+        "output_bps": 16,
+        "no_auto_bright": True,
+        "bright": 1.0,
+        # Otherwise the white level follows the brightest pixel of each shot.
+        "adjust_maximum_thr": 0.0,
+        "use_camera_wb": False,
+        "use_auto_wb": False,
+        "user_wb": [red, green, blue, green],
+        "user_flip": 0,
+        "median_filter_passes": 0,
+    }
+    with contextlib.suppress(ImportError):
+        rawpy = importlib.import_module("rawpy")
+        settings |= {
+            "output_color": rawpy.ColorSpace.raw,
+            "demosaic_algorithm": rawpy.DemosaicAlgorithm.LINEAR,
+            "highlight_mode": rawpy.HighlightMode.Clip,
+            "fbdd_noise_reduction": rawpy.FBDDNoiseReductionMode.Off,
+        }
+    return settings
+
+
+_MIRRORED = (2, 4, 5, 7)
+QUARTER_TURNS = (5, 6, 7, 8)
+"""Orientations that exchange width and height."""
+INVERSE = {code: {6: 8, 8: 6}.get(code, code) for code in range(1, 9)}
+"""The orientation that takes another one back."""
+TURNS = {
+    2: "mirrored left to right",
+    3: "turned by 180 degrees",
+    4: "mirrored top to bottom",
+    5: "mirrored along the falling diagonal",
+    6: "turned by 90 degrees clockwise",
+    7: "mirrored along the rising diagonal",
+    8: "turned by 90 degrees counter-clockwise",
+}
+"""What each orientation but 1 does to the stored picture for display."""
+
+
+def orientation(data: bytes) -> int:
+    """The orientation tag of a picture file, 1 to 8; 1 (as stored) where there is none that can be read.
+
+    HEIC states its turn in the header; its tag is for information only.
+    """
+    if is_heif(data):
+        head = heif_head(data)
+        return 1 if head is None else head.orientation
+    value = tags_of(data).get(ORIENTATION)
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
+def apply_orientation(pixels: NDArray[Any], code: int) -> NDArray[Any]:
+    """Pixels [H, W, ...] rotated or mirrored for display, given the orientation tag."""
+    if code in (5, 7):
+        pixels = pixels.swapaxes(0, 1)
+        return np.rot90(pixels, 2) if code == 7 else pixels
+    if code in (2, 4):
+        return np.flip(pixels, axis=1 if code == 2 else 0)
+    return np.rot90(pixels, {1: 0, 3: 2, 6: -1, 8: 1}[code])
+
+
+def orientation_calibration(code: int) -> Calibration:
+    """The change of polarizer angles when the stored picture is rotated or mirrored for display."""
+    return Calibration(
+        sense="cw" if code in _MIRRORED else "ccw", zero=90.0 if code in QUARTER_TURNS else 0.0
+    )
+
+
+def tags_of(data: bytes) -> dict[int, Any]:
+    """The EXIF tags of a picture file and of camera raw that is built like TIFF; none where they are damaged.
+
+    Pillow reads tags only: of pictures with 16 bits a channel it would return 8.
+    """
+    tiff = data
+    if data.startswith(b"\xff\xd8"):
+        contents = (content for kind, content in jpeg_segments(data) if kind == 0xE1)
+        tiff = next((content[6:] for content in contents if content.startswith(b"Exif\0\0")), b"")
+    elif data.startswith(b"\x89PNG"):
+        tiff = next((data[at + 8 : end - 4] for kind, at, end in png_chunks(data) if kind == b"eXIf"), b"")
+    elif is_webp(data):
+        tiff = next((data[at:end] for kind, at, end in webp_chunks(data) if kind == b"EXIF"), b"")
+        tiff = tiff.removeprefix(b"Exif\0\0")
+    elif is_heif(data):
+        tiff = heif_tags(data).removeprefix(b"Exif\0\0")
+    if tiff[:4] not in TIFF:
+        return {}
+    exif = Image.Exif()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            exif.load(tiff)
+            return {**exif, **exif.get_ifd(_DIRECTORY)}
+    except Exception:  # Pillow raises a dozen kinds for tags that are damaged, and promises none
+        return {}
+
+
+_MAKER, _MODEL, _DIRECTORY = 271, 272, 34665
+_TIME, _F_NUMBER, _ISO = 33434, 33437, 34855
+
+
+@dataclass(frozen=True)
+class Taken:
+    """How a photograph was taken, as its file says.
+
+    Attributes:
+        camera: maker and model; empty where it does not say.
+        light: how much light was let in and how it was amplified: seconds * ISO / f-number^2; None where it does not
+            say the time. ISO and f-number count as 100 and 1 where they are not said.
+    """
+
+    camera: str
+    light: float | None
+
+
+def read_taken(path: Path) -> Taken:
+    """What a file says about its exposure: EXIF of pictures and of camera raw that is built like TIFF; else LibRaw.
+
+    Raises:
+        PolarguideError: the file cannot be read, or LibRaw is needed and missing.
+    """
+    raw = is_camera_raw(path)
+    data = read_file(path) if raw else read_picture(path)
+    found = taken(data)
+    if not raw or found.light is not None or data[:4] in TIFF:
+        return found
+    libraw = optional_import("rawpy", str(path))
+    # LibRaw's errors: whoever develops the file says what is wrong with it.
+    with contextlib.suppress(Exception), libraw.imread(io.BytesIO(data)) as opened:
+        other = opened.other  # which some versions of rawpy do not have
+        return Taken("", _light(other.shutter, other.iso_speed, other.aperture))
+    return found
+
+
+def taken(data: bytes) -> Taken:
+    """What the EXIF tags of a picture file say; damaged ones say nothing."""
+    tags = tags_of(data)
+    names = (str(tags.get(tag, "")).partition("\0")[0].strip() for tag in (_MAKER, _MODEL))
+    light = _light(*(_number(tags.get(tag)) for tag in (_TIME, _ISO, _F_NUMBER)))
+    return Taken(" ".join(filter(None, names)), light)
+
+
+def _light(seconds: float | None, iso: float | None, f_number: float | None) -> float | None:
+    """Relative exposure of plausible numbers; None without a time."""
+    if seconds is None or not 0 < seconds < 1e5:
+        return None
+    iso = iso if iso is not None and 0 < iso < 1e8 else 100.0
+    f_number = f_number if f_number is not None and 0.1 < f_number < 1000 else 1.0
+    return seconds * iso / f_number**2
+
+
+def _number(value: Any) -> float | None:
+    """A tag as a number, the first of several; None where it is missing or not finite."""
+    try:
+        number = float(value[0] if isinstance(value, tuple) else value)
+    except (TypeError, ValueError, IndexError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+_TIFF_PROFILE = 34675
+_JPEG_PROFILE = b"ICC_PROFILE\0"
+_CURVES = (b"rTRC", b"kTRC")
+_PARAMETERS = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}
+_MIDDLE = 0.5
+
+
+def stated_exponent(data: bytes) -> float | None:
+    """The exponent e that the ICC profile of a PNG, JPEG, WebP or TIFF file states: light = value ^ e at half scale.
+
+    1 is linear, 2.2 sRGB and Adobe RGB, 1.8 ProPhoto RGB. None where there is no profile, or none of this kind.
+    """
+    try:
+        profile = _profile(data)
+        decoded = None if profile is None else _decoded_middle(profile)
+    except (struct.error, zlib.error, OverflowError, ValueError, IndexError):
+        return None  # a damaged profile states nothing
+    if decoded is None or not 0 < decoded < 1:
+        return None
+    return math.log(decoded) / math.log(_MIDDLE)
+
+
+def _profile(data: bytes) -> bytes | None:
+    """The ICC profile in a picture file."""
+    if data.startswith(b"\xff\xd8"):
+        parts = [content for kind, content in jpeg_segments(data) if kind == 0xE2]
+        parts = [part[len(_JPEG_PROFILE) + 2 :] for part in parts if part.startswith(_JPEG_PROFILE)]
+        return b"".join(parts) or None
+    if data.startswith(b"\x89PNG"):
+        chunk = next((data[at + 8 : end - 4] for kind, at, end in png_chunks(data) if kind == b"iCCP"), None)
+        return None if chunk is None else zlib.decompress(chunk[chunk.index(b"\0") + 2 :])
+    if is_webp(data):
+        return next((data[at:end] for kind, at, end in webp_chunks(data) if kind == b"ICCP"), None)
+    if data[:4] in TIFF:
+        for tag, _, count, place in tiff_entries(data):
+            if tag == _TIFF_PROFILE:
+                (at,) = struct.unpack_from(tiff_order(data) + "I", data, place)
+                return data[at : at + count]
+    return None
+
+
+def _decoded_middle(profile: bytes) -> float | None:
+    """What the red or gray curve of a profile makes of half scale (ICC.1, curveType and parametricCurveType)."""
+    (count,) = struct.unpack_from(">I", profile, 128)
+    entries = [struct.unpack_from(">4sII", profile, 132 + 12 * number) for number in range(min(count, 100))]
+    at = next((at for name, at, _ in entries if name in _CURVES), None)
+    if at is None:
+        return None
+    kind = profile[at : at + 4]
+    if kind == b"curv":
+        (count,) = struct.unpack_from(">I", profile, at + 8)
+        if count == 0:
+            return _MIDDLE
+        if count == 1:
+            return float(_MIDDLE ** (struct.unpack_from(">H", profile, at + 12)[0] / 256))
+        return float(struct.unpack_from(">H", profile, at + 12 + 2 * round(_MIDDLE * (count - 1)))[0]) / 65535
+    if kind != b"para":
+        return None
+    (form,) = struct.unpack_from(">H", profile, at + 8)
+    if form not in _PARAMETERS:
+        return None
+    numbers = [n / 65536 for n in struct.unpack_from(f">{_PARAMETERS[form]}i", profile, at + 12)]
+    factor, shift = numbers[1:3] if form else (1.0, 0.0)
+    # Half scale lies above the linear part of every curve in use.
+    raised = numbers[{2: 3, 4: 5}[form]] if form in (2, 4) else 0.0
+    return float(max(0.0, factor * _MIDDLE + shift) ** max(numbers[0], 0.1) + raised)

@@ -1,0 +1,389 @@
+"""Formats that OpenCV is not asked for: BMP, PGM, PPM, HEIC and TIFF, their samples and headers; headers of WebP."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import logging
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from polarguide.core.errors import optional_import
+
+BMP = b"BM"
+PNM = (b"P5", b"P6")
+_PNM_HEAD = re.compile(
+    rb"P[56](?:\s+|#[^\n]*\n)+?(\d{1,9})(?:\s+|#[^\n]*\n)+?(\d{1,9})(?:\s+|#[^\n]*\n)+?(\d{1,5})\s"
+)
+_LARGEST_HEAD = 4096
+_BMP_BITS = (8, 24, 32)
+_ANIMATED = 2
+
+
+@dataclass(frozen=True)
+class PlainHead:
+    """What the header of an uncompressed file says.
+
+    Attributes:
+        size: width and height. channels: samples of a pixel. full: value of full scale.
+        start: where the samples begin. row: bytes of a row. rising: whether the lowest row comes first.
+    """
+
+    size: tuple[int, int]
+    channels: int
+    full: int
+    start: int
+    row: int
+    rising: bool = False
+
+    @property
+    def end(self) -> int:
+        """Where the samples end."""
+        return self.start + self.row * self.size[1]
+
+
+def is_webp(data: bytes) -> bool:
+    """Whether a file is a WebP picture, by its first twelve bytes."""
+    return data[:4] == b"RIFF" and data[8:12] == b"WEBP"
+
+
+def plain_head(data: bytes) -> PlainHead | None:
+    """The header of a PGM, PPM or BMP file; None where it has none that is read."""
+    if data[:2] in PNM:
+        match = _PNM_HEAD.match(data[:_LARGEST_HEAD])
+        if match is None:
+            return None
+        width, height, full = (int(text) for text in match.groups())
+        channels = 1 if data[:2] == b"P5" else 3
+        row = width * channels * (1 if full < 256 else 2)
+        return PlainHead((width, height), channels, full, match.end(), row) if 0 < full < 1 << 16 else None
+    if data[:2] != BMP or len(data) < 54:
+        return None
+    start, head, width, height, _, bits, packing = struct.unpack_from("<IIiiHHI", data, 10)
+    if head < 40 or bits not in _BMP_BITS or packing or width <= 0 or not height:
+        return None
+    row = (width * bits // 8 + 3) // 4 * 4
+    return PlainHead((width, abs(height)), bits // 8, 255, start, row, rising=height > 0)
+
+
+def plain_pixels(data: bytes, head: PlainHead) -> NDArray[Any]:
+    """The samples of a file that holds all that its header promises: [H, W] or [H, W, 3] in OpenCV's order.
+
+    Palettes of 8-bit BMP files are applied, unless they are the levels of gray.
+    """
+    width, height = head.size
+    rows = np.frombuffer(data, np.uint8, head.row * height, head.start).reshape(height, head.row)
+    if data[:2] in PNM:
+        samples = rows if head.full < 256 else rows.view(">u2").astype(np.uint16)
+        pixels = samples.reshape(height, width, head.channels)
+        return pixels[..., 0].copy() if head.channels == 1 else pixels[..., ::-1].copy()
+    pixels = rows[:, : width * head.channels].reshape(height, width, head.channels)
+    pixels = pixels[::-1] if head.rising else pixels
+    if head.channels > 1:
+        return pixels[..., :3].copy()  # the fourth byte is padding
+    (length,) = struct.unpack_from("<I", data, 14)
+    (used,) = struct.unpack_from("<I", data, 46)
+    palette = np.zeros((256, 4), np.uint8)
+    stored = np.frombuffer(data[14 + length : min(head.start, 14 + length + 4 * (used or 256))], np.uint8)
+    palette[: len(stored) // 4] = stored[: len(stored) // 4 * 4].reshape(-1, 4)
+    colors = palette[:, :3]
+    gray = (colors == colors[:, :1]).all()
+    return np.asarray(colors[pixels[..., 0], 0] if gray else colors[pixels[..., 0]])
+
+
+def webp_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, start and end of the contents of the chunks of a WebP file; the last may end beyond the file."""
+    at = 12
+    while at + 8 <= len(data):
+        kind, length = struct.unpack_from("<4sI", data, at)
+        yield kind, at + 8, at + 8 + length
+        at += 8 + length + length % 2
+
+
+def webp_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height in the header of a WebP file; None where there are none, or of an animation."""
+    for kind, at, _ in webp_chunks(data):
+        head = data[at : at + 10]
+        if len(head) < 10:
+            return None
+        if kind == b"VP8X":
+            if head[0] & _ANIMATED:
+                return None
+            return 1 + int.from_bytes(head[4:7], "little"), 1 + int.from_bytes(head[7:10], "little")
+        if kind == b"VP8L":
+            packed = int.from_bytes(head[1:5], "little")
+            return 1 + (packed & 0x3FFF), 1 + (packed >> 14 & 0x3FFF)
+        if kind == b"VP8 ":
+            width, height = struct.unpack_from("<HH", head, 6)
+            return width & 0x3FFF, height & 0x3FFF
+        return None
+    return None
+
+
+def plain_damage(data: bytes) -> str | None:
+    """What is wrong with a BMP, PGM, PPM or WebP file as far as its structure tells, or None."""
+    if is_webp(data):
+        if webp_size(data) is None:
+            return "a WebP file without a size, or an animated one"
+        chunks = list(webp_chunks(data))
+        return (
+            None if chunks[-1][2] <= len(data) else f"a WebP file cut short (it ends after {len(data)} bytes)"
+        )
+    name = "BMP" if data[:2] == BMP else "PGM or PPM"
+    head = plain_head(data)
+    if head is None:
+        kinds = "8, 24 or 32 bits a pixel, not compressed" if name == "BMP" else "a size and full scale"
+        return f"a {name} file without {kinds}"
+    if head.start < 2 or head.end > len(data):
+        return f"a {name} file cut short (it ends after {len(data)} bytes)"
+    return None
+
+
+EXTRA = "heic"
+"""The extra that brings pillow-heif."""
+_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif", b"avis")
+_AVIF = (b"avif", b"avis")
+_ORIENTATION_OF_TURNS = (1, 8, 3, 6)
+"""EXIF's number for quarter turns counter-clockwise."""
+_HIGH_RANGE = {16: "PQ", 18: "HLG"}
+"""Transfer characteristics (ITU-T H.273) of displays, which depend on more than the light at a pixel."""
+
+
+@dataclass(frozen=True)
+class HeifHead:
+    """What the header of a HEIC file says of its picture.
+
+    Attributes:
+        size: width and height as stored, before it is turned. turns: quarter turns counter-clockwise for display.
+        mirrored: whether it is mirrored for display.
+    """
+
+    size: tuple[int, int]
+    turns: int
+    mirrored: bool
+
+    @property
+    def orientation(self) -> int:
+        """The turn as EXIF's number. The tag itself is for information only (ISO/IEC 23008-12)."""
+        return _ORIENTATION_OF_TURNS[self.turns]
+
+
+def is_heif(data: bytes) -> bool:
+    """Whether a file is one of telephones, HEIC or AVIF, by its first twelve bytes."""
+    return data[4:8] == b"ftyp" and data[8:12] in _BRANDS
+
+
+def heif_head(data: bytes) -> HeifHead | None:
+    """The header of a HEIC file; None where it states no size of its picture."""
+    try:
+        boxes = {kind: (start, end) for kind, start, end in _boxes(data, 0, len(data))}
+        start, end = boxes[b"meta"]
+        meta = {kind: span for kind, *span in _boxes(data, start + 4, end)}
+        wide = data[meta[b"pitm"][0]] > 0
+        (primary,) = struct.unpack_from(">I" if wide else ">H", data, meta[b"pitm"][0] + 4)
+        inside = {kind: span for kind, *span in _boxes(data, *meta[b"iprp"])}
+        properties = list(_boxes(data, *inside[b"ipco"]))
+        own = [properties[number - 1] for number in _associated(data, inside[b"ipma"][0], primary) if number]
+        at = {kind: start for kind, start, _ in own}
+        width, height = struct.unpack_from(">II", data, at[b"ispe"] + 4)
+        if b"clap" in at:  # encoders fill blocks up, and cut what they added off again
+            across, of_across, down, of_down = struct.unpack_from(">4I", data, at[b"clap"])
+            width, height = across // of_across, down // of_down
+        turns = data[at[b"irot"]] & 3 if b"irot" in at else 0
+    except (KeyError, IndexError, ZeroDivisionError, struct.error):
+        return None
+    return HeifHead((width, height), turns, b"imir" in at) if width and height else None
+
+
+def _boxes(data: bytes, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, start and end of the contents of the boxes in a part of a file; the last may end beyond it."""
+    while start + 8 <= end:
+        length, kind = struct.unpack_from(">I4s", data, start)
+        head = 8
+        if length == 1:
+            (length,) = struct.unpack_from(">Q", data, start + 8)
+            head = 16
+        length = length or end - start
+        if length < head:
+            return
+        yield kind, start + head, start + length
+        start += length
+
+
+def _associated(data: bytes, start: int, item: int) -> list[int]:
+    """Numbers, from 1, of the properties of an item, by the box of associations at ``start``."""
+    version, wide = data[start], data[start + 3] & 1
+    (count,) = struct.unpack_from(">I", data, start + 4)
+    start += 8
+    for _ in range(count):
+        (number,) = struct.unpack_from(">I" if version else ">H", data, start)
+        start += 4 if version else 2
+        length, start = data[start], start + 1
+        if number == item:
+            values = struct.unpack_from(f">{length}{'H' if wide else 'B'}", data, start)
+            return [value & (0x7FFF if wide else 0x7F) for value in values]
+        start += length * (2 if wide else 1)
+    return []
+
+
+def heif_damage(data: bytes) -> str | None:
+    """What is wrong with a HEIC or AVIF file as far as its structure tells, or None."""
+    if data[8:12] in _AVIF:
+        return "an AVIF file"
+    if max((end for _, _, end in _boxes(data, 0, len(data))), default=0) > len(data):
+        return f"a HEIC file cut short (it ends after {len(data)} bytes)"
+    head = heif_head(data)
+    if head is None:
+        return "a HEIC file without a size"
+    return "a HEIC file that is mirrored for display" if head.mirrored else None
+
+
+def heif_tags(data: bytes) -> bytes:
+    """The EXIF block of a HEIC file; empty where it has none, or pillow-heif is not installed."""
+    try:
+        opened = optional_import("pillow_heif", "EXIF").open_heif(io.BytesIO(data))
+        return bytes(opened.info.get("exif") or b"")
+    except Exception:  # no package, or a damaged file: whoever reads its pixels says so
+        return b""
+
+
+def heif_pixels(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
+    """The picture of a HEIC file as the camera stored it, before it is turned for display.
+
+    Args:
+        path: where ``data`` came from, for messages.
+        data: the whole file, without damage that its structure tells.
+
+    Returns:
+        [H, W, C] uint8, or uint16 of more than 8 bits, in OpenCV's order of channels; and the value of full scale.
+
+    Raises:
+        PolarguideError: pillow-heif is not installed.
+        ValueError: the file is of a kind that is not read; the text is a noun phrase that says why.
+        Exception: of several kinds, where the file is damaged.
+    """
+    library, head = optional_import("pillow_heif", str(path), extra=EXTRA), heif_head(data)
+    assert head is not None
+    opened = library.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False, bgr_mode=True)
+    if len(opened) > 1:
+        raise ValueError(f"a HEIC file of {len(opened)} pictures")
+    transfer = (opened.info.get("nclx_profile") or {}).get("transfer_characteristics")
+    if transfer in _HIGH_RANGE:
+        raise ValueError(f"a HEIC file of high dynamic range ({_HIGH_RANGE[transfer]})")
+    bits, pixels = int(opened.info["bit_depth"]), np.asarray(opened)
+    pixels = np.rot90(pixels, -head.turns)
+    if pixels.shape[1::-1] != head.size:
+        raise ValueError("a HEIC file whose picture has another size than its header states")
+    if pixels.dtype == np.uint8:
+        return np.ascontiguousarray(pixels), 255
+    # The decoder puts the bits at the top of 16.
+    return np.ascontiguousarray(pixels >> (16 - bits)), (1 << bits) - 1
+
+
+# It logs what it finds odd in a file; what matters of it is an error here.
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
+
+_GRAY, _RGB, _PALETTE, _YCBCR = 1, 2, 3, 6
+_WHITE_IS_ZERO = 0
+_SAMPLES = {_GRAY: 1, _RGB: 3, _PALETTE: 1, _YCBCR: 3}
+_JPEG = (6, 7)
+"""Compressions that decode to RGB what is stored as luminance and color differences."""
+_NO_PICTURE, _OLD_REDUCED = 1 | 4, 2
+"""Of NewSubfileType: a smaller copy, or a mask of transparency; of the older tag: a smaller copy."""
+_MOST_PICTURES = 1000
+
+
+class UnreadableTiffError(ValueError):
+    """A TIFF file that is no ordinary picture; the text is a noun phrase that says why."""
+
+
+def decode_tiff(data: bytes) -> tuple[NDArray[Any], int]:
+    """The picture of a TIFF or BigTIFF file, neither turned nor scaled.
+
+    Args:
+        data: the whole file.
+
+    Returns:
+        [H, W] or [H, W, C] in OpenCV's order of channels (blue, green, red, alpha), of 8- or 16-bit whole numbers or
+        floating-point numbers; and the bits of a sample, which may be fewer than those of the array.
+
+    Raises:
+        UnreadableTiffError: it has several pictures, or samples that mean something else.
+        Exception: of a dozen kinds, where the file is damaged.
+    """
+    with tifffile.TiffFile(io.BytesIO(data)) as file:
+        page = _only_page(file)
+        samples, transparent = _judged(page)
+        pixels = np.asarray(page.asarray(maxworkers=1))
+        size, bits = (page.imagelength, page.imagewidth), int(page.bitspersample)
+        colors = page.colormap if page.photometric == _PALETTE else None
+    if pixels.ndim == 3 and page.planarconfig == 2:
+        pixels = np.moveaxis(pixels, 0, -1)
+    if pixels.shape != (size if samples == 1 else (*size, samples)):
+        raise UnreadableTiffError("a TIFF file of several layers")
+    pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
+    if bits == 1 and pixels.dtype.kind in "bu":
+        pixels, bits = pixels.astype(np.uint8) * np.uint8(255), 8
+    if colors is not None:
+        # Palettes have 16 bits; those of 8-bit colors are multiples of 257.
+        pixels, bits = np.rint(np.asarray(colors).T[pixels] / 257).astype(np.uint8), 8
+    if transparent and samples == 2:
+        return pixels[..., [0, 0, 0, 1]], bits
+    if pixels.ndim == 3:
+        pixels = pixels[..., [2, 1, 0, 3]] if transparent else pixels[..., ::-1]
+    return pixels, bits
+
+
+def _only_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
+    """The page of the picture.
+
+    Raises:
+        UnreadableTiffError: there are several, or it begins with another one.
+    """
+    pages = [page.aspage() for page in itertools.islice(file.pages, _MOST_PICTURES)]
+    whole = [page for page in pages if not _is_copy(page)]
+    stacked = int((file.imagej_metadata or {}).get("images", 1))
+    if len(whole) > 1 or stacked > 1:
+        raise UnreadableTiffError(f"a TIFF file of {max(len(whole), stacked)} pictures")
+    if not whole or whole[0] is not pages[0]:
+        raise UnreadableTiffError("a TIFF file that begins with a smaller copy of its picture")
+    return whole[0]
+
+
+def _is_copy(page: tifffile.TiffPage) -> bool:
+    """Whether a page is a smaller copy or a mask of another one."""
+    older = page.tags.get(255)
+    return bool(page.subfiletype & _NO_PICTURE) or (older is not None and older.value == _OLD_REDUCED)
+
+
+def _judged(page: tifffile.TiffPage) -> tuple[int, bool]:
+    """Samples of a pixel, and whether the last is transparency.
+
+    Raises:
+        UnreadableTiffError: the samples are not those of a gray or a color picture.
+    """
+    meaning, samples = int(page.photometric), int(page.samplesperpixel)
+    if meaning == _WHITE_IS_ZERO:
+        raise UnreadableTiffError("a TIFF file whose white is 0")
+    if meaning not in _SAMPLES or (meaning == _YCBCR and int(page.compression) not in _JPEG):
+        name = getattr(page.photometric, "name", str(meaning)).lower()
+        raise UnreadableTiffError(f"a TIFF file of the color model {name}")
+    more = samples - _SAMPLES[meaning]
+    extra = tuple(int(kind) for kind in page.extrasamples)
+    # Many writers leave the fourth sample of RGB unnamed; a second one of gray may be anything.
+    alpha = more == 1 and meaning in (_GRAY, _RGB) and (meaning == _RGB or extra[:1] in {(1,), (2,)})
+    if more and not alpha:
+        what = "gray" if meaning == _GRAY else "color"
+        raise UnreadableTiffError(f"a TIFF file of {samples} samples a pixel, more than {what} has")
+    whole = page.dtype is not None and page.dtype.kind in "bu" and page.dtype.itemsize <= 2
+    if page.dtype is None or not (whole or page.dtype.kind == "f"):
+        raise UnreadableTiffError(f"a TIFF file with values of type {page.dtype}")
+    return samples, alpha

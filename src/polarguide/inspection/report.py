@@ -1,0 +1,270 @@
+"""An inspection as one HTML page without scripts or other files, and as ``inspection.json`` for programs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch.nn.functional import max_pool2d
+
+from polarguide import __version__, optics
+from polarguide.core.files import make_folder, write_text, write_whole
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.records import to_json
+from polarguide.inspection.angles import AngleFindings
+from polarguide.inspection.capture import InspectedView, ViewMeasurements, quantile
+from polarguide.inspection.inspect import Inspection
+from polarguide.inspection.settings import plain
+from polarguide.inspection.shots import ShotFindings
+from polarguide.visualization import figures
+from polarguide.visualization.embedded import data_uri
+from polarguide.visualization.figures import Picture
+from polarguide.visualization.layers import AOLP_FULL_DOLP, DOLP_HIGH
+from polarguide.visualization.pages import page
+
+SIDE = 240
+"""Longest side of the pictures in pixels."""
+NOISE_HIGH, EXCESS_HIGH = 0.05, 0.1
+SATURATED_COLOR, INVALID_COLOR = (255, 40, 40), (60, 120, 255)
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A layer that the page can show.
+
+    Attributes:
+        key, label: its name in HTML and for people. legend: a description of its colors.
+        ramp: color map of the legend's bar, or None. caption: the line below a view.
+    """
+
+    key: str
+    label: str
+    legend: str
+    ramp: str | None
+    caption: Callable[[ViewMeasurements], str]
+
+
+LAYERS: tuple[Layer, ...] = (
+    Layer("s0", "S0", "Photograph S0 / 2 in sRGB; the view's 99th percentile is white.", None,
+          lambda r: f"99 % under {r.bright:.2f}"),
+    Layer("dolp", "DoLP", f"0 to {DOLP_HIGH:g}", "inferno", lambda r: f"median {r.dolp[0]:.3f}, 99 % {r.dolp[1]:.2f}"),
+    Layer("aolp", "AoLP", f"Angle of the field by color; dark where the DoLP is below {AOLP_FULL_DOLP:g}.", None,
+          lambda r: f"{r.polarized:.0%} polarized"),
+    Layer("saturation", "Saturation", "Red: one angle at full scale. Blue: marked invalid, or black.", None,
+          lambda r: f"{r.saturated:.1%} + {r.invalid:.1%}"),
+    Layer("noise", "Noise", f"Of one intensity relative to the photograph: 0 to {NOISE_HIGH:.0%}", "viridis",
+          lambda r: f"median {r.noise_share:.2%}"),
+    Layer("consistency", "Pair sums", f"|I0 + I90 - I45 - I135| / S0: 0 to {EXCESS_HIGH:.0%}", "magma",
+          lambda r: f"median {r.sum_error:.1%}" + ("" if r.pair_ratio is None else f", ratio {r.pair_ratio:.3f}")),
+)  # fmt: skip
+
+
+SHOT_LAYERS: tuple[Layer, ...] = (
+    Layer("s0", "Picture", "Mean of the view's pictures in sRGB; its 99th percentile is white.", None,
+          lambda r: f"{r.exposures}; 99 % under {r.bright:.2f}"),
+    Layer("saturation", "Saturation", "Red: one picture at full scale. Blue: marked invalid, or black.", None,
+          lambda r: f"{r.saturated:.1%} + {r.invalid:.1%}"),
+)  # fmt: skip
+"""Of captures with other pictures than four angles a view."""
+
+
+def layer_uris(view: InspectedView, layers: Sequence[Layer]) -> dict[str, str]:
+    """Layers of a view as data URIs, by key."""
+    photograph = view.intensities().mean(dim=0)
+    shown = figures.radiance_to_rgb(photograph / max(quantile(photograph, 0.99), 1e-6))
+    pictures = {"s0": shown, "saturation": _marked(shown, view)}
+    if layers is LAYERS:
+        pictures |= _of_four(view)
+    return {layer.key: data_uri(pictures[layer.key], layer.key, SIDE) for layer in layers}
+
+
+def _of_four(view: InspectedView) -> dict[str, Picture]:
+    """What only pictures at four angles show."""
+    gray = view.intensities().mean(dim=-1)
+    stokes = optics.stokes(gray)
+    s0, degree = stokes[0].clamp(min=1e-6), optics.dolp(stokes)
+    excess = (gray[0] + gray[2] - gray[1] - gray[3]).abs() / s0
+    return {
+        "dolp": figures.dolp_to_rgb(degree, DOLP_HIGH),
+        "aolp": figures.aolp_to_rgb(optics.aolp(stokes), degree / AOLP_FULL_DOLP),
+        "noise": figures.scalar_to_rgb(optics.intensity_noise(gray) / (s0 / 2), 0.0, NOISE_HIGH),
+        "consistency": figures.scalar_to_rgb(excess, 0.0, EXCESS_HIGH, "magma"),
+    }
+
+
+def _marked(shown: Picture, view: InspectedView) -> Picture:
+    """The photograph in dark gray, with saturated and invalid pixels in color."""
+    dim = (shown.mean(axis=-1, keepdims=True) * 0.6).astype(np.uint8).repeat(3, axis=-1)
+    for mask, color in (
+        (view.black | view.invalid, INVALID_COLOR),
+        (view.saturated & ~view.black, SATURATED_COLOR),
+    ):
+        # Dilated by a pixel, so that single ones stay visible after downscaling.
+        dim[(max_pool2d(mask[None].float(), 3, 1, 1)[0] > 0).numpy()] = color
+    return dim
+
+
+FILE = "inspection.html"
+
+
+def inspection_html(found: Inspection, reporter: Reporter = SILENT) -> str:
+    """The HTML page; all names and texts in it are escaped.
+
+    Args:
+        found: the findings.
+        reporter: receives the progress.
+    """
+    capture, settings, angles = found.capture, found.settings, found.angles
+    layers = LAYERS if capture.four else SHOT_LAYERS
+    marked = {name for check in found.checks for name in check.views}
+    tiles = []
+    with reporter.track("drawing", len(capture.views)) as advance:
+        for view, measured in zip(capture.views, found.measurements, strict=True):
+            uris = layer_uris(view, layers)
+            pictures = [(layer, uris[layer.key], layer.caption(measured)) for layer in layers]
+            tiles.append((measured.view, view.name in marked, pictures))
+            advance(len(tiles))
+    posed = f"{len(capture.posed)} with a pose" if capture.model is not None else "no poses"
+    width, height = capture.size
+    return page(
+        "polarguide.inspection",
+        "inspection.html",
+        title=f"Inspection of {capture.name}",
+        summary=f"{len(capture.views)} views of {width} x {height} pixels, {capture.bits} bits; {posed}",
+        found=found,
+        why=_why(angles),
+        orders=_orders(angles) if isinstance(angles, AngleFindings) else [],
+        shots=_shots(angles) if isinstance(angles, ShotFindings) else [],
+        notes=_notes(angles) if isinstance(angles, AngleFindings) else [],
+        layers=layers,
+        ramps={layer.ramp: figures.color_gradient(layer.ramp) for layer in layers if layer.ramp},
+        wheel=figures.aolp_wheel(),
+        tiles=tiles,
+        figures=_figures(found.measurements),
+        facts={
+            "transfer": capture.transfer,
+            "box filter": f"{capture.factor} x {capture.factor} pixels",
+            "refractive index": f"{found.index:g}",
+            "normals": f"{settings.normals}, {settings.steps} steps if trained",
+            "SHA-256 of the pictures": capture.digest,
+        },
+    )
+
+
+def _why(angles: AngleFindings | ShotFindings) -> str:
+    """Why nothing was found; empty where something was."""
+    if isinstance(angles, ShotFindings):
+        return angles.why
+    return "" if angles.posterior else "Not decided: this check needs poses and reflecting surfaces."
+
+
+def _orders(angles: AngleFindings) -> list[tuple[str, str, float, str]]:
+    """Files, sense and zero, probability, and log-odds relative to the best (empty: the best)."""
+    if angles.posterior is None:
+        return []
+    return [
+        (
+            ", ".join(f"{angle}°" for angle in row.files),
+            row.order.label,
+            row.probability,
+            "" if k == angles.posterior.best else f"{-row.log_odds:.1f}",
+        )
+        for k, row in enumerate(angles.hypotheses)
+    ]
+
+
+def _notes(angles: AngleFindings) -> list[str]:
+    found = angles.posterior
+    zero = "" if found is None else f"{found.offset:+.2f}° ± {found.offset_error:.2f}°"
+    notes = [f"Zero offset beyond the best order: {zero}."] if zero else []
+    return notes + [
+        f"{e.source.capitalize()}{'' if e.usable else ' (not used)'}: {e.note}" for e in angles.sources
+    ]
+
+
+def _shots(found: ShotFindings) -> list[tuple[str, ...]]:
+    """Rows of the table of angles: what is specified of each picture, and what was found."""
+    rows: list[tuple[str, ...]] = []
+    for judgment, said in zip(found.judgments, found.said, strict=True):
+        angle = "without a filter, as it looks" if judgment.unfiltered else f"{judgment.angle:.0f}°"
+        angle = "too little polarization to tell" if judgment.vague else angle
+        numbers = (f"{judgment.spread:.1f}°", f"{judgment.modulation:.2f}", f"{judgment.gain:.2f}")
+        rows.append((judgment.view, said.words, angle, *numbers))
+    return [] if found.why else rows
+
+
+def _figures(measurements: Sequence[ViewMeasurements]) -> list[tuple[str, ...]]:
+    """Head and rows of the table of figures; single shots have fewer of them."""
+    shots = any(r.exposures for r in measurements)
+    head = ("99 % under", "saturated", "invalid", "dark")
+    more = (
+        "noise",
+        "pair ratio",
+        "sum error",
+        "DoLP median",
+        "DoLP 99 %",
+        "polarized",
+        "above diffuse limit",
+    )
+    rows: list[tuple[str, ...]] = [("view", "pictures", *head) if shots else ("view", *head, *more)]
+    for r in measurements:
+        cells = (f"{r.bright:.3f}", f"{r.saturated:.2%}", f"{r.invalid:.2%}", f"{r.dark:.2%}")
+        if shots:
+            rows.append((r.view, r.exposures or "0, 45, 90, 135", *cells))
+            continue
+        ratio = "n/a" if r.pair_ratio is None else f"{r.pair_ratio:.4f}"
+        further = (ratio, f"{r.sum_error:.2%}", f"{r.dolp[0]:.3f}", f"{r.dolp[1]:.3f}", f"{r.polarized:.1%}")
+        rows.append((r.view, *cells, f"{r.noise_share:.2%}", *further, f"{r.above_limit:.1%}"))
+    return rows
+
+
+SCHEMA = 2
+"""Raised whenever a key changes its meaning or goes away; new keys do not raise it."""
+RECORD = "inspection.json"
+
+
+def inspection_record(found: Inspection) -> dict[str, Any]:
+    """The findings as plain JSON types; docs/reference/inspection.md describes the keys."""
+    capture = found.capture
+    record: dict[str, Any] = plain(
+        {
+            "schema": SCHEMA,
+            "program": f"polarguide {__version__}",
+            "scene": {
+                "name": capture.name,
+                "views": len(capture.views),
+                "posed_views": len(capture.posed),
+                "size": list(capture.size),
+                "bits": capture.bits,
+                "digest": capture.digest,
+            },
+            "settings": {
+                "downscale": capture.factor,
+                "transfer": capture.transfer,
+                "refractive_index": found.index,
+                "normals": found.settings.normals,
+                "steps": found.settings.steps,
+            },
+            "verdict": found.verdict,
+            "checks": [check.record() for check in found.checks],
+            "angles": found.angles.record(),
+            "views": [measured.record() for measured in found.measurements],
+        }
+    )
+    return record
+
+
+def write_inspection(found: Inspection, out: Path, reporter: Reporter = SILENT) -> tuple[Path, Path]:
+    """Write the page and ``inspection.json`` into a folder; returns their paths.
+
+    Raises:
+        PolarguideError: they cannot be written.
+    """
+    make_folder(out)
+    page, record = out / FILE, out / RECORD
+    write_whole(record, to_json(inspection_record(found)))
+    write_text(page, inspection_html(found, reporter))
+    return page, record

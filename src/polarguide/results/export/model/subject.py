@@ -1,0 +1,103 @@
+"""The subject of a run as a clean mesh: what lies in the crop box, and in the masks of the foreground."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from polarguide.capture.presentation import Crop
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import write_whole
+from polarguide.core.options import ModelOptions
+from polarguide.geometry.camera import Camera, seen_at
+from polarguide.results.export.model.topology import Places, simplified, topology
+from polarguide.results.rendering.mesh import Box, ColoredMesh, DepthSamples, Surface, fused_surface
+from polarguide.runs.opened import OpenedRun
+from polarguide.shading.result import RenderResult
+
+SurfaceView = Callable[[Camera], RenderResult]
+Inside = Callable[[Places], NDArray[np.bool_]]
+"""Which places [N, 3] of the scene belong to the subject."""
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def subject_of(run: OpenedRun, crop: Crop | None, *, masked: bool) -> Inside | None:
+    """What belongs to the subject: all in the crop box, and where ``masked``, in the mask of most views that have it.
+
+    Returns:
+        None where that is everything.
+
+    Raises:
+        PolarguideError: masks are asked for, and the scene has none.
+    """
+    views = [view for view in run.scene.views if view.mask is not None] if masked else []
+    if masked and not views:
+        raise PolarguideError(
+            "--masked",
+            expected="a scene with masks of the foreground (masks/)",
+            found="none",
+            remedy="Set a crop box instead: polarguide present RUN --crop.",
+        )
+    if crop is None and not views:
+        return None
+
+    def inside(places: Places) -> NDArray[np.bool_]:
+        points = torch.from_numpy(places)
+        votes = torch.zeros(len(points))
+        for view in views:
+            assert view.mask is not None
+            pixel, _, in_picture = seen_at(points - view.camera.center, view.camera)
+            votes += in_picture * torch.where(view.mask.cpu()[pixel], 1.0, -1.0)
+        kept = votes > 0 if views else torch.ones(len(points), dtype=torch.bool)
+        if crop is not None:
+            kept &= crop.inside(points, run.camera_frame)
+        return np.asarray(kept.numpy())
+
+    return inside
+
+
+def subject_surface(
+    run: OpenedRun, surface_view: SurfaceView, inside: Inside | None, options: ModelOptions, resolution: int
+) -> tuple[Surface, list[tuple[Camera, DepthSamples]], Box]:
+    """The simplified surface of the subject, what each camera saw of it, and the grid it was fused in.
+
+    Raises:
+        PolarguideError: there is none.
+    """
+    surface, views, box = fused_surface(run.cameras, surface_view, resolution=resolution)
+    if inside is not None:
+        surface = ColoredMesh(surface, surface.vertices).within(inside(surface.vertices)).surface
+    surface = simplified(surface, options.triangles, closed=options.close_bottom)
+    return surface, views, box
+
+
+def counted(surface: Surface) -> str:
+    """The counts of a mesh, for people."""
+    counts = topology(surface.faces)
+    return (
+        f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, {counts.pieces} pieces; "
+        f"{counts.boundary_edges:,} boundary edges, {counts.non_manifold_edges} non-manifold edges"
+    )
+
+
+def write_stl(path: Path, vertices: Places, faces: NDArray[np.int64], words: str) -> None:
+    """Write a binary STL file.
+
+    Args:
+        path: the file. vertices: [V, 3] as the file has them. faces: [F, 3]. words: for its head, of which 80 are kept.
+
+    Raises:
+        PolarguideError: it cannot be written.
+    """
+    table = np.zeros(len(faces), _TRIANGLE)
+    table["corners"] = vertices[faces]
+    across = np.cross(
+        vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
+    )
+    table["normal"] = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
+    head = words.encode("ascii", "replace")[:80].ljust(80)  # it must not begin with "solid"
+    write_whole(path, head + np.uint32(len(faces)).tobytes() + table.tobytes())

@@ -1,0 +1,57 @@
+"""What ``model.json`` of a package says: units, axes, origin, cameras, scores, and what is not known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
+from polarguide.results.evaluation.table import shown_metrics
+from polarguide.results.export.placement import GENERATOR, Origin, Placement, transforms
+from polarguide.runs.opened import OpenedRun
+
+RECORD = "model.json"
+FILES = {
+    "model.glb": "textured mesh, lit by the viewer",
+    "model-unlit.glb": "textured mesh with the picture's colors, for viewers without light",
+    "splats-srgb.glb": "splats for readers that blend encoded colors (Babylon, PlayCanvas)",
+    "splats-linear.glb": "splats for readers that blend linear colors (three.js)",
+    "environment.exr": "the learned light as a panorama of linear radiance",
+    "environment.hdr": "the same in the Radiance format",
+    "environment.png": "the same, to look at",
+    "preview.png": "a view of the run, to look at",
+}
+
+
+def about_files(names: list[str]) -> dict[str, str]:
+    """The files of a package with a word on each."""
+    return {name: FILES[name] for name in names}
+
+
+def package_record(run: OpenedRun, placement: Placement, origin: Origin, base_color: str) -> dict[str, Any]:
+    """The record, without files.
+
+    Args:
+        run: the run; its scene is read. placement: of the files, upright (+y). origin: whom they are owed to.
+        base_color: what that of the model is.
+    """
+    unknown = [
+        "the absolute brightness of base color and light: the learned light has no absolute scale",
+        "surfaces that no camera saw: they are closed or continued from the nearest ones",
+    ]
+    if not placement.metric:
+        unknown.append("how long a unit is")
+    cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
+    scored = (run.folder / METRICS_FILE).exists()
+    return {
+        "generator": GENERATOR,
+        **origin.record(),
+        "units": "meters" if placement.metric else "units of the scene",
+        "up_axis": "+y",
+        "rotation_of_scene": placement.rotation.flatten().tolist(),
+        "scale_of_scene": placement.scale,
+        "white_balance": list(origin.presentation.white_balance or (1.0, 1.0, 1.0)),
+        "base_color": base_color,
+        "not_known": unknown,
+        "scores": dict(shown_metrics(read_metrics(run.folder), scores_only=True)) if scored else {},
+        "cameras": transforms(cameras)["frames"],
+    }

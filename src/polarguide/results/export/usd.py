@@ -1,0 +1,150 @@
+"""Models and splats as USDZ packages: +y up, with ``metersPerUnit``, since without it a unit is a centimeter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.files import temporary_folder, write_whole
+from polarguide.gaussians.ply import read_ply
+from polarguide.results.export.model.gltf import Textured, encoded
+
+ROOT = "/model"
+WHAT = "a USDZ package"
+
+
+def write_usdz(path: Path, model: Textured, about: dict[str, Any], *, jpeg: bool) -> None:
+    """Write a textured mesh with a UsdPreviewSurface; unlit, its color is emitted.
+
+    Args:
+        path: the file. model: upright (+y). about: whom and what made it, in the stage's own data.
+        jpeg: whether base color, roughness and metalness are JPEG; else PNG.
+
+    Raises:
+        PolarguideError: usd-core is not installed, or the file cannot be written.
+    """
+    vt, geom, sdf = _module("Vt"), _module("UsdGeom"), _module("Sdf")
+
+    def fill(stage: Any, folder: Path) -> None:
+        mesh = geom.Mesh.Define(stage, f"{ROOT}/mesh")
+        points = vt.Vec3fArray.FromNumpy(model.vertices.astype("f4"))
+        mesh.CreatePointsAttr(points)
+        mesh.CreateExtentAttr(geom.PointBased.ComputeExtent(points))
+        mesh.CreateFaceVertexCountsAttr([3] * len(model.faces))
+        mesh.CreateFaceVertexIndicesAttr(vt.IntArray.FromNumpy(model.faces.ravel().astype("i4")))
+        mesh.CreateNormalsAttr(vt.Vec3fArray.FromNumpy(model.normals.astype("f4")))
+        mesh.SetNormalsInterpolation("vertex")
+        mesh.CreateSubdivisionSchemeAttr("none")
+        uv = model.uv.astype("f4")
+        uv[:, 1] = 1 - uv[:, 1]  # v counts from the last row
+        coordinates = geom.PrimvarsAPI(mesh).CreatePrimvar("st", sdf.ValueTypeNames.TexCoord2fArray, "vertex")
+        coordinates.Set(vt.Vec2fArray.FromNumpy(uv))
+        _bind(stage, mesh, model, folder, jpeg=jpeg)
+
+    _package(path, about, fill)
+
+
+def _bind(stage: Any, mesh: Any, model: Textured, folder: Path, *, jpeg: bool) -> None:
+    """The material of a mesh, with its textures as files in the folder."""
+    shade, types = _module("UsdShade"), _module("Sdf").ValueTypeNames
+    material = shade.Material.Define(stage, f"{ROOT}/material")
+
+    def shader(name: str, kind: str, **inputs: tuple[Any, Any]) -> Any:
+        made = shade.Shader.Define(stage, f"{ROOT}/material/{name}")
+        made.CreateIdAttr(kind)
+        for key, (type_name, value) in inputs.items():
+            made.CreateInput(key, type_name).Set(value)
+        return made
+
+    def texture(name: str, pixels: Any, space: str) -> Any:
+        kind, data = encoded(pixels, jpeg=jpeg)
+        file = f"{name}.{'jpg' if kind.endswith('jpeg') else 'png'}"
+        (folder / file).write_bytes(data)
+        clamp = (types.Token, "clamp")
+        made = shader(name, "UsdUVTexture", file=(types.Asset, f"./{file}"), sourceColorSpace=(types.Token, space),
+                      wrapS=clamp, wrapT=clamp)  # fmt: skip
+        made.CreateInput("st", types.Float2).ConnectToSource(places.CreateOutput("result", types.Float2))
+        return made
+
+    places = shader("st", "UsdPrimvarReader_float2", varname=(types.String, "st"))
+    surface = shader("surface", "UsdPreviewSurface", ior=(types.Float, model.index))
+    color = texture("color", model.base_color, "sRGB").CreateOutput("rgb", types.Float3)
+    if model.surface is None:
+        surface.CreateInput("diffuseColor", types.Color3f).Set((0, 0, 0))
+        surface.CreateInput("emissiveColor", types.Color3f).ConnectToSource(color)
+        surface.CreateInput("roughness", types.Float).Set(1.0)
+    else:
+        surface.CreateInput("diffuseColor", types.Color3f).ConnectToSource(color)
+        values = texture("reflection", model.surface, "raw")
+        for name, channel in (("roughness", "g"), ("metallic", "b")):
+            surface.CreateInput(name, types.Float).ConnectToSource(values.CreateOutput(channel, types.Float))
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", types.Token))
+    shade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+
+
+def write_splat_usdz(path: Path, ply: Path, about: dict[str, Any]) -> None:
+    """Write splats as a ``ParticleField3DGaussianSplat``; our own fields are left out.
+
+    Args:
+        path: the file. ply: as ``write_run_ply`` writes it, upright (+y). about: whom and what made it.
+
+    Raises:
+        PolarguideError: usd-core is not installed or knows no splats, or the file cannot be written.
+    """
+    vt, kind = _module("Vt"), getattr(_module("UsdVol"), "ParticleField3DGaussianSplat", None)
+    if kind is None:
+        raise PolarguideError(
+            "usd-core",
+            expected="a version with ParticleField3DGaussianSplat",
+            found="an older one",
+            remedy="pip install -U usd-core.",
+        )
+    gaussians = read_ply(ply)
+    harmonics = torch.cat((gaussians["sh_dc"], gaussians["sh_rest"]), dim=1).reshape(-1, 3)
+    turns = torch.nn.functional.normalize(gaussians["quaternions"], dim=1)[
+        :, [1, 2, 3, 0]
+    ]  # as USD stores them
+    scales = gaussians["log_scales"].exp()
+    reach = 3 * scales.amax(dim=1, keepdim=True)
+    corners = torch.stack(
+        ((gaussians["means"] - reach).amin(dim=0), (gaussians["means"] + reach).amax(dim=0))
+    )
+
+    def fill(stage: Any, _: Path) -> None:
+        field = kind.Define(stage, f"{ROOT}/splats")
+        field.CreatePositionsAttr(vt.Vec3fArray.FromNumpy(gaussians["means"].numpy()))
+        field.CreateExtentAttr(vt.Vec3fArray.FromNumpy(corners.numpy()))
+        field.CreateScalesAttr(vt.Vec3fArray.FromNumpy(scales.numpy()))
+        field.CreateOrientationsAttr(vt.QuatfArray.FromNumpy(turns.contiguous().numpy()))
+        field.CreateOpacitiesAttr(vt.FloatArray.FromNumpy(torch.sigmoid(gaussians["opacity_logits"]).numpy()))
+        field.CreateRadianceSphericalHarmonicsDegreeAttr(3)
+        field.CreateRadianceSphericalHarmonicsCoefficientsAttr(vt.Vec3fArray.FromNumpy(harmonics.numpy()))
+
+    _package(path, about, fill)
+
+
+def _module(name: str) -> Any:
+    return optional_import(f"pxr.{name}", WHAT, extra="usd")
+
+
+def _package(path: Path, about: dict[str, Any], fill: Callable[[Any, Path], None]) -> None:
+    """Write a stage, filled by a function that may put textures beside it, as one package."""
+    usd, geom, utils, sdf = (_module(name) for name in ("Usd", "UsdGeom", "UsdUtils", "Sdf"))
+    with temporary_folder(path.with_suffix(".parts")) as folder:
+        stage = usd.Stage.CreateNew(str(folder / "model.usdc"))
+        geom.SetStageUpAxis(stage, geom.Tokens.y)
+        geom.SetStageMetersPerUnit(stage, 1.0)
+        stage.SetDefaultPrim(geom.Xform.Define(stage, ROOT).GetPrim())
+        stage.GetRootLayer().customLayerData = about
+        fill(stage, folder)
+        stage.Save()
+        whole = folder / "whole.usdz"
+        if not utils.CreateNewUsdzPackage(sdf.AssetPath(str(folder / "model.usdc")), str(whole)):
+            raise PolarguideError(
+                path, expected="a USDZ package", found="none", remedy="Make room on the disk."
+            )
+        write_whole(path, whole.read_bytes())

@@ -1,0 +1,149 @@
+"""A color chart in a photograph: 24 patches, and the matrix from the camera's linear RGB to linear sRGB that they give.
+
+The chart is that of McCamy, Marcus and Davidson (1976), "A color-rendition chart". ``LAB`` are its maker's values for
+charts made since November 2014 (X-Rite 2016, "New color specifications for ColorChecker SG and Classic Charts"): CIELAB
+under D50, by rows from dark skin to black. The matrix is the one of least squared distances in CIELAB; its error is
+stated as CIEDE2000 of each patch by the matrix that the others give.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from polarguide.capture import View
+from polarguide.capture.presentation import Chart
+from polarguide.core.errors import PolarguideError, optional_import
+
+Floats = NDArray[np.float64]
+LAB: Floats = np.array([
+    (37.54, 14.37, 14.92), (64.66, 19.27, 17.50), (49.32, -3.82, -22.54), (43.46, -12.74, 22.72),
+    (54.94, 9.61, -24.79), (70.48, -32.26, -0.37), (62.73, 35.83, 56.50), (39.43, 10.75, -45.17),
+    (50.57, 48.64, 16.67), (30.10, 22.54, -20.87), (71.77, -24.13, 58.19), (71.51, 18.24, 67.37),
+    (28.37, 15.42, -49.80), (54.38, -39.72, 32.27), (42.43, 51.05, 28.62), (81.80, 2.67, 80.41),
+    (50.63, 51.28, -14.12), (49.57, -29.71, -28.32), (95.19, -1.03, 2.93), (81.29, -0.57, 0.44),
+    (66.89, -0.75, -0.06), (50.76, -0.13, 0.14), (35.63, -0.46, -0.48), (20.64, 0.07, -0.46),
+])  # fmt: skip
+COLUMNS, ROWS = 6, 4
+XYZ_OF_SRGB: Floats = np.array(
+    [(0.4360747, 0.3850649, 0.1430804), (0.2225045, 0.7168786, 0.0606169), (0.0139322, 0.0971045, 0.7141733)]
+)
+"""Linear sRGB to XYZ under D50, adapted after Bradford (Lindbloom, "RGB/XYZ matrices")."""
+HALF_PATCH = 0.25
+"""Of the distance of two patches, to each side of a center: what is surely of the patch."""
+LEAST_PIXELS = 16
+"""Of a patch, so that noise and the mosaic's colors do not decide."""
+LEAST_PATCHES = 18
+"""Twice the unknowns of the matrix in patches: a row of grays or a column may clip or lie in shade."""
+WORST_FIT = 6.0
+"""Mean CIEDE2000: matrices of cameras leave 1 to 4; beyond, corners, chart or light are others."""
+
+
+def chart_of(view: View, corners: Sequence[float]) -> Chart:
+    """What a chart in a photograph says of the camera and the light.
+
+    Args:
+        view: whose photograph shows the chart. corners: x, y of the centers of the four corner patches in pixels, four
+            times, around the chart, from any of them: the order that fits best is taken.
+
+    Raises:
+        PolarguideError: patches clip, are too small or too few, or no order fits.
+    """
+    quad = np.array(corners, dtype=np.float64).reshape(4, 2)
+    fits = []
+    for order in _orders():
+        colors = _patches(view, quad[order])
+        used: NDArray[np.bool_] = np.all(np.isfinite(colors), axis=1)
+        fits.append((_distance(_linear(colors[used], used), colors[used], used), colors, used))
+    _, colors, used = min(fits, key=lambda fit: fit[0])
+    if int(used.sum()) < LEAST_PATCHES:
+        raise PolarguideError(
+            "chart",
+            expected=f"{LEAST_PATCHES} of {len(LAB)} patches of {LEAST_PIXELS} pixels, none of them clipped",
+            found=f"{int(used.sum())} in {view.name}",
+            remedy="Take a photograph of less exposure or from nearer, or correct the corners.",
+        )
+    matrix, errors = _fitted(colors[used], used), _left_out(colors, used)
+    if not errors.mean() <= WORST_FIT:
+        raise PolarguideError(
+            "chart",
+            expected=f"patches that one matrix brings within a mean CIEDE2000 of {WORST_FIT:g}",
+            found=f"{errors.mean():.1f}, up to {errors.max():.1f}, in {view.name}",
+            remedy="Give the centers of the four corner patches, around the chart, under even light.",
+        )
+    red, green, blue = ((float(a), float(b), float(c)) for a, b, c in matrix)
+    return Chart((red, green, blue), float(errors.mean()), float(errors.max()), int(used.sum()), view.name)
+
+
+def _orders() -> Iterator[list[int]]:
+    """The eight ways to go around four corners."""
+    for begin in range(4):
+        for step in (1, -1):
+            yield [(begin + step * k) % 4 for k in range(4)]
+
+
+def _patches(view: View, quad: Floats) -> Floats:
+    """Mean linear colors of the patches, [24, 3]; NaN where one clips, is invalid or too small."""
+    ends = np.array([(0, 0), (COLUMNS - 1, 0), (COLUMNS - 1, ROWS - 1), (0, ROWS - 1)], np.float32)
+    to_chart = cv2.getPerspectiveTransform(quad.astype(np.float32), ends)
+    camera = view.camera
+    low = np.maximum(np.floor(quad.min(axis=0) - 0.2 * np.ptp(quad, axis=0)), 0).astype(int)
+    high = np.ceil(quad.max(axis=0) + 0.2 * np.ptp(quad, axis=0)).astype(int) + 1
+    part = slice(low[1], min(int(high[1]), camera.height)), slice(low[0], min(int(high[0]), camera.width))
+    picture = view.photograph()[part].double().numpy()
+    bad = (view.invalid | view.saturated)[part].numpy()
+    y, x = np.mgrid[0 : bad.shape[0], 0 : bad.shape[1]] + 0.5
+    homogeneous = np.stack([x + low[0], y + low[1], np.ones_like(x)], axis=-1) @ to_chart.T
+    place = homogeneous[..., :2] / homogeneous[..., 2:]
+    nearest = np.rint(place)
+    inside = (np.abs(place - nearest) < HALF_PATCH).all(axis=-1)
+    inside &= ((nearest >= 0) & (nearest < (COLUMNS, ROWS))).all(axis=-1)
+    index = (nearest[..., 1] * COLUMNS + nearest[..., 0])[inside].astype(int)
+    counts = np.bincount(index, minlength=len(LAB))
+    whole = (counts >= LEAST_PIXELS) & (np.bincount(index, bad[inside], len(LAB)) == 0)
+    sums = np.stack([np.bincount(index, picture[inside][:, c], len(LAB)) for c in range(3)], axis=1)
+    return np.where(whole[:, None], sums / np.maximum(counts, 1)[:, None], np.nan)
+
+
+def _linear(colors: Floats, used: NDArray[np.bool_]) -> Floats:
+    """The matrix [3, 3] of least squares in linear sRGB; zero where there are too few patches."""
+    if len(colors) < LEAST_PATCHES:
+        return np.zeros((3, 3))
+    wanted = _skimage().lab2xyz(LAB, illuminant="D50")[used] @ np.linalg.inv(XYZ_OF_SRGB).T
+    return np.asarray(np.linalg.lstsq(colors, wanted, rcond=None)[0].T)
+
+
+def _lab(matrix: Floats, colors: Floats) -> Floats:
+    return np.asarray(_skimage().xyz2lab(colors @ (XYZ_OF_SRGB @ matrix).T, illuminant="D50"))
+
+
+def _distance(matrix: Floats, colors: Floats, used: NDArray[np.bool_]) -> float:
+    """Mean CIEDE2000 of what a matrix makes of colors."""
+    if not len(colors):
+        return np.inf
+    return float(_skimage().deltaE_ciede2000(LAB[used], _lab(matrix, colors)).mean())
+
+
+def _fitted(colors: Floats, used: NDArray[np.bool_]) -> Floats:
+    def residuals(numbers: Floats) -> Floats:
+        return np.asarray(_lab(numbers.reshape(3, 3), colors) - LAB[used]).ravel()
+
+    return np.asarray(least_squares(residuals, _linear(colors, used).ravel(), x_scale="jac").x.reshape(3, 3))
+
+
+def _left_out(colors: Floats, used: NDArray[np.bool_]) -> Floats:
+    """CIEDE2000 of each patch that is used, by the matrix of the others."""
+    errors = []
+    for patch in np.flatnonzero(used):
+        one = np.arange(len(LAB)) == patch
+        errors.append(_distance(_fitted(colors[used & ~one], used & ~one), colors[one], one))
+    return np.array(errors)
+
+
+def _skimage() -> Any:
+    return optional_import("skimage.color", "--chart")
