@@ -12,7 +12,7 @@ import pytest
 from safetensors.torch import load_file
 
 from polarguide.cli.app import run
-from polarguide.runs.folder import CHECKPOINT
+from polarguide.runs.folder import CHECKPOINT, LOG
 
 PATIENCE = 120.0
 
@@ -82,7 +82,9 @@ def test_a_training_with_a_viewer_is_stopped_as_any(demo_scene: Path, tmp_path: 
     flags = ("--downscale", "4", "--threads", "1", "--viewer", "--viewer-port", str(port))
     process, _ = started("train", str(demo_scene), "--out", str(tmp_path / "run"), *flags)
     with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=PATIENCE):
-        time.sleep(1.0)
+        give_up = time.monotonic() + PATIENCE
+        while not (tmp_path / "run" / LOG).exists() and time.monotonic() < give_up:
+            time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     said, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
