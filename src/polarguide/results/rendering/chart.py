@@ -58,7 +58,7 @@ def chart_of(view: View, corners: Sequence[float]) -> Chart:
     fits = []
     for order in _orders():
         colors = _patches(view, quad[order])
-        used = np.isfinite(colors).all(axis=1)
+        used = np.asarray(np.isfinite(colors).all(axis=1))
         fits.append((_distance(_linear(colors[used], used), colors[used], used), colors, used))
     _, colors, used = min(fits, key=lambda fit: fit[0])
     if int(used.sum()) < LEAST_PATCHES:
