@@ -1,7 +1,7 @@
 """A color chart in a photograph: 24 patches, and the matrix from the camera's linear RGB to linear sRGB that they give.
 
 The chart is that of McCamy, Marcus and Davidson (1976), "A color-rendition chart". ``LAB`` are its maker's values for
-charts made since November 2014 (X-Rite 2016, "New color specifications for ColorChecker SG and Classic Charts"): CIELAB
+charts made since the end of 2014 (X-Rite, "New color specifications for ColorChecker SG and Classic Charts"): CIELAB
 under D50, by rows from dark skin to black. The matrix is the one of least squared distances in CIELAB; its error is
 stated as CIEDE2000 of each patch by the matrix that the others give.
 """
