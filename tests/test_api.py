@@ -56,7 +56,9 @@ class Listener(polarguide.Reporter):
 
     @contextlib.contextmanager
     def track(self, label: str, total: int | None) -> Iterator[Advance]:
-        def advance(done: int, *, total: int | None = None, note: str = "") -> None:
+        def advance(
+            done: int, *, total: int | None = None, note: str = "", left: float | None = None
+        ) -> None:
             self.tracked[label] = (done, note)
 
         yield advance

@@ -97,7 +97,9 @@ class Watch(Reporter):
     def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
         self.open.add(label)
 
-        def advance(done: int, *, total: int | None = None, note: str = "") -> None:
+        def advance(
+            done: int, *, total: int | None = None, note: str = "", left: float | None = None
+        ) -> None:
             assert label in self.open
             self.most = max(self.most, len(self.open) - 1)
             if label == "all":

@@ -25,7 +25,9 @@ class Heard(Reporter):
         progress: list[int] = []
         self.tracked.append((label, total, progress))
 
-        def advance(done: int, *, total: int | None = None, note: str = "") -> None:
+        def advance(
+            done: int, *, total: int | None = None, note: str = "", left: float | None = None
+        ) -> None:
             progress.append(done)
 
         yield advance

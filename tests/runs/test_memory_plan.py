@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from faults import Fault
@@ -129,6 +130,23 @@ def test_a_forecast_leaves_no_trace_and_a_short_training_has_none(tiny_scene: Sc
         "1 h 30 min",
         "2 h 01 min",
     ]
+
+
+def test_the_time_left_follows_the_stages_the_priors_and_the_gaussians() -> None:
+    """A machine that is half as fast as forecast, where an event of a minute comes at the tenth part."""
+    steps, first, most = 1000, 1000, 9000
+    priors = np.zeros(steps, bool)
+    priors[100:160] = priors[500:560] = True
+    least = np.where(np.arange(steps) < 100, 0.01, 0.02) + 0.05 * priors
+    expected = forecasts.Forecast(0, 0, first, most, 0, np.stack([least, 2 * least]), priors)
+    grown = np.minimum(first + 1000 * (np.arange(steps) // 100), 5000)  # density control ends at the half
+    true = 2 * (least * (1 + (grown - first) / (most - first)))
+    left = forecasts.TimeLeft(expected, STOKES)
+    for done in range(10, steps, 10):
+        event = 60.0 if done == 110 else 0.0
+        found = left.take(done, int(grown[done - 1]), float(true[done - 10 : done].sum()) + event)
+        if done > 100:
+            assert found == pytest.approx(true[done:].sum(), rel=0.2), done
 
 
 def test_what_is_found_once_of_all_views_is_not_forecast_for_each(

@@ -264,11 +264,7 @@ class Scene:
         ]
         ready = {each: posed[each] if downscale == 1 else posed[each].downscaled(downscale) for each in names}
         stored = StoredViews.of(data, [ready[item.name] for item in data])
-        places = _rows(points, "points", np.float32)
-        colors = np.full(places.shape, 128, np.uint8) if point_colors is None else point_colors
-        shades = _rows(colors, "point_colors", np.uint8)
-        if len(shades) != len(places):
-            raise _unlike("point_colors", f"{len(places)} rows, one a point", str(len(shades)))
+        places, shades = _points_of(points, point_colors)
         tests = chosen_views(posed, split) if test_views is None else tuple(sorted(test_views))
         for each in tests:
             if each not in given:
@@ -372,6 +368,18 @@ def _mask(given: Array | None, where: str, size: tuple[int, int]) -> NDArray[np.
     if mask.shape != size or mask.dtype != bool:
         raise _unlike(where, f"bool of shape {list(size)}", kind_of(mask))
     return np.ascontiguousarray(mask)
+
+
+def _points_of(
+    points: ArrayLike | Tensor, point_colors: ArrayLike | Tensor | None
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Points [M, 3] float32 and their colors [M, 3] uint8, gray where there are none."""
+    places = _rows(points, "points", np.float32)
+    colors = np.full(places.shape, 128, np.uint8) if point_colors is None else point_colors
+    shades = _rows(colors, "point_colors", np.uint8)
+    if len(shades) != len(places):
+        raise _unlike("point_colors", f"{len(places)} rows, one a point", str(len(shades)))
+    return places, shades
 
 
 def _rows(given: Any, where: str, kind: type[np.generic]) -> NDArray[Any]:

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn, TimeRemainingColumn
 from rich.table import Column
+from rich.text import Text
 
 import polarguide
 from polarguide.core.errors import PolarguideWarning
@@ -85,6 +86,21 @@ SPEED_SECONDS = 180.0
 """The speed of so long tells the time left: of a training whose pictures grow, the steps of the beginning are cheap."""
 
 
+class _Left(TimeRemainingColumn):
+    """The time left as the work itself says, or by its speed."""
+
+    def render(self, task: Task) -> Text:
+        """A time as of the superclass."""
+        left = task.fields.get("left")
+        return super().render(task) if left is None else Text(_clock(left), style="progress.remaining")
+
+
+def _clock(seconds: float) -> str:
+    """Hours, minutes and seconds."""
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+
+
 def bars(memory_seconds: float = 30.0) -> Progress:
     """A display of progress bars; the time left follows from the speed of the last seconds.
 
@@ -96,7 +112,7 @@ def bars(memory_seconds: float = 30.0) -> Progress:
         TextColumn("{task.description}", markup=False, table_column=label),
         BarColumn(bar_width=10),
         MofNCompleteColumn(table_column=Column(no_wrap=True)),
-        TimeRemainingColumn(table_column=Column(no_wrap=True)),
+        _Left(table_column=Column(no_wrap=True)),
         TextColumn("{task.fields[note]}", markup=False, table_column=note),
         console=console,
         transient=True,
@@ -114,7 +130,9 @@ class Lines:
         self._seen: deque[tuple[float, int]] = deque()  # when how much was done, about once a second
         self._line = ""
 
-    def __call__(self, done: int, *, total: int | None = None, note: str = "") -> None:
+    def __call__(
+        self, done: int, *, total: int | None = None, note: str = "", left: float | None = None
+    ) -> None:
         """See ``core.progress.Advance``."""
         now = self._clock()
         self._total = total or self._total
@@ -124,12 +142,11 @@ class Lines:
             self._seen.popleft()
         begin, first = self._seen[0]  # a training that goes on does not begin at 0
         finished = self._total is not None and done >= self._total
-        left = ""
-        if self._total is not None and done > first and not finished:
-            seconds = round((now - begin) * (self._total - done) / (done - first))
-            left = f", {seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d} left"
+        if left is None and self._total is not None and done > first:
+            left = (now - begin) * (self._total - done) / (done - first)
+        time_left = "" if left is None or finished else f", {_clock(left)} left"
         of = "" if self._total is None else f"/{self._total}"
-        self._line = f"{self._label} {done}{of}{left}" + (f"  {note}" if note else "")
+        self._line = f"{self._label} {done}{of}{time_left}" + (f"  {note}" if note else "")
         if now - self._last >= LINE_SECONDS:
             self._last = now
             self._print()
@@ -165,11 +182,13 @@ class ConsoleReporter(Reporter):
                 yield tell
             return
         with bars() as progress:
-            task = progress.add_task(label, total=total, note="")
+            task = progress.add_task(label, total=total, note="", left=None)
 
-            def advance(done: int, *, total: int | None = None, note: str = "") -> None:
+            def advance(
+                done: int, *, total: int | None = None, note: str = "", left: float | None = None
+            ) -> None:
                 progress.live.transient = not note
-                progress.update(task, completed=done, total=total, note=note)
+                progress.update(task, completed=done, total=total, note=note, left=left)
 
             yield advance
 
@@ -180,10 +199,10 @@ def lines(label: str, total: int | None) -> Iterator[Advance]:
     printer = Lines(label, total)
     noted = False
 
-    def advance(done: int, *, total: int | None = None, note: str = "") -> None:
+    def advance(done: int, *, total: int | None = None, note: str = "", left: float | None = None) -> None:
         nonlocal noted
         noted = bool(note)
-        printer(done, total=total, note=note)
+        printer(done, total=total, note=note, left=left)
 
     try:
         yield advance
@@ -212,10 +231,12 @@ class JobReporter(ConsoleReporter):
         if not self._open:
             self._progress.start()
         self._open += 1
-        task = self._progress.add_task(label, total=total, note="")
+        task = self._progress.add_task(label, total=total, note="", left=None)
 
-        def advance(done: int, *, total: int | None = None, note: str = "") -> None:
-            self._progress.update(task, completed=done, total=total, note=note)
+        def advance(
+            done: int, *, total: int | None = None, note: str = "", left: float | None = None
+        ) -> None:
+            self._progress.update(task, completed=done, total=total, note=note, left=left)
 
         try:
             yield advance

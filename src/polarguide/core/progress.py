@@ -10,11 +10,15 @@ from typing import Protocol
 class Advance(Protocol):
     """Records how much of a piece of work is done."""
 
-    def __call__(self, done: int, *, total: int | None = None, note: str = "") -> None:
-        """``done`` so far, of ``total`` if that has become known, and a few words about it."""
+    def __call__(
+        self, done: int, *, total: int | None = None, note: str = "", left: float | None = None
+    ) -> None:
+        """``done`` so far, of ``total`` if that has become known, and a few words about it; ``left``: the seconds that
+        it still takes, where more is known of them than the speed so far.
+        """
 
 
-def _ignore(done: int, *, total: int | None = None, note: str = "") -> None:
+def _ignore(done: int, *, total: int | None = None, note: str = "", left: float | None = None) -> None:
     pass
 
 

@@ -5,11 +5,15 @@ from __future__ import annotations
 import contextlib
 import math
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median_low
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from polarguide.capture import Scene
 from polarguide.capture.layout import (
@@ -220,6 +224,8 @@ class Forecast:
         seconds: as long as there are as many Gaussians as at the beginning. most_seconds: with ``most`` of them.
         gaussians: at the beginning. most: see above.
         peak: bytes of memory, at most.
+        costs: [2, steps] seconds of every step with either number of Gaussians, priors of views included.
+        priors: [steps] bool, which steps compute the priors of a view.
     """
 
     seconds: float
@@ -227,6 +233,8 @@ class Forecast:
     gaussians: int
     most: int
     peak: int
+    costs: NDArray[np.float64]
+    priors: NDArray[np.bool_]
 
     def sentence(self) -> str:
         """For whoever waits."""
@@ -259,14 +267,66 @@ def forecast(
     most = max(first, min(GROWTH * first, settings.gaussians))
     coarse = coarse_steps(recipe, scene.train_views, settings.steps)
     seconds, of_view = _measured(trainer, coarse)
-    computed = _priors_made(recipe, settings, len(scene.train_views), coarse)
-    priors = sum(count * of_view.get(size, 0.0) for size, count in computed.items())
+    computed = np.array(_priors_made(recipe, settings, len(scene.train_views), coarse))
+    small = np.arange(settings.steps) < coarse
+    priors = computed * np.where(small, of_view.get(True, 0.0), of_view.get(False, 0.0))
     again = 1 + _search_share(scene, recipe, settings)
-    least = greatest = again * (seconds + priors)
+    costs = np.stack([seconds + priors, seconds + priors])
     if most != first:
         _multiply(trainer, most)
-        greatest = again * (_measured(trainer, coarse)[0] + priors)
-    return Forecast(least, greatest, first, most, peak)
+        costs[1] = _measured(trainer, coarse)[0] + priors
+    least, greatest = (again * float(each.sum()) for each in costs)
+    return Forecast(least, greatest, first, most, peak, costs, computed > 0)
+
+
+class TimeLeft:
+    """The time that a training still takes: what its steps were expected to cost with as many Gaussians as there will
+    be, times how much longer than expected the last ones of their kind took: with priors to compute, or without.
+
+    Until the density control ends, every round of it adds as many Gaussians as the last one did.
+
+    Args:
+        expected: of the training. recipe: of it.
+    """
+
+    def __init__(self, expected: Forecast, recipe: Recipe) -> None:
+        self._expected, self._every = expected, recipe.densification.every
+        self._steps = expected.costs.shape[1]
+        stages = [Schedule(recipe, self._steps).at(step).stage for step in range(self._steps)]
+        self._grows = np.cumsum([stage.densify for stage in stages])
+        self._counts: list[tuple[int, int]] = [(0, expected.gaussians)]
+        # Single events, such as the search for metals, are no speed: the median of a tenth of the training is, of
+        # which every tenth step calls.
+        tenth = max(1, self._steps // 100)
+        self._ratios: dict[bool, deque[float]] = {kind: deque(maxlen=tenth) for kind in (False, True)}
+
+    def take(self, done: int, gaussians: int, seconds: float) -> float:
+        """The seconds left after so many steps; ``seconds``: that those since the last call took."""
+        before = self._counts[-1][0]
+        self._counts.append((done, gaussians))
+        wanted = float(self._costs(np.arange(before, done), np.full(done - before, gaussians)).sum())
+        kind = bool(self._expected.priors[before:done].any())
+        mine, others = self._ratios[kind], self._ratios[not kind]
+        if not mine:  # until more is known, a step of another kind tells how fast the machine is
+            mine.append(median_low(others or [1.0]))
+        mine.append(seconds / max(wanted, 1e-9))
+        steps = np.arange(done, self._steps)
+        added = self._growth(done, gaussians) * (self._grows[steps] - self._grows[done - 1])
+        costs = self._costs(steps, gaussians + added)
+        same = self._expected.priors[steps] == kind
+        alike, unlike = (float(costs[chosen].sum()) for chosen in (same, ~same))
+        return median_low(mine) * alike + median_low(others or mine) * unlike
+
+    def _growth(self, done: int, gaussians: int) -> float:
+        """Gaussians that a step of the density control adds, by the last round."""
+        past = max((step, count) for step, count in self._counts if step <= max(0, done - self._every))
+        return max(0, gaussians - past[1]) / max(1, done - past[0])
+
+    def _costs(self, steps: NDArray[np.int64], gaussians: NDArray[np.float64]) -> NDArray[np.float64]:
+        first, most = self._expected.gaussians, self._expected.most
+        least, greatest = self._expected.costs[:, steps]
+        share = (np.minimum(gaussians, most) - first) / max(1, most - first)
+        return np.asarray(least + (greatest - least) * share)
 
 
 def _search_share(scene: Scene, recipe: Recipe, settings: ResolvedSettings) -> float:
@@ -287,8 +347,8 @@ def in_words(seconds: float) -> str:
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def _measured(trainer: Trainer, coarse: int) -> tuple[float, dict[bool, float]]:
-    """Seconds of all steps with as many Gaussians as now, without priors, and seconds of the priors of one view, by
+def _measured(trainer: Trainer, coarse: int) -> tuple[NDArray[np.float64], dict[bool, float]]:
+    """Seconds of every step with as many Gaussians as now, without priors, and seconds of the priors of one view, by
     whether its picture is one of the smaller ones of the first steps.
     """
     schedule, steps = trainer.schedule, trainer.settings.steps
@@ -315,7 +375,7 @@ def _measured(trainer: Trainer, coarse: int) -> tuple[float, dict[bool, float]]:
         if position.stage.weights.priors:
             priors[small] = max(priors.get(small, 0.0), fresh - seconds[kind])
     kinds = ((step < coarse, stage.reflection, stage.weights) for step, stage in enumerate(stages))
-    return sum(seconds.get(kind, max(seconds.values())) for kind in kinds), priors
+    return np.array([seconds.get(kind, max(seconds.values())) for kind in kinds]), priors
 
 
 def _timed(trainer: Trainer, step: int) -> float:
@@ -326,17 +386,17 @@ def _timed(trainer: Trainer, step: int) -> float:
     return time.perf_counter() - begin
 
 
-def _priors_made(recipe: Recipe, settings: ResolvedSettings, views: int, coarse: int) -> dict[bool, int]:
-    """How many times priors of a view are computed, by whether its picture is one of the smaller ones."""
+def _priors_made(recipe: Recipe, settings: ResolvedSettings, views: int, coarse: int) -> list[int]:
+    """Of how many views each step computes the priors."""
     schedule, due = Schedule(recipe, settings.steps), views
-    counts = {True: 0, False: 0}
+    counts = [0] * settings.steps
     for step in range(settings.steps):
         position = schedule.at(step)
         if "refresh_priors" in position.actions or step == coarse:
             due = views
         if position.stage.weights.priors:
-            counts[step < coarse] += min(due, settings.views_per_step)
-            due -= min(due, settings.views_per_step)
+            counts[step] = min(due, settings.views_per_step)
+            due -= counts[step]
     return counts
 
 

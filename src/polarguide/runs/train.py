@@ -36,12 +36,12 @@ from polarguide.runs.folder import (
     save_checkpoint,
     writing_to,
 )
-from polarguide.runs.forecast import MemoryPlan, Stopwatch, pixels_of
+from polarguide.runs.forecast import MemoryPlan, Stopwatch, TimeLeft, pixels_of
 from polarguide.runs.health import examine
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.training.distributed import Ranks, backend_of, process_group
 from polarguide.training.losses import refuse_diverged
-from polarguide.training.recipe import Method
+from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings, StepReport, TrainSettings
 from polarguide.training.view_store import ViewStore
 
@@ -147,7 +147,10 @@ def train(
                     if problem := _unsuitable(out, resume):  # another training has begun meanwhile
                         raise problem
                 configuration.save(out)
-            seconds = _Loop(trainer, out, session, reporter, should_stop, look, bound).run()
+            left = None
+            if expected is not None and isinstance(chosen, Recipe) and not resolved.begin_again:
+                left = TimeLeft(expected, chosen)
+            seconds = _Loop(trainer, out, session, reporter, should_stop, look, bound, left).run()
         model = family.model(trainer.state, chosen, resolved, backend)
         if expected is not None:
             reporter.say(expected.truth(seconds))
@@ -189,7 +192,9 @@ class _Loop:
         should_stop: Ends,
         look: Look | None,
         memory: MemoryBound,
+        left: TimeLeft | None,
     ) -> None:
+        self._left = left
         self._trainer, self._out, self._session, self._memory = trainer, out, session, memory
         self._reporter, self._should_stop, self._look = reporter, should_stop, look
         self._log = RunLog(out) if trainer.ranks.rank == 0 else None
@@ -201,7 +206,7 @@ class _Loop:
         """Train; see ``train``. Returns the seconds that it took."""
         trainer = self._trainer
         with self._reporter.track("training", trainer.total) as advance:
-            meter = _Meter(advance, self._log, self._stopwatch)
+            meter = _Meter(advance, self._log, self._stopwatch, self._left)
             advance(trainer.done)
             try:
                 stopped = self._steps(meter)
@@ -248,8 +253,11 @@ class _Meter:
     Reports are looked at ten at a time: on a GPU, looking waits for it.
     """
 
-    def __init__(self, advance: Advance, log: RunLog | None, stopwatch: Stopwatch) -> None:
-        self._advance, self._log, self._stopwatch = advance, log, stopwatch
+    def __init__(
+        self, advance: Advance, log: RunLog | None, stopwatch: Stopwatch, left: TimeLeft | None
+    ) -> None:
+        self._advance, self._log, self._stopwatch, self._left = advance, log, stopwatch, left
+        self._read = stopwatch.read()[0]
         self._loss = self._psnr = math.nan
         self._began, self._first = time.perf_counter(), -1
         self._waiting: list[StepReport] = []
@@ -295,7 +303,11 @@ class _Meter:
         rate = (last.done - self._first) / max(1e-9, time.perf_counter() - self._began)
         count = "" if last.gaussians is None else f"{last.gaussians:,} Gaussians  "
         note = f"{last.stage}  loss {self._loss:.4f}  PSNR {self._psnr:.2f} dB  {count}{rate:.1f} it/s"
-        self._advance(last.done, note=note)
+        left = None
+        if self._left is not None and last.gaussians is not None:
+            before, self._read = self._read, self._stopwatch.read()[0]
+            left = self._left.take(last.done, last.gaussians, self._read - before)
+        self._advance(last.done, note=note, left=left)
         return loss, psnr
 
 

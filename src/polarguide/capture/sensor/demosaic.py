@@ -261,7 +261,7 @@ def _registered(plain: Array, full: Array, interpolation: str) -> Array:
     angles, height, width, channels = plain.shape
     cells = full.reshape(angles, height, 2, width, 2, channels)
     upper, lower = (cells[:, :, row, :, 0] + cells[:, :, row, :, 1] for row in (0, 1))
-    centered: Array = np.divide(upper + lower, np.float32(4), dtype=np.float32)
+    centered = np.asarray((upper + lower) / np.float32(4), np.float32)
     if interpolation == "bilinear":
         centered += (plain.sum(axis=0) - centered.sum(axis=0)) / np.float32(4)
     return centered

@@ -1,7 +1,7 @@
 """A color chart in a photograph: 24 patches, and the matrix from the camera's linear RGB to linear sRGB that they give.
 
 The chart is that of McCamy, Marcus and Davidson (1976), "A color-rendition chart". ``LAB`` are its maker's values for
-charts made since November 2014 (X-Rite 2016, "New color specifications for ColorChecker SG and Classic Charts"): CIELAB
+charts made since the end of 2014 (X-Rite, "New color specifications for ColorChecker SG and Classic Charts"): CIELAB
 under D50, by rows from dark skin to black. The matrix is the one of least squared distances in CIELAB; its error is
 stated as CIEDE2000 of each patch by the matrix that the others give.
 """
@@ -58,7 +58,7 @@ def chart_of(view: View, corners: Sequence[float]) -> Chart:
     fits = []
     for order in _orders():
         colors = _patches(view, quad[order])
-        used: NDArray[np.bool_] = np.all(np.isfinite(colors), axis=1)
+        used = np.asarray(np.isfinite(colors).all(axis=1))
         fits.append((_distance(_linear(colors[used], used), colors[used], used), colors, used))
     _, colors, used = min(fits, key=lambda fit: fit[0])
     if int(used.sum()) < LEAST_PATCHES:
