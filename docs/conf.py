@@ -32,7 +32,7 @@ myst_heading_anchors = 3
 # A notebook that fails is an error. What it writes is gone afterwards.
 nb_execution_mode = "auto"
 nb_execution_in_temp = True
-nb_execution_timeout = 240
+nb_execution_timeout = 900  # a cell takes a minute; a machine with other work is slow
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 math_number_all = False
@@ -63,6 +63,7 @@ napoleon_custom_sections = [("Attributes", "params_style"), ("Raises", "params_s
 html_theme = "furo"
 html_title = f"polarguide {release}"
 html_static_path = ["_static"]
+html_extra_path = ["extra"]  # copied as it is: pages that polarguide share wrote
 html_css_files = ["polarguide.css"]
 html_copy_source = False
 html_show_sourcelink = False

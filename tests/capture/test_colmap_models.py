@@ -20,7 +20,6 @@ from polarguide.capture.colmap import sfm
 from polarguide.capture.colmap.model import load_model, posed_images, unseen_points
 from polarguide.capture.colmap.poses import Geometry, Poses
 from polarguide.capture.colmap.sfm import connected_views, log_false_alarms, reconstruct
-from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import SILENT
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.polarizer import ANGLES
@@ -110,17 +109,13 @@ def test_names_of_text_models_are_not_cut(tmp_path: Path, name: str, view: str) 
 def test_text_models_that_would_be_read_in_part(tmp_path: Path, lines: str, found: str) -> None:
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24\n")
     (tmp_path / "images.txt").write_text(lines)
-    with pytest.raises(PolarguideError) as error:
-        Poses.read(tmp_path, ["a", "b"])
-    assert found in error.value.found
+    Fault(found=found).raised_by(Poses.read, tmp_path, ["a", "b"])
 
 
 def test_cameras_without_a_focal_length_are_refused(tmp_path: Path) -> None:
     (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 64 32 64 32\n")
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
-    with pytest.raises(PolarguideError) as error:
-        Poses.read(tmp_path, ["a"])
-    assert "image a.png" in str(error.value.where)
+    Fault("image a.png").raised_by(Poses.read, tmp_path, ["a"])
 
 
 def test_binary_wins_over_text(capture: TinyCapture) -> None:

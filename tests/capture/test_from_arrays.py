@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from faults import Fault
 from trainings import different
 
 import polarguide
 from polarguide.capture import Scene, load_scene
-from polarguide.core.errors import PolarguideError
 from polarguide.core.options import SessionOptions
 from polarguide.geometry.camera import Camera
 from polarguide.runs.folder import CHECKPOINT
@@ -74,9 +74,7 @@ def test_it_trains_to_the_same_bits(demo_scene: Path, filed: Scene, tmp_path: Pa
     for out, each in (("arrays", scene), ("files", filed)):
         polarguide.train(each, tmp_path / out, settings=settings, session=session)
     assert different(tmp_path / "arrays" / CHECKPOINT, tmp_path / "files" / CHECKPOINT) == []
-    with pytest.raises(PolarguideError) as caught:
-        _ = polarguide.open_run(tmp_path / "arrays").scene
-    assert (caught.value.where, caught.value.found) == ("scene", "none")
+    Fault("scene", found="none").raised_by(lambda: polarguide.open_run(tmp_path / "arrays").scene)
     opened = polarguide.open_run(tmp_path / "arrays", scene=scene)
     assert opened.render("v000")["final"].shape == (24, 32, 3)
 
@@ -139,9 +137,7 @@ GOOD = np.full((4, 6, 8), 100, np.uint8)
 )
 def test_wrong_arrays_are_refused_in_one_line(changes: dict[str, Any], where: str, found: str) -> None:
     given = {"pictures": [GOOD, GOOD], "cameras": [CAMERA, CAMERA], "points": np.ones((1, 3))} | changes
-    with pytest.raises(PolarguideError) as caught:
-        Scene.from_arrays(**given)
-    assert (caught.value.where, caught.value.found) == (where, found)
+    Fault(where, found=found).raised_by(Scene.from_arrays, **given)
 
 
 @pytest.mark.parametrize(
@@ -156,9 +152,7 @@ def test_wrong_arrays_are_refused_in_one_line(changes: dict[str, Any], where: st
     ],
 )
 def test_matrices_that_are_no_camera_are_refused(intrinsics: np.ndarray, pose: np.ndarray) -> None:
-    with pytest.raises(PolarguideError) as caught:
-        Camera.from_matrices(intrinsics, pose, 8, 6)
-    assert caught.value.where == "camera"
+    Fault("camera").raised_by(Camera.from_matrices, intrinsics, pose, 8, 6)
 
 
 def test_representations_are_two_lines_and_html(filed: Scene) -> None:

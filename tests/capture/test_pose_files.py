@@ -13,7 +13,7 @@ from faults import Fault
 
 from polarguide.capture.colmap.files import colmap_camera
 from polarguide.capture.pose_files import read_pose_file
-from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.errors import PolarguideWarning
 from polarguide.geometry.camera import Camera
 from polarguide.results.export.placement import write_transforms
 
@@ -209,9 +209,9 @@ def test_every_field_of_transforms_is_used(
 def test_other_lenses_frames_and_sizes_are_refused_by_name(
     tmp_path: Path, top: dict, frame: dict, found: str
 ) -> None:
-    with pytest.raises(PolarguideError) as error:
-        read_pose_file(write_json(tmp_path / "t.json", {**WHOLE, **top}, frame), VIEWS, stated)
-    assert found in error.value.found
+    Fault(found=found).raised_by(
+        read_pose_file, write_json(tmp_path / "t.json", {**WHOLE, **top}, frame), VIEWS, stated
+    )
 
 
 def test_fields_that_are_not_known_are_named(tmp_path: Path) -> None:
@@ -232,9 +232,7 @@ def test_a_size_that_the_file_lacks_is_that_of_the_pictures_it_fits(
     np.savez(tmp_path / "c.npz", **idr_cameras(inner))
     found = read_pose_file(tmp_path / "c.npz", VIEWS, lambda view: ((128, 96), (WIDTH, HEIGHT)))
     assert {(camera.width, camera.height) for camera in found.values()} == {size}
-    with pytest.raises(PolarguideError) as error:
-        read_pose_file(tmp_path / "c.npz", VIEWS, lambda view: ((400, 300),))
-    assert error.value.expected.endswith("400x300")
+    Fault(expected="400x300").raised_by(read_pose_file, tmp_path / "c.npz", VIEWS, lambda view: ((400, 300),))
 
 
 @pytest.mark.parametrize(
@@ -252,9 +250,7 @@ def test_idr_cameras_of_another_unit_or_number_are_refused(
     np.savez(tmp_path / "c.npz", **idr_cameras(), camera_mat_0=np.eye(4), world_mat_inv_0=np.eye(4))
     read_pose_file(tmp_path / "c.npz", VIEWS, stated)
     np.savez(tmp_path / "c.npz", **{**idr_cameras(), entry: matrix})
-    with pytest.raises(PolarguideError) as error:
-        read_pose_file(tmp_path / "c.npz", VIEWS, stated)
-    assert found in error.value.found
+    Fault(found=found).raised_by(read_pose_file, tmp_path / "c.npz", VIEWS, stated)
 
 
 def test_views_never_take_the_cameras_of_others_by_number(tmp_path: Path) -> None:
@@ -263,9 +259,9 @@ def test_views_never_take_the_cameras_of_others_by_number(tmp_path: Path) -> Non
     found = read_pose_file(tmp_path / "c.npz", ["1", "2", "3", "4"], stated)
     np.testing.assert_allclose(found["1"].rotation, next(iter(poses()))[0], atol=1e-6)
     for views in (["1", "2", "3"], ["1", "2", "3", "5"]):
-        with pytest.raises(PolarguideError) as error:
-            read_pose_file(tmp_path / "c.npz", views, stated)
-        assert error.value.found == "4 cameras, world_mat_0 to world_mat_3"
+        Fault(found="4 cameras, world_mat_0 to world_mat_3").raised_by(
+            read_pose_file, tmp_path / "c.npz", views, stated
+        )
 
 
 @pytest.mark.parametrize(
@@ -291,9 +287,7 @@ def test_metashape_of_another_lens_or_frame_is_refused(
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(PolarguideError) as error:
-        read_pose_file(path, VIEWS, unknown)
-    assert found in error.value.found
+    Fault(found=found).raised_by(read_pose_file, path, VIEWS, unknown)
 
 
 def test_metashape_cameras_that_are_not_enabled_are_left_out_and_other_elements_named(tmp_path: Path) -> None:

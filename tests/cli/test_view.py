@@ -12,7 +12,7 @@ import pytest
 from safetensors.torch import load_file
 
 from polarguide.cli.app import run
-from polarguide.runs.folder import CHECKPOINT
+from polarguide.runs.folder import CHECKPOINT, LOG
 
 PATIENCE = 120.0
 
@@ -37,18 +37,21 @@ def started(*arguments: str) -> tuple[subprocess.Popen[str], str]:
     return process, said
 
 
+def stop(process: subprocess.Popen[str], number: signal.Signals) -> None:
+    """Send a signal, after which a process says one word more."""
+    process.send_signal(number)
+    rest, _ = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, rest.split()) == (130, ["stopped."])
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_view_serves_a_page_until_it_is_stopped(trained: Path, port: int, number: signal.Signals) -> None:
+def test_view_serves_a_page_until_it_is_stopped(trained: Path, port: int) -> None:
     process, said = started("view", str(trained), "--port", str(port), "--threads", "1")
     assert f"viewer: http://127.0.0.1:{port}" in said
     assert "warning" not in said
     with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=PATIENCE) as answer:
         assert b"<html" in answer.read().lower()
-    process.send_signal(number)
-    rest, _ = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 130
-    assert rest.split() == ["stopped."]
+    stop(process, signal.SIGINT)
 
 
 @pytest.mark.slow
@@ -57,8 +60,7 @@ def test_view_warns_where_others_can_look_and_takes_a_free_port(trained: Path, p
         listener.bind(("0.0.0.0", port))
         listener.listen()
         process, said = started("view", str(trained), "--host", "0.0.0.0", "--port", str(port))
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=PATIENCE)
+    stop(process, signal.SIGTERM)
     assert "there is no password" in said
     assert "viewer: http://127.0.0.1:" in said
     assert f":{port}\n" not in said
@@ -80,7 +82,9 @@ def test_a_training_with_a_viewer_is_stopped_as_any(demo_scene: Path, tmp_path: 
     flags = ("--downscale", "4", "--threads", "1", "--viewer", "--viewer-port", str(port))
     process, _ = started("train", str(demo_scene), "--out", str(tmp_path / "run"), *flags)
     with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=PATIENCE):
-        time.sleep(1.0)
+        give_up = time.monotonic() + PATIENCE
+        while not (tmp_path / "run" / LOG).exists() and time.monotonic() < give_up:
+            time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     said, _ = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130

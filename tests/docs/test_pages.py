@@ -39,6 +39,7 @@ FOREIGN_OPTIONS = {
         "opensplat",
         "gaussians",
         "port",
+        "dashboard-address",
         "nthreads",
         "gres",
         "me",

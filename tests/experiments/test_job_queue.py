@@ -283,19 +283,6 @@ def test_a_task_survives_its_way(tmp_path: Path) -> None:
         assert decode(encoded(message), Message, "task") == message
 
 
-def test_nothing_is_imported_from_the_current_folder(demo_scene: Path, tmp_path: Path) -> None:
-    names = ("json", "torch", "safetensors", "msgspec", "numpy", "random", "polarguide", "sitecustomize")
-    for name in names:
-        (tmp_path / f"{name}.py").write_text(
-            "open('imported', 'a').write(__name__ + '\\n')\nraise SystemExit(9)"
-        )
-    with child(training(demo_scene, tmp_path / "run"), tmp_path) as process:
-        assert process.wait(PATIENCE) == 0
-        assert process.stderr.read() == b""  # type: ignore[union-attr]
-    assert not (tmp_path / "imported").exists()
-    assert (tmp_path / "run" / CHECKPOINT).exists()
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -330,7 +317,11 @@ def test_a_line_that_is_no_task_is_refused(capsys: pytest.CaptureFixture[str]) -
 
 @pytest.mark.slow
 def test_a_training_that_nobody_waits_for_saves_its_state(demo_scene: Path, tmp_path: Path) -> None:
+    """And imports nothing from the folder in which it was started."""
     run = tmp_path / "run"
+    for name in ("json", "torch", "safetensors", "msgspec", "numpy", "random", "polarguide", "sitecustomize"):
+        program = "open('imported', 'a').write(__name__ + '\\n')\nraise SystemExit(9)"
+        (tmp_path / f"{name}.py").write_text(program)
     with child(training(demo_scene, run, steps=5000), tmp_path) as process:
         give_up = time.monotonic() + PATIENCE
         while not (run / LOG).exists() and time.monotonic() < give_up:
@@ -340,3 +331,4 @@ def test_a_training_that_nobody_waits_for_saves_its_state(demo_scene: Path, tmp_
         assert process.wait(PATIENCE) == 130
         assert process.stderr.read() == b""  # type: ignore[union-attr]
     assert (run / CHECKPOINT).exists()
+    assert not (tmp_path / "imported").exists()

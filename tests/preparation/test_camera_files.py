@@ -25,7 +25,6 @@ from polarguide.capture.formats.pictures import decode_mask, decode_picture
 from polarguide.capture.sensor.demosaic import defects
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
 from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
-from polarguide.core.errors import PolarguideError
 from polarguide.optics.color import srgb_encode_array as srgb_encode
 from polarguide.preparation.mosaic_source import MosaicFiles
 from polarguide.preparation.settings import PrepareSettings
@@ -119,18 +118,14 @@ def test_samples_that_are_no_picture_are_refused(tmp_path, kind):
     values, how, found = REFUSED[kind]
     path = tmp_path / "v.tif"
     tifffile.imwrite(path, values, planarconfig="contig" if values.ndim == 3 else None, **how)
-    with pytest.raises(PolarguideError) as caught:
-        read_mosaic(path, RawFormat())
-    assert found in caught.value.found
+    Fault(found=found).raised_by(read_mosaic, path, RawFormat())
 
 
 def test_transparent_gray_tiff_is_refused(tmp_path):
     path = tmp_path / "v.tif"
     alpha = {"photometric": "minisblack", "planarconfig": "contig", "extrasamples": ["unassalpha"]}
     tifffile.imwrite(path, np.zeros((8, 8, 2), np.uint8), **alpha)
-    with pytest.raises(PolarguideError) as caught:
-        decode_picture(path, path.read_bytes())
-    assert "transparent" in caught.value.found
+    Fault(found="transparent").raised_by(decode_picture, path, path.read_bytes())
 
 
 @pytest.mark.parametrize("levels", [(1, 2, 3), (80, 160, 240)])
@@ -139,9 +134,9 @@ def test_labels_of_objects_are_no_mask(tmp_path, levels):
     path = tmp_path / "v.png"
     discs = [np.hypot(*(np.mgrid[:60, :90] - np.array([[[30]], [[15 + 30 * k]]]))) < 9 for k in range(3)]
     cv2.imwrite(str(path), np.sum([d * v for d, v in zip(discs, levels, strict=True)], 0).astype(np.uint8))
-    with pytest.raises(PolarguideError) as caught:
-        decode_mask(path, path.read_bytes(), any_value=False)
-    assert f"areas of {levels[0]} beside a maximum of {levels[2]}" in caught.value.found
+    Fault(found=f"areas of {levels[0]} beside a maximum of {levels[2]}").raised_by(
+        decode_mask, path, path.read_bytes(), any_value=False
+    )
     cv2.imwrite(str(path), cv2.GaussianBlur(np.any(discs, 0) * np.uint8(255), (0, 0), 3))
     off = decode_mask(path, path.read_bytes(), any_value=False) ^ np.any(discs, 0)
     assert off.mean() < 0.04
@@ -181,9 +176,7 @@ def test_wrong_packing_is_refused(tmp_path, stored, asked):
     path = tmp_path / "v.raw"
     path.write_bytes(pack(values, stored))
     assert (read_mosaic(path, RawFormat(128, 96, stored)) == values).all()
-    with pytest.raises(PolarguideError) as caught:
-        read_mosaic(path, RawFormat(128, 96, asked))
-    assert caught.value.remedy.rstrip(".").endswith(f"--packing {stored}")
+    Fault(remedy=f"--packing {stored}").raised_by(read_mosaic, path, RawFormat(128, 96, asked))
 
 
 def test_four_pictures_side_by_side_are_no_mosaic(tmp_path):
@@ -199,9 +192,7 @@ def test_four_pictures_side_by_side_are_no_mosaic(tmp_path):
         noisy = rng.poisson(np.clip(picture, 0, 1) * 4095)
         np.save(tmp_path / f"{name}.npy", np.minimum(noisy, 4095).astype(np.uint16))
     assert read_mosaic(tmp_path / "mosaic.npy", RawFormat()).shape == (192, 256)
-    with pytest.raises(PolarguideError) as caught:
-        read_mosaic(tmp_path / "quarters.npy", RawFormat())
-    assert "four times" in caught.value.found
+    Fault(found="four times").raised_by(read_mosaic, tmp_path / "quarters.npy", RawFormat())
 
 
 def test_hot_pixels_are_found_and_noise_is_not():
@@ -269,9 +260,7 @@ def test_profiles_state_how_a_picture_is_encoded(tmp_path, suffix, curve, expone
     assert found == (None if exponent is None else pytest.approx(exponent, abs=0.01))
     if exponent != 1.8:
         return require_known_encoding(path)
-    with pytest.raises(PolarguideError) as caught:
-        require_known_encoding(path)
-    assert "1.80" in caught.value.found
+    Fault(found="1.80").raised_by(require_known_encoding, path)
 
 
 def test_damaged_profiles_state_nothing():

@@ -21,11 +21,12 @@ from dataset_files import (
     write_nersp,
     write_pandora,
 )
+from faults import Fault
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.datasets.dataset import Dataset, read_mask
 from polarguide.capture.datasets.readers import detect_dataset, open_dataset
-from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.errors import PolarguideWarning
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import RimAgreement, StokesSource, rim_agreement, sense_of_rims
@@ -178,10 +179,10 @@ def test_a_missing_camera_is_named_and_no_view_is_to_be_removed(tmp_path: Path) 
     with np.load(tmp_path / "in" / "cameras.npz") as file:
         arrays = {name: file[name] for name in file if not name.endswith("_0")}
     np.savez(tmp_path / "in" / "cameras.npz", **arrays)
-    with pytest.raises(PolarguideError) as error:
-        open_dataset(tmp_path / "in", "pandora")
-    assert error.value.expected == "the entry world_mat_0 for view 01"
-    assert "remove" not in error.value.remedy
+    error = Fault(expected="the entry world_mat_0 for view 01").raised_by(
+        open_dataset, tmp_path / "in", "pandora"
+    )
+    assert "remove" not in error.remedy
 
 
 def test_a_copy_with_a_colmap_model_brings_no_cameras_of_its_own(tmp_path: Path) -> None:

@@ -35,7 +35,6 @@ from polarguide.capture.colmap.files import PosedCamera, write_cameras
 from polarguide.capture.colmap.sfm import match_features, tone_mapped
 from polarguide.capture.colmap.triangulate import sample_visual_hull
 from polarguide.capture.write import write_png
-from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import SILENT
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
@@ -114,9 +113,7 @@ def test_sizes_of_a_crop_are_refused(tmp_path: Path, camera: str, found: str) ->
     write_mosaics(tmp_path / "in")
     model = write_model(tmp_path / "model", NAMES, camera)
     settings = replace(MOSAIC, demosaic="full", poses=str(model))
-    with pytest.raises(PolarguideError) as error:
-        prepare_scene(tmp_path / "in", tmp_path / "out", settings)
-    assert error.value.found == found
+    Fault(found=found).raised_by(prepare_scene, tmp_path / "in", tmp_path / "out", settings)
 
 
 def test_one_map_undistorts_all_four_intensities(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -37,147 +36,168 @@ def picture(path: Path, array: np.ndarray) -> None:
     assert cv2.imwrite(str(path), array)
 
 
-MOSAICS: dict[str, tuple[Callable[[Path], object], PrepareSettings, str]] = {
-    "truncated png": (lambda d: cut(d / "v001.png", 200), MOSAIC, "v001.png: .*cut short"),
-    "zero bytes": (lambda d: cut(d / "v001.png", 0), MOSAIC, "v001.png: .*an empty file"),
-    "empty npy": (lambda d: (d / "w.npy").touch(), MOSAIC, "w.npy: .*an empty file"),
+MOSAICS: dict[str, tuple[Callable[[Path], object], PrepareSettings, Fault]] = {
+    "truncated png": (lambda d: cut(d / "v001.png", 200), MOSAIC, Fault("v001.png", found="cut short")),
+    "zero bytes": (lambda d: cut(d / "v001.png", 0), MOSAIC, Fault("v001.png", found="an empty file")),
+    "empty npy": (lambda d: (d / "w.npy").touch(), MOSAIC, Fault("w.npy", found="an empty file")),
     "truncated npy": (
         lambda d: (save(d / "w.npy", np.zeros((48, 64), np.uint16)), cut(d / "w.npy", 500)),
-        MOSAIC, "w.npy: expected a complete .npy file",
+        MOSAIC, Fault("w.npy", expected="a complete .npy file"),
     ),
-    "float npy": (lambda d: save(d / "w.npy", np.zeros((48, 64))), MOSAIC, "w.npy: .*64 of float64|float64"),
-    "nan npy": (lambda d: save(d / "w.npy", np.full((48, 64), np.nan)), MOSAIC, "float64"),
+    "float npy": (lambda d: save(d / "w.npy", np.zeros((48, 64))), MOSAIC, Fault("w.npy", found="64 of float64")),
+    "nan npy": (lambda d: save(d / "w.npy", np.full((48, 64), np.nan)), MOSAIC, Fault(found="float64")),
     "object npy": (
-        lambda d: np.save(d / "w.npy", np.array([{}]), allow_pickle=True), MOSAIC, "expected a complete .npy file"
+        lambda d: np.save(d / "w.npy", np.array([{}]), allow_pickle=True), MOSAIC,
+        Fault(expected="a complete .npy file")
     ),
     "color png": (
-        lambda d: picture(d / "w.png", np.zeros((48, 64, 3), np.uint8)), MOSAIC, "w.png: .*48x64x3"
+        lambda d: picture(d / "w.png", np.zeros((48, 64, 3), np.uint8)), MOSAIC, Fault("w.png", found="48x64x3")
     ),
     "mixed sizes": (
-        lambda d: picture(d / "w.png", np.ones((32, 64), np.uint16)), MOSAIC, "w.png: expected 64x48.*found 64x32"
+        lambda d: picture(d / "w.png", np.ones((32, 64), np.uint16)), MOSAIC, Fault("w.png", "64x48", "64x32")
     ),
     "mixed depth": (
-        lambda d: picture(d / "w.png", np.ones((48, 64), np.uint8)), MOSAIC, "w.png: .*uint16.*uint8"
+        lambda d: picture(d / "w.png", np.ones((48, 64), np.uint8)), MOSAIC, Fault("w.png", "uint16", "uint8")
     ),
     "duplicate names": (
-        lambda d: picture(d / "v000.tif", np.ones((48, 64), np.uint16)), MOSAIC, "v000.png and v000.tif"
+        lambda d: picture(d / "v000.tif", np.ones((48, 64), np.uint16)), MOSAIC, Fault(found="v000.png and v000.tif")
     ),
-    "not a picture": (lambda d: (d / "v000.png").write_text("hello"), MOSAIC, "v000.png: .*none of these"),
+    "not a picture": (lambda d: (d / "v000.png").write_text("hello"), MOSAIC, Fault("v000.png", found="none of these")),
     "tiny": (
         lambda d: [picture(d / f"v00{i}.png", np.ones((8, 8), np.uint16)) for i in range(3)],
-        MOSAIC, "at least 16x16",
+        MOSAIC, Fault(expected="at least 16x16"),
     ),
-    "raw without packing": (lambda d: (d / "w.raw").write_bytes(b"1"), MOSAIC, "no --width, --height, --packing"),
+    "raw without packing": (
+        lambda d: (d / "w.raw").write_bytes(b"1"), MOSAIC,
+        Fault(found="no --width, --height, --packing")
+    ),
     "raw of wrong size": (
-        lambda d: (d / "a.raw").write_bytes(b"1" * 100), RAW, "a.raw: expected 4608 bytes for 64x48.*found 100"
+        lambda d: (d / "a.raw").write_bytes(b"1" * 100), RAW, Fault("a.raw", "4608 bytes for 64x48", "100")
     ),
-    "width of other files": (lambda d: None, replace(MOSAIC, width=32), "expected 32x48 .*found 64x48"),
-    "no sensor": (lambda d: None, replace(MOSAIC, sensor=None), "with --sensor, .*3 pictures .* --sensor IMX250MYR"),
-    "unknown sensor": (lambda d: None, replace(MOSAIC, sensor="IMX1"), "--sensor: expected IMX250MYR, .*IMX1"),
+    "width of other files": (lambda d: None, replace(MOSAIC, width=32), Fault(expected="32x48", found="64x48")),
+    "no sensor": (
+        lambda d: None, replace(MOSAIC, sensor=None),
+        Fault(expected="with --sensor,", found="3 pictures", remedy="--sensor IMX250MYR")
+    ),
+    "unknown sensor": (lambda d: None, replace(MOSAIC, sensor="IMX1"), Fault("--sensor", "IMX250MYR,", "IMX1")),
     "gray white balance": (
-        lambda d: None, replace(MOSAIC, sensor="IMX250MZR", white_balance="gray"), "--white-balance"
+        lambda d: None, replace(MOSAIC, sensor="IMX250MZR", white_balance="gray"), Fault("--white-balance")
     ),
-    "broken white balance": (lambda d: None, replace(MOSAIC, white_balance="1,2"), "--white-balance: .*'1,2'"),
-    "black level": (lambda d: None, replace(MOSAIC, black_level=70000.0), "--black-level"),
-    "nan black level": (lambda d: None, replace(MOSAIC, black_level=float("nan")), "--black-level: .*found nan"),
-    "saturation": (lambda d: None, replace(MOSAIC, saturation=70000), "--saturation"),
-    "bits": (lambda d: None, replace(MOSAIC, bits=12), "--bits: expected values below 4096"),
-    "bits out of range": (lambda d: None, replace(MOSAIC, bits=99), "--bits: expected 8 to 16"),
-    "negative offset": (lambda d: None, replace(MOSAIC, offset_x=-1), "--offset-x: expected 0 to 1048576"),
-    "missing dark frame": (lambda d: None, replace(MOSAIC, dark_frame="none.png"), "none.png: .*readable file"),
+    "broken white balance": (
+        lambda d: None, replace(MOSAIC, white_balance="1,2"),
+        Fault("--white-balance", found="'1,2'")
+    ),
+    "black level": (lambda d: None, replace(MOSAIC, black_level=70000.0), Fault("--black-level")),
+    "nan black level": (lambda d: None, replace(MOSAIC, black_level=float("nan")), Fault("--black-level", found="nan")),
+    "saturation": (lambda d: None, replace(MOSAIC, saturation=70000), Fault("--saturation")),
+    "bits": (lambda d: None, replace(MOSAIC, bits=12), Fault("--bits", expected="values below 4096")),
+    "bits out of range": (lambda d: None, replace(MOSAIC, bits=99), Fault("--bits", expected="8 to 16")),
+    "negative offset": (lambda d: None, replace(MOSAIC, offset_x=-1), Fault("--offset-x", expected="0 to 1048576")),
+    "missing dark frame": (
+        lambda d: None, replace(MOSAIC, dark_frame="none.png"),
+        Fault("none.png", expected="readable file")
+    ),
     "dark frame of another size": (
         lambda d: picture(d.parent / "dark.png", np.ones((16, 16), np.uint16)),
-        replace(MOSAIC, dark_frame="DARK"), "dark frame of 64x48",
+        replace(MOSAIC, dark_frame="DARK"), Fault(expected="dark frame of 64x48"),
     ),
-    "flag of the other format": (lambda d: None, replace(MOSAIC, transfer="srgb"), "--transfer: .*mosaic"),
+    "flag of the other format": (
+        lambda d: None, replace(MOSAIC, transfer="srgb"),
+        Fault("--transfer", expected="mosaic")
+    ),
     "nan zero": (
-        lambda d: None, replace(MOSAIC, calibration=Calibration(zero=float("nan"))), r"calibration \(zero\)"
+        lambda d: None, replace(MOSAIC, calibration=Calibration(zero=float("nan"))), Fault("calibration (zero)")
     ),
     "order": (
-        lambda d: None, replace(MOSAIC, calibration=Calibration(order=(0, 0, 90, 135))), r"calibration \(order\)"
+        lambda d: None, replace(MOSAIC, calibration=Calibration(order=(0, 0, 90, 135))), Fault("calibration (order)")
     ),
-    "empty folder": (lambda d: [p.unlink() for p in d.iterdir()], MOSAIC, "found an empty folder"),
-    "no folder": (lambda d: shutil.rmtree(d), MOSAIC, "expected a folder of camera files, found nothing"),
-    "no model": (lambda d: None, replace(MOSAIC, poses="nowhere"), "nowhere: expected a COLMAP model"),
+    "empty folder": (lambda d: [p.unlink() for p in d.iterdir()], MOSAIC, Fault(found="an empty folder")),
+    "no folder": (lambda d: shutil.rmtree(d), MOSAIC, Fault(expected="a folder of camera files", found="nothing")),
+    "no model": (lambda d: None, replace(MOSAIC, poses="nowhere"), Fault("nowhere", expected="a COLMAP model")),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", MOSAICS)
 def test_mosaics(tmp_path: Path, case: str) -> None:
-    damage, settings, message = MOSAICS[case]
+    damage, settings, fault = MOSAICS[case]
     source = tmp_path / "räume und zeit"  # with blanks and umlauts, for every message
     write_mosaics(source)
     damage(source)
     if settings.dark_frame == "DARK":
         settings = replace(settings, dark_frame=str(tmp_path / "dark.png"))
-    text = refused(source, tmp_path / "out", settings)
-    assert re.search(message, text), text
+    refused(source, tmp_path / "out", settings, fault)
     assert not (tmp_path / "out").exists()
 
 
-SHOTS: dict[str, tuple[Callable[[Path], object], PrepareSettings, str]] = {
-    "missing shot": (lambda d: (d / "90" / "b.png").unlink(), FILTER, "shots of view b .*found none at 90"),
-    "missing folder": (lambda d: shutil.rmtree(d / "135"), FILTER, "none for 135 degrees"),
-    "two folders for an angle": (lambda d: (d / "I-45").mkdir(), FILTER, "one folder for 45 degrees"),
-    "duplicate shot": (
-        lambda d: shutil.copy(d / "0" / "a.png", d / "0" / "a.tif"), FILTER, "picture of a at 0 degrees, .*a.tif"
+SHOTS: dict[str, tuple[Callable[[Path], object], PrepareSettings, Fault]] = {
+    "missing shot": (
+        lambda d: (d / "90" / "b.png").unlink(), FILTER,
+        Fault(expected="shots of view b", found="none at 90")
     ),
-    "truncated": (lambda d: cut(d / "45" / "b.png", 300), FILTER, "b.png: .*cut short"),
+    "missing folder": (lambda d: shutil.rmtree(d / "135"), FILTER, Fault(found="none for 135 degrees")),
+    "two folders for an angle": (lambda d: (d / "I-45").mkdir(), FILTER, Fault(expected="one folder for 45 degrees")),
+    "duplicate shot": (
+        lambda d: shutil.copy(d / "0" / "a.png", d / "0" / "a.tif"), FILTER,
+        Fault(expected="picture of a at 0 degrees", found="a.tif")
+    ),
+    "truncated": (lambda d: cut(d / "45" / "b.png", 300), FILTER, Fault("b.png", found="cut short")),
     "mixed sizes": (
-        lambda d: picture(d / "45" / "b.png", np.ones((8, 8, 3), np.uint16)), FILTER, "b.png: .*64x48 with 16 bits"
+        lambda d: picture(d / "45" / "b.png", np.ones((8, 8, 3), np.uint16)), FILTER,
+        Fault("b.png", expected="64x48 with 16 bits")
     ),
     "mixed depth": (
-        lambda d: picture(d / "45" / "b.png", np.ones((48, 64, 3), np.uint8)), FILTER, "found 64x48 with 8 bits"
+        lambda d: picture(d / "45" / "b.png", np.ones((48, 64, 3), np.uint8)), FILTER, Fault(found="64x48 with 8 bits")
     ),
-    "flag of the other format": (lambda d: None, replace(FILTER, demosaic="quarter"), "--demosaic: .*filter"),
+    "flag of the other format": (
+        lambda d: None, replace(FILTER, demosaic="quarter"),
+        Fault("--demosaic", expected="filter")
+    ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", SHOTS)
 def test_filter_shots(tmp_path: Path, case: str) -> None:
-    damage, settings, message = SHOTS[case]
+    damage, settings, fault = SHOTS[case]
     source = tmp_path / "in"
     for view in "ab":
         write_shots(source, view, behind(smooth_light()))
     damage(source)
-    text = refused(source, tmp_path / "out", settings)
-    assert re.search(message, text), text
+    refused(source, tmp_path / "out", settings, fault)
 
 
 @pytest.mark.parametrize(
-    ("camera", "line", "message"),
+    ("camera", "line", "fault"),
     [
-        ("PINHOLE 64 48 80 82 32 24", None, "images named like the views"),
+        ("PINHOLE 64 48 80 82 32 24", None, Fault(expected="images named like the views")),
         (
             "PINHOLE 64 40 80 82 32 24",
             "1 1 0 0 0 0 0 2 1 v000.png",
-            "expected the size of the pictures, 32x24",
+            Fault(expected="the size of the pictures, 32x24"),
         ),
         (
             "PINHOLE 64 48 80 82 32 24",
             "1 nan 0 0 0 0 0 2 1 v000.png",
-            "expected a pose and a lens of|refuses",
+            Fault("model"),
         ),
         (
             "PINHOLE 64 48 80 82 32 24",
             "1 1 0 0 0 nan 0 2 1 v000.png",
-            "expected a pose and a lens of|refuses",
+            Fault("model"),
         ),
         (
             "PINHOLE 64 48 nan 82 32 24",
             "1 1 0 0 0 0 0 2 1 v000.png",
-            "expected a pose and a lens of|refuses|COLMAP",
+            Fault("model"),
         ),
-        ("PINHOLE 64 48 -80 -82 32 24", "1 1 0 0 0 0 0 2 1 v000.png", "positive focal"),
+        ("PINHOLE 64 48 -80 -82 32 24", "1 1 0 0 0 0 0 2 1 v000.png", Fault(expected="positive focal")),
     ],
 )
-def test_models(tmp_path: Path, camera: str, line: str | None, message: str) -> None:
+def test_models(tmp_path: Path, camera: str, line: str | None, fault: Fault) -> None:
     write_mosaics(tmp_path / "in")
     model = write_model(tmp_path / "model", ("strangers", "elsewhere"), camera)
     if line is not None:
         (model / "images.txt").write_text(line + "\n\n")
-    text = refused(tmp_path / "in", tmp_path / "out", replace(MOSAIC, poses=str(model)))
-    assert re.search(message, text), text
+    refused(tmp_path / "in", tmp_path / "out", replace(MOSAIC, poses=str(model)), fault)
 
 
 def test_views_with_blanks_and_umlauts(tmp_path: Path) -> None:

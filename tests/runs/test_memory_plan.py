@@ -12,7 +12,6 @@ from textured_ball import cameras
 from torch import Tensor
 
 from polarguide.capture import Scene
-from polarguide.core.errors import PolarguideError
 from polarguide.core.options import Exposures, SceneOptions, gibibytes
 from polarguide.fields.recipe import NeuralRecipe
 from polarguide.fields.state import FieldState
@@ -32,10 +31,8 @@ SMALL = [256 * 192] * 60
 
 def least(pixels: list[int], gaussians: int) -> float:
     """GiB, from the error."""
-    with pytest.raises(PolarguideError) as error:
-        plan_memory(pixels, STOKES, gaussians, limit=0.01)
-    assert error.value.found == "0.0 GB"
-    size = gibibytes(re.search(r"--memory ([\d.]+GB)", error.value.remedy)[1])
+    error = Fault(found="0.0 GB").raised_by(plan_memory, pixels, STOKES, gaussians, limit=0.01)
+    size = gibibytes(re.search(r"--memory ([\d.]+GB)", error.remedy)[1])
     return size
 
 
@@ -171,10 +168,8 @@ def test_a_field_is_planned_for_by_its_numbers(monkeypatch: pytest.MonkeyPatch) 
     plan = plan_field_memory(SMALL, field, limit=4)
     assert plan.kept is None
     assert plan.peak > 400_000_000 + 4 * learned
-    with pytest.raises(PolarguideError) as error:
-        plan_field_memory(SMALL, field, limit=0.01)
-    assert "memory" in error.value.where
-    assert "Gaussians" not in str(error.value)
+    error = Fault("memory").raised_by(plan_field_memory, SMALL, field, limit=0.01)
+    assert "Gaussians" not in str(error)
 
 
 @pytest.mark.parametrize("exposures", ["three", "one"])

@@ -5,16 +5,15 @@ from dataclasses import fields, replace
 import pytest
 import shaded_gaussians
 import torch
-from instruction_sets import instruction_sets, selected
-from shaded_gaussians import COUNT, camera
+from instruction_sets import instruction_sets
+from shaded_gaussians import COUNT, RESOLUTION, camera, compare_native_polarization, rendered
 from torch import Tensor
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from polarguide import optics
 from polarguide.capture import Scene
-from polarguide.raster import choose_backend, rasterize_reference
-from polarguide.raster.cpu import rasterize_cpu
+from polarguide.raster import choose_backend
 from polarguide.raster.surface import surface_picture
 from polarguide.recipes import recipe_named
 from polarguide.runs.folder import resolve
@@ -23,11 +22,9 @@ from polarguide.shading.gbuffer import RenderRequest, render, splatting
 from polarguide.shading.model import PLAIN
 from polarguide.shading.result import RenderResult
 from polarguide.training.actions import outward_directions
-from polarguide.training.native_terms import S1_AND_S2, Polarization, Terms, pixel_terms
 from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer
 
-RESOLUTION = 8
 SHADING = DeferredShading("fresnel", local=True, metal=True, indices=True)
 WITHOUT = DeferredShading("fresnel", local=True, metal=True)
 TRAINED = ("strength_logits", "local_dc", "sh_dc", "quaternions", "opacity_logits")
@@ -40,21 +37,6 @@ def gaussians(
     offsets = torch.linspace(-0.17, 0.4, COUNT, dtype=torch.float64).to(dtype)
     offsets[: COUNT - others] = 0
     return {**shaded_gaussians.gaussians(dtype, metals=metals), "index_offset": offsets}
-
-
-def rendered(shading: DeferredShading, values: dict[str, Tensor], **options: bool) -> RenderResult:
-    dtype = values["means"].dtype
-    generator = torch.Generator().manual_seed(1)
-    texels = 0.1 * torch.randn(6, RESOLUTION, RESOLUTION, 3, generator=generator, dtype=torch.float64)
-    rasterize = rasterize_cpu if dtype == torch.float32 else rasterize_reference
-    return render(
-        values,
-        camera(),
-        rasterize,
-        RenderRequest(**options),
-        shading=shading,
-        light={"texels": texels.to(dtype)},
-    )
 
 
 @pytest.mark.parametrize("metals", [0, 10])
@@ -118,26 +100,7 @@ def test_the_index_of_a_pixel_is_that_of_what_it_shows() -> None:
 @pytest.mark.parametrize("instructions", instruction_sets())
 @pytest.mark.parametrize("metals", [0, 10])
 def test_the_native_polarization_term_has_the_index_of_each_pixel(instructions: str, metals: int) -> None:
-    generator = torch.Generator().manual_seed(5)
-    measured = 0.3 * torch.randn(2, 20, 24, 3, generator=generator)
-    weight = torch.rand(20, 24, generator=generator)
-    found = []
-    for native in (True, False):
-        values = gaussians(metals=metals)
-        for name in TRAINED:
-            values[name].requires_grad_()
-        result = rendered(SHADING, values)
-        if native:
-            term = Polarization(measured, S1_AND_S2, weight, 0.7, 1.5, result.index)
-            with selected(instructions):
-                loss = pixel_terms(result, camera(), Terms(term, [], None))
-        else:
-            predicted = SHADING.predicted_stokes(result, camera())[1:]
-            loss = 0.7 * (weight[..., None] * (predicted - measured).abs()).sum()
-        loss.backward()
-        found.append([loss.detach(), *(values[name].grad for name in TRAINED)])
-    for ours, reference in zip(*found, strict=True):
-        assert_close(ours, reference, rtol=2e-3, atol=2e-3)
+    compare_native_polarization(SHADING, lambda: gaussians(metals=metals), TRAINED, instructions)
 
 
 def test_colors_attributes_and_the_page() -> None:

@@ -6,9 +6,17 @@ from pathlib import Path
 
 import pytest
 import torch
-from instruction_sets import instruction_sets, selected
+from instruction_sets import instruction_sets
 from random_runs import random_state
-from shaded_gaussians import COUNT, camera, gaussians
+from shaded_gaussians import (
+    COUNT,
+    RESOLUTION,
+    camera,
+    compare_native_polarization,
+    gaussians,
+    light,
+    rendered,
+)
 from torch import Tensor
 
 from polarguide import optics
@@ -16,11 +24,10 @@ from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.harmonics import evaluate_sh, sh_basis
 from polarguide.gaussians.ply import read_ply
-from polarguide.raster import rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.runs.model import gaussian_colors, write_run_ply
 from polarguide.shading.deferred import DeferredShading
-from polarguide.shading.gbuffer import RenderRequest, render
+from polarguide.shading.gbuffer import render
 from polarguide.shading.metal import (
     any_nonzero,
     convert,
@@ -32,26 +39,11 @@ from polarguide.shading.metal import (
     spread_directions,
 )
 from polarguide.shading.model import mirrored
-from polarguide.shading.result import Layout, RenderResult
+from polarguide.shading.result import Layout
 from polarguide.shading.roughness import ggx_alpha, gltf_roughness
-from polarguide.training.native_terms import S1_AND_S2, Polarization, Terms, pixel_terms
 
-RESOLUTION = 8
 WITHOUT = DeferredShading("fresnel", local=True, rough=True)
 SHADING = DeferredShading("fresnel", local=True, rough=True, metal=True)
-
-
-def light(dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
-    generator = torch.Generator().manual_seed(1)
-    texels = 0.1 * torch.randn(6, RESOLUTION, RESOLUTION, 3, generator=generator, dtype=torch.float64)
-    return {"texels": texels.to(dtype)}
-
-
-def rendered(shading: DeferredShading, values: dict[str, Tensor], **options: bool) -> RenderResult:
-    native = values["means"].dtype == torch.float32
-    rasterize = rasterize_cpu if native else rasterize_reference
-    seen = light(values["means"].dtype)
-    return render(values, camera(), rasterize, RenderRequest(**options), shading=shading, light=seen)
 
 
 def test_without_a_metal_every_bit_is_as_before() -> None:
@@ -321,24 +313,5 @@ def test_what_stays_keeps_all_that_was_learned_of_it() -> None:
 
 @pytest.mark.parametrize("instructions", instruction_sets())
 def test_the_native_polarization_term_knows_metals(instructions: str) -> None:
-    generator = torch.Generator().manual_seed(5)
-    measured = 0.3 * torch.randn(2, 20, 24, 3, generator=generator)
-    weight = torch.rand(20, 24, generator=generator)
-    found = []
-    for native in (True, False):
-        values = gaussians()
-        names = ("reflectance_logits", "roughness_logits", "strength_logits", "sh_dc", "quaternions")
-        for name in names:
-            values[name].requires_grad_()
-        result = rendered(SHADING, values)
-        if native:
-            term = Polarization(measured, S1_AND_S2, weight, 0.7, SHADING.refractive_index)
-            with selected(instructions):
-                loss = pixel_terms(result, camera(), Terms(term, [], None))
-        else:
-            predicted = SHADING.predicted_stokes(result, camera())[1:]
-            loss = 0.7 * (weight[..., None] * (predicted - measured).abs()).sum()
-        loss.backward()
-        found.append([loss.detach(), *(values[name].grad for name in names)])
-    for ours, reference in zip(*found, strict=True):
-        torch.testing.assert_close(ours, reference, rtol=2e-3, atol=2e-3)
+    names = ("reflectance_logits", "roughness_logits", "strength_logits", "sh_dc", "quaternions")
+    compare_native_polarization(SHADING, gaussians, names, instructions)

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from faults import Fault
 from test_read import CUP, MONO, PLAIN, SHAPE, TINT, light, write_four, write_mosaic
 
 import polarguide
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
-from polarguide.core.errors import PolarguideError
 from polarguide.geometry.polarizer import malus
 from polarguide.shots.maps import ShotMaps
 from polarguide.shots.options import MeasureOptions, ShotOptions
@@ -104,10 +104,9 @@ MOSAIC = np.full(SHAPE, 900, np.uint16)
     ],
 )
 def test_what_is_no_shot_is_refused(array: Any, options: ShotOptions, angles: Any, found: str) -> None:
-    with pytest.raises(PolarguideError) as caught:
-        read_shot(array, options, **({} if angles is None else {"angles": angles}))
-    assert caught.value.where.startswith("array")
-    assert caught.value.found == found
+    Fault("array", found=found).raised_by(
+        read_shot, array, options, **{} if angles is None else {"angles": angles}
+    )
 
 
 def test_measuring_without_files_is_measuring_files(tmp_path: Path) -> None:
@@ -142,9 +141,7 @@ def test_measuring_without_files_is_measuring_files(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_not_measured(shots: Any, found: str) -> None:
-    with pytest.raises(PolarguideError) as caught:
-        polarguide.measure(shots, reading=MONO)
-    assert caught.value.found == found
+    Fault(found=found).raised_by(polarguide.measure, shots, reading=MONO)
 
 
 def test_a_region_beyond_an_array_is_in_its_line() -> None:
@@ -223,9 +220,7 @@ def test_a_polygon_counts_pixels_whose_centers_it_holds(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("roi", ["1,1;5,5", "a=1,1;9,1;5,1", "1,1;5,5;-1,3", "1,1;5,5;1.5,3", "=1,1;5,5;1,5"])
 def test_what_is_no_polygon_is_refused(roi: str) -> None:
-    with pytest.raises(PolarguideError) as caught:
-        polarguide.measure([MOSAIC], options=MeasureOptions(roi=(roi,)), reading=MONO)
-    assert caught.value.where == "--roi"
+    Fault("--roi").raised_by(polarguide.measure, [MOSAIC], options=MeasureOptions(roi=(roi,)), reading=MONO)
 
 
 @pytest.mark.parametrize("mode", ["full", "half", "quarter"])

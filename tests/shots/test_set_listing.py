@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from faults import Fault
 
 import polarguide
-from polarguide.core.errors import PolarguideError
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.shots.exposures import find_shots, list_shots
@@ -92,9 +92,7 @@ def test_frames_of_a_video(tmp_path: Path) -> None:
         picture = photographed(SMALL, [angles[frame // 2] + 7.5 * (frame % 2)], noisy=False)[0]
         writer.write(np.repeat(np.rint(picture / 257).astype(np.uint8)[..., None], 3, axis=2))
     writer.release()
-    with pytest.raises(PolarguideError) as error:
-        read_shot(path)
-    assert error.value.where == str(tmp_path / "turn.csv")
+    Fault(str(tmp_path / "turn.csv")).raised_by(read_shot, path)
     lines = [f"{2 * k},{angle}" for k, angle in enumerate(angles)]
     (tmp_path / "turn.csv").write_text("\n".join(["frame,angle", *lines]))
     maps = read_shot(path, ShotOptions(transfer="linear"))
@@ -102,9 +100,7 @@ def test_frames_of_a_video(tmp_path: Path) -> None:
     np.testing.assert_allclose(maps.s0, SMALL[0], atol=0.01)
     np.testing.assert_allclose(maps.stokes, SMALL, atol=0.02)
     (tmp_path / "turn.csv").write_text("frame,angle\n0,0\n8,60\n99,120\n")
-    with pytest.raises(PolarguideError) as error:
-        read_shot(path)
-    assert "frame 99" in error.value.expected
+    Fault(expected="frame 99").raised_by(read_shot, path)
 
 
 @pytest.mark.parametrize(
@@ -130,17 +126,13 @@ def test_angles_that_determine_nothing_are_refused(
 def test_two_files_of_one_angle_are_ambiguous(tmp_path: Path) -> None:
     write(tmp_path, [f"cup_a{angle}.png" for angle in SIX])
     write(tmp_path, ["cup_a010.png"], (10,))
-    with pytest.raises(PolarguideError) as error:
-        read_shot(tmp_path)
-    assert error.value.expected == "one picture of cup at 10 degrees"
+    Fault(expected="one picture of cup at 10 degrees").raised_by(read_shot, tmp_path)
 
 
 @pytest.mark.parametrize("option", [{"align": False}, {"gains": "auto"}, {"flip": "x"}])
 def test_options_of_others_are_refused(tmp_path: Path, option: dict) -> None:
     write(tmp_path, [f"cup_a{angle}.png" for angle in SIX])
-    with pytest.raises(PolarguideError) as error:
-        find_shots([tmp_path], ShotOptions(**option))
-    assert "cup, a set at other angles" in error.value.found
+    Fault(found="cup, a set at other angles").raised_by(find_shots, [tmp_path], ShotOptions(**option))
 
 
 def test_what_prepare_wrote_is_read(tmp_path: Path) -> None:

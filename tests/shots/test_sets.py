@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from faults import Fault
 
 from polarguide import optics
 from polarguide.capture.calibration import Calibration
-from polarguide.core.errors import PolarguideError
 from polarguide.shots.maps import Reason, ShotMaps
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.read import read_shot
@@ -198,18 +198,15 @@ def test_a_calibration_of_the_usual_four_is_refused(tmp_path: Path) -> None:
         ("gains", Calibration(gains=(1.0, 1.1, 1.0, 1.0))),
         ("order", Calibration(order=(90, 45, 0, 135))),
     ):
-        with pytest.raises(PolarguideError) as error:
-            read(tmp_path, photographed(sphere(24), SIX), SIX, ShotOptions(calibration=calibration))
-        assert error.value.where == f"calibration ({field})"
+        Fault(f"calibration ({field})").raised_by(
+            read, tmp_path, photographed(sphere(24), SIX), SIX, ShotOptions(calibration=calibration)
+        )
 
 
 def test_pictures_of_other_sizes_are_refused(tmp_path: Path) -> None:
     write_set(tmp_path, [f"ball_a{angle}.png" for angle in SIX], photographed(sphere(24), SIX))
     cv2.imwrite(str(tmp_path / "ball_a70.png"), np.zeros((24, 25), np.uint16))
-    with pytest.raises(PolarguideError) as error:
-        read_shot(tmp_path)
-    assert error.value.where.endswith("ball_a70.png")
-    assert "25x24" in error.value.found
+    Fault("ball_a70.png", found="25x24").raised_by(read_shot, tmp_path)
 
 
 def test_a_picture_that_clips_everywhere_is_left_out(tmp_path: Path) -> None:

@@ -1,32 +1,24 @@
 """``polarguide synth`` from end to end on a tiny scene: read again, resumed, refused, prepared."""
 
-import csv
 import hashlib
 import json
-import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
-import cv2
 import msgspec
 import numpy as np
 import pytest
 import scipy.ndimage
-import torch
 from faults import Fault
 from tiny_capture import write_picture
 
 from polarguide import optics
 from polarguide.capture import load_scene
-from polarguide.capture.colmap.model import read_model
 from polarguide.core.progress import Reporter
 from polarguide.synth import render as runner
 from polarguide.synth.folder import MANIFEST, photograph, scene_digest, verify_scene
 from polarguide.synth.render import Sweep, sweep_scenes, synthesize
 from polarguide.synth.schema import SceneSpec, parse_scene
-from polarguide.synth.sensor import Sensor, behind_filter
 from polarguide.synth.settings import (
     OLDEST_LLVM,
     Overrides,
@@ -188,90 +180,6 @@ def test_other_settings_and_other_folders_are_refused(scene: Path, spec: SceneSp
     Fault("--samples").raised_by(
         lambda: synthesize(spec, tmp_path / "new", SynthSettings(samples=0), Reporter())
     )
-
-
-def polarguide(*arguments: str) -> str:
-    """What a command line prints."""
-    command = [sys.executable, "-m", "polarguide", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
-
-
-@COMPILED
-@pytest.mark.parametrize("sensor", ["imx250mzr", "imx250myr"])
-def test_mosaics_come_back_through_prepare(sensor: str, variant: Variant, tmp_path: Path) -> None:
-    """As a user goes: by the command that ``synth`` prints at its end; compared with the truth of the same paths."""
-    out = tmp_path / "scene"
-    ground, ball = TINY["things"]
-    # Dark, so that reflections polarize its light.
-    things = [ground, {**ball, "material": {"color": [0.04, 0.05, 0.03]}}]
-    dark = {**TINY, "camera": {**TINY["camera"], "views": 2}, "things": things}
-    (tmp_path / "dark.json").write_text(json.dumps(dark))
-    wishes = ["--sensor", sensor, "--size", "48x48", "--samples", "32", "--threads", "1"]
-    printed = polarguide("synth", str(tmp_path / "dark.json"), "--out", str(out), *wishes)
-    command = printed.partition("next: polarguide ")[2].splitlines()[0]
-    polarguide(*shlex.split(command), "--gains", "none")
-    prepared = load_scene(Path(f"{out}-prepared"))
-    for mine, other in zip(load_scene(out).test_views, prepared.test_views, strict=True):
-        assert (other.name, other.camera.fx) == (mine.name, pytest.approx(mine.camera.fx))
-        with np.load(out / "gt" / f"{mine.name}.npz") as ground_truth:
-            light, ball = (
-                torch.from_numpy(ground_truth["stokes"]).float(),
-                torch.from_numpy(ground_truth["objid"]) == 2,
-            )
-        ball = torch.from_numpy(scipy.ndimage.binary_erosion(ball.numpy(), iterations=4))
-        usable = ball & ~other.invalid & ~other.saturated
-        found, known = optics.stokes(other.intensities()), light
-        if sensor == "imx250mzr":
-            found, known = found.mean(-1, keepdim=True), known.mean(-1, keepdim=True)
-        # Full scale has room for the largest gain, so that the pictures are darker by the smallest.
-        found, known = found[:, usable] / min(Sensor().gains), known[:, usable]
-        np.testing.assert_allclose(
-            found[0].mean(0), known[0].mean(0), rtol=0.008
-        )  # 0.012 without calibration
-        assert ((found[1:] - known[1:]) / known[0]).abs().median() < 0.02
-        strong = optics.dolp(known) > 0.1
-        assert strong.sum() > 100
-        turn = torch.remainder(optics.aolp(found) - optics.aolp(known) + np.pi / 2, np.pi) - np.pi / 2
-        assert torch.rad2deg(turn[strong]).abs().median() < 2.5
-
-
-@COMPILED
-def test_photographs_through_a_filter_come_back_through_prepare(variant: Variant, tmp_path: Path) -> None:
-    """By the command that ``synth`` prints; the pictures are what a sheet before the lens passes of the light."""
-    out = tmp_path / "scene"
-    (tmp_path / "tiny.json").write_text(json.dumps(TINY))
-    wishes = [
-        "--sensor",
-        "filter",
-        "--size",
-        "48x32",
-        "--samples",
-        "32",
-        "--threads",
-        "1",
-        "--ground-truth",
-        "all",
-    ]
-    printed = polarguide("synth", str(tmp_path / "tiny.json"), "--out", str(out), *wishes)
-    command = printed.partition("next: polarguide ")[2].splitlines()[0]
-    polarguide(*shlex.split(command))
-    made = json.loads((out / "scene.json").read_text())["shots"]
-    rows = list(csv.DictReader((Path(f"{out}-prepared") / "angles.csv").read_text().splitlines()))
-    assert [(row["view"], float(row["angle"])) for row in rows] == [(n, s["angle"]) for n, s in made.items()]
-    stops = np.log2([float(row["gain"]) for row in rows])
-    known = np.array([shot["stops"] for shot in made.values()])
-    assert np.abs(stops - (known - known.mean())).max() < 0.05
-    assert {shot["orientation"] for shot in made.values()} - {1}
-    model = read_model(out)
-    for row in rows:
-        with np.load(out / "gt" / f"{row['view']}.npz") as ground_truth:
-            stokes = ground_truth["stokes"].astype(float)
-        rays = model.camera(row["view"]).rays(dtype=torch.float64).numpy()
-        light = behind_filter(stokes, rays, float(row["angle"])) * 2 ** made[row["view"]]["stops"]
-        stored = cv2.imread(str(Path(f"{out}-prepared") / "polar" / row["file"]), cv2.IMREAD_UNCHANGED)
-        picture = stored[..., ::-1] / 65535
-        assert picture.shape == light.shape
-        assert np.median(np.abs(picture - light)[light < 0.9]) < 0.01
 
 
 def test_a_sweep_over_views_shares_its_test_views(spec: SceneSpec, variant: Variant, tmp_path: Path) -> None:

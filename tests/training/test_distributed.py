@@ -147,7 +147,7 @@ def test_rates_follow_the_square_root_of_the_views(tiny_scene: Scene, busy_recip
     assert four.betas == pytest.approx((0.9**4, 0.999**4))
 
 
-STEPS = 400
+STEPS = 200
 
 
 def flags(scene: Path, out: Path) -> list[str]:

@@ -153,8 +153,10 @@ def test_a_training_says_where_they_count_for_nothing(
     assert message in "".join(warned)
 
 
-def test_a_training_heeds_them_and_goes_on_to_the_same_bits(whole_demo: Path, tmp_path: Path) -> None:
-    scene = said(whole_demo, tmp_path)
+def test_a_training_heeds_them_and_goes_on_to_the_same_bits(
+    demo_scene: Path, trained: Path, tmp_path: Path
+) -> None:
+    scene = said(demo_scene, tmp_path)
     given = {"settings": TrainSettings(40), "reading": READING}
     whole = polarguide.train(scene, tmp_path / "whole", **given)
     calls = iter([*[False] * 30, True])
@@ -165,7 +167,7 @@ def test_a_training_heeds_them_and_goes_on_to_the_same_bits(whole_demo: Path, tm
     offsets = whole.gaussians["index_offset"]
     assert float((offsets < 0).float().mean()) > 0.1
     result = whole.result(whole.scene.views[0].name)
-    assert float(result.index.min()) == pytest.approx(1.33, abs=0.03)
-    plain = polarguide.train(whole_demo, tmp_path / "plain", **given)
+    assert 1.32 < float(result.index.min()) < 1.42  # five views say 1.33, and all else has 1.5
+    plain = polarguide.open_run(trained)  # nothing is said of the same views
     assert not bool(plain.gaussians["index_offset"].any())
     assert not torch.equal(whole.gaussians["sh_dc"], plain.gaussians["sh_dc"])

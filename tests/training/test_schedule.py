@@ -204,7 +204,7 @@ def test_when_3dgs_dr_resets_and_propagates(
 
 
 @pytest.mark.parametrize("name", [*OF_GAUSSIANS, "polarguide-paper:kind"])
-@pytest.mark.parametrize("steps", [300, 1500, 2500, 5000, 9999, 20_000, 40_001, 61_000])
+@pytest.mark.parametrize("steps", [300, 1500, 2500, 5000, 9999, 61_000])
 def test_a_scene_can_heal_between_resets_and_propagations(name: str, steps: int) -> None:
     """Also across stages: a tenth of the steps, or 350."""
     places = sorted(step for found in upheavals(name, steps).values() for step in found)

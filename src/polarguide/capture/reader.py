@@ -57,7 +57,7 @@ def load_scene(
         transfer: how the files are encoded: "linear", or "srgb" for display-encoded pictures.
         views: names of the views to read; all if None. The split is that of the whole capture.
         memory: GiB that the pictures may take; None: 80 % of what is free.
-        split: which views are held out where there is no ``split.json``, see ``split.chosen_views``.
+        split: which views are held out where there is no ``split.json``, see ``scene.chosen_views``.
         test_views: names of the views to hold out, whatever else says so, as far as there are such views.
         hold: whether pictures stay in memory; otherwise views load theirs from the files when they are read.
         reporter: receives the progress.

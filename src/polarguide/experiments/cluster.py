@@ -83,7 +83,9 @@ def workers(
     import dask
     from distributed import Client, LocalCluster
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it, run_jobs says
+    # What matters, run_jobs says. Each of them has a level of its own.
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     with dask.config.set(SETTINGS), contextlib.ExitStack() as stack:
         if options.scheduler is not None:
             client = stack.enter_context(_connected(options.scheduler))

@@ -242,11 +242,11 @@ def polarization_uncertainty(stokes: Tensor, variances: Tensor) -> Uncertainty:
     check_leading(stokes, 3, "stokes")
     check_leading(variances, 4, "variances")
     v0, v45, v90, v135 = variances.unbind(0)
-    c, s, d = _direction(stokes)
+    c, s, d, *scales = _direction(stokes)
     half = d / 2
     along = (c - half) ** 2 * v0 + (s - half) ** 2 * v45 + (c + half) ** 2 * v90 + (s + half) ** 2 * v135
     across = s * s * (v0 + v90) + c * c * (v45 + v135)
-    return _uncertainty(stokes, d, along, across)
+    return _uncertainty(d, along, across, *scales)
 
 
 @for_arrays
@@ -264,33 +264,34 @@ def fitted_uncertainty(stokes: Tensor, covariance: Tensor) -> Uncertainty:
     check_leading(stokes, 3, "stokes")
     check_leading(covariance, 6, "covariance")
     v00, v01, v02, v11, v12, v22 = covariance.unbind(0)
-    c, s, d = _direction(stokes)
+    c, s, d, *scales = _direction(stokes)
     along = c * c * v11 + 2 * c * s * v12 + s * s * v22 - 2 * d * (c * v01 + s * v02) + d * d * v00
     across = s * s * v11 - 2 * s * c * v12 + c * c * v22
-    return _uncertainty(stokes, d, along.clamp(min=0), across.clamp(min=0))
+    return _uncertainty(d, along.clamp(min=0), across.clamp(min=0), *scales)
 
 
-def _direction(stokes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Cosine and sine of twice the AoLP, of the first direction without polarization; and the DoLP, 0 without light."""
+def _direction(stokes: Tensor) -> tuple[Tensor, ...]:
+    """Cosine and sine of twice the AoLP, of the first direction without polarization; the DoLP, 0 without light; where
+    light is polarized and where it is, and one over either intensity, 1 elsewhere.
+    """
     s0, s1, s2 = stokes.unbind(0)
     tiny = torch.finfo(s0.dtype).tiny
     square = s1 * s1 + s2 * s2
     polarized = square > tiny
     inverse = torch.where(polarized, square, 1.0).rsqrt()
-    scale = 1 / torch.where(s0 > tiny, s0, 1.0)
-    d = (torch.where(polarized, square * inverse, 0.0) * scale).clamp(max=1)
-    return torch.where(polarized, s1 * inverse, 1.0), s2 * inverse, d
-
-
-def _uncertainty(stokes: Tensor, d: Tensor, along: Tensor, across: Tensor) -> Uncertainty:
-    """From the DoLP, and variances along and across the direction of polarization (along: of S0 times the DoLP)."""
-    s0, s1, s2 = stokes.unbind(0)
-    tiny = torch.finfo(s0.dtype).tiny
     lit = s0 > tiny
-    square = s1 * s1 + s2 * s2
-    polarized = square > tiny
-    inverse = torch.where(polarized, square, 1.0).rsqrt()
     scale = 1 / torch.where(lit, s0, 1.0)
+    d = (torch.where(polarized, square * inverse, 0.0) * scale).clamp(max=1)
+    return torch.where(polarized, s1 * inverse, 1.0), s2 * inverse, d, polarized, lit, inverse, scale
+
+
+def _uncertainty(
+    d: Tensor, along: Tensor, across: Tensor, polarized: Tensor, lit: Tensor, inverse: Tensor, scale: Tensor
+) -> Uncertainty:
+    """From the DoLP, variances along and across the direction of polarization (along: of S0 times the DoLP), and the
+    last four of ``_direction``.
+    """
+    tiny = torch.finfo(d.dtype).tiny
     b2 = across * scale * scale
     ratio = (d * d / b2.clamp(min=tiny)).clamp(max=88.0)
     removed = b2 * -torch.expm1(-ratio) / (2 * d.clamp(min=1e-12))

@@ -142,8 +142,8 @@ def sample_blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
     """A regular subset of a mosaic's blocks, [N, size, size]."""
     rows, columns = values.shape[0] // size, values.shape[1] // size
     grid = values[: rows * size, : columns * size].reshape(rows, size, columns, size)
-    found = grid.swapaxes(1, 2).reshape(-1, size, size)
-    return found[:: max(1, len(found) // _BLOCKS)].copy()
+    row, column = np.divmod(np.arange(0, rows * columns, max(1, rows * columns // _BLOCKS)), max(columns, 1))
+    return grid.swapaxes(1, 2)[row, column]
 
 
 def block_intensities(

@@ -26,7 +26,7 @@ from polarguide.capture.formats.pictures import is_lossy
 from polarguide.capture.layout import KEPT, READ, find_layout, require_memory_of_each, select_views
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
-from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic
+from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic, spoiled
 from polarguide.capture.sensor.pattern import (
     SENSOR_SIZE,
     SIDE,
@@ -105,19 +105,14 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     lsb = 1 / (levels.white - levels.black)
     noise = given_noise(options, lsb) or _noise_of(linear, saturated | black | defective, pattern, lsb)
     picture = demosaic(linear, saturated, pattern, mode=mode, interpolation=way, colored=False)
-    lost = picture.invalid
-
-    def spoiled(samples: Mask) -> Mask:
-        """The pixels that are made from some samples."""
-        if not samples.any():
-            return np.zeros(lost.shape, bool)
-        return demosaic(linear, samples, pattern, mode=mode, interpolation=way, colored=False).invalid
-
+    dark_pixels, masked = (
+        spoiled(samples, pattern, mode=mode, interpolation=way) for samples in (black, defective)
+    )
     return Developed(
         intensities=oriented(picture.intensities, options.calibration),
-        dark=spoiled(black),
-        saturated=lost,
-        masked=spoiled(defective),
+        dark=dark_pixels,
+        saturated=picture.invalid,
+        masked=masked,
         noise=noise,
         factors=_placed(interpolation_factors(options.sensor, x, y, mode), options.calibration),
         mean_variance=averaged_factor(options.sensor, x, y, mode),

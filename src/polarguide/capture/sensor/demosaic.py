@@ -165,70 +165,86 @@ def demosaic(
     Returns:
         The picture, of size ``H // s`` x ``W // s`` for s = 2, 4 or 1 (what fills no cell is cut).
     """
+    invalid = spoiled(bad, pattern, mode=mode, interpolation=interpolation, registered=registered)
     step = 4 if mode == "quarter" else 2
-    height, width = values.shape[0] // step * step, values.shape[1] // step * step
-    values, bad = values[:height, :width], bad[:height, :width]
+    values = values[: values.shape[0] // step * step, : values.shape[1] // step * step]
     if mode == "quarter":
-        found = _superpixels(values, bad, pattern)
+        found = _superpixels(values, pattern)
     else:
-        cells = _cells(values, bad, pattern, interpolation)
+        cells = _cells(values, pattern, interpolation)
         if mode == "full":
             found = _full(cells, pattern, interpolation)
         else:
             found = _half_size(cells, pattern)
             if registered:
                 found = _registered(found, _full(cells, pattern, interpolation), interpolation)
-    if colored and found.intensities.shape[-1] == 1:
-        return DemosaicedPicture(np.repeat(found.intensities, 3, axis=-1), found.invalid)
-    return found
+    if colored and found.shape[-1] == 1:
+        found = np.repeat(found, 3, axis=-1)
+    return DemosaicedPicture(found, invalid)
 
 
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """Colors at every sensor pixel: position (row, column) in the cell -> [H/2, W/2, C], and what is bad."""
+def spoiled(bad: Mask, pattern: Pattern, *, mode: str, interpolation: str, registered: bool = True) -> Mask:
+    """The pixels for which ``demosaic`` uses an unusable sample; arguments and size as there."""
+    step = DEMOSAIC_MODES[mode]
+    whole = 4 if mode == "quarter" else 2
+    bad = bad[: bad.shape[0] // whole * whole, : bad.shape[1] // whole * whole]
+    if not bad.any():
+        return np.zeros((bad.shape[0] // step, bad.shape[1] // step), bool)
+    if mode != "quarter":
+        colored = np.empty_like(bad)
+        for row, column in np.ndindex(2, 2):
+            colored[row::2, column::2] = _spoiled_colors(bad, pattern, (row, column), interpolation)
+        # Around every pixel the 3x3 pixels hold what is used of all angles.
+        full = _dilated(colored, 1 if interpolation == "bilinear" else GUIDED_RADIUS)
+        bad = full if mode == "full" else colored | full if registered else colored
+    blocks = bad.reshape(bad.shape[0] // step, step, bad.shape[1] // step, step)
+    return np.asarray(blocks.any(axis=(1, 3)))
 
-    colors: dict[tuple[int, int], Array]
-    bad: dict[tuple[int, int], Mask]
+
+def _spoiled_colors(bad: Mask, pattern: Pattern, place: tuple[int, int], interpolation: str) -> Mask:
+    """At one place of the cells, where colors use an unusable sample."""
+    (row, column), mask = place, bad[place[0] :: 2, place[1] :: 2]
+    if pattern.colors is None:
+        return mask
+    if interpolation != "bilinear":
+        return _dilated(mask, GUIDED_RADIUS)
+    bayer = tiled(pattern.colors[row::2, column::2], mask.shape)
+    return np.any([used_by_bilinear(mask, bayer == color) for color in range(3)], axis=0)
 
 
-def _cells(values: Array, bad: Mask, pattern: Pattern, interpolation: str) -> _Cells:
-    colors: dict[tuple[int, int], Array] = {}
-    wrong: dict[tuple[int, int], Mask] = {}
+_Cells = dict[tuple[int, int], Array]
+"""Colors at every sensor pixel: position (row, column) in the cell -> [H/2, W/2, C]."""
+
+
+def _cells(values: Array, pattern: Pattern, interpolation: str) -> _Cells:
+    colors: _Cells = {}
     for row, column in np.ndindex(2, 2):
-        sample, mask = values[row::2, column::2], bad[row::2, column::2]
+        sample = values[row::2, column::2]
         if pattern.colors is None:
-            colors[row, column], wrong[row, column] = sample[..., None], mask
+            colors[row, column] = sample[..., None]
             continue
         bayer = tiled(pattern.colors[row::2, column::2], sample.shape)
         if interpolation == "bilinear":
             planes = [bilinear(sample, bayer == color) for color in range(3)]
-            uses = [used_by_bilinear(mask, bayer == color) for color in range(3)]
             colors[row, column] = np.stack(planes, axis=-1)
-            wrong[row, column] = np.any(uses, axis=0)
         else:
             colors[row, column] = guided_color(sample, bayer)
-            wrong[row, column] = _dilated(mask, GUIDED_RADIUS)
-    return _Cells(colors, wrong)
+    return colors
 
 
-def _half_size(cells: _Cells, pattern: Pattern) -> DemosaicedPicture:
+def _half_size(cells: _Cells, pattern: Pattern) -> Array:
     """Half size: the samples of a cell, by angle."""
-    angles = {int(pattern.angles[place]): place for place in cells.colors}
-    stack = np.stack([cells.colors[angles[angle]] for angle in ANGLES])
-    return DemosaicedPicture(stack, np.any(list(cells.bad.values()), axis=0))
+    angles = {int(pattern.angles[place]): place for place in cells}
+    return np.stack([cells[angles[angle]] for angle in ANGLES])
 
 
-def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> DemosaicedPicture:
+def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Array:
     """Full size: each channel is the mosaic of a monochrome polarization sensor."""
-    height, width, channels = cells.colors[0, 0].shape
+    height, width, channels = cells[0, 0].shape
     mosaic = np.empty((channels, 2 * height, 2 * width), np.float32)
-    bad = np.empty((2 * height, 2 * width), bool)
-    for (row, column), colors in cells.colors.items():
-        mosaic[:, row::2, column::2], bad[row::2, column::2] = (
-            colors.transpose(2, 0, 1),
-            cells.bad[row, column],
-        )
-    at = {int(pattern.angles[place]): place for place in cells.colors}
+    for (row, column), colors in cells.items():
+        mosaic[:, row::2, column::2] = colors.transpose(2, 0, 1)
+    at = {int(pattern.angles[place]): place for place in cells}
     # A plane of every angle and channel in turn; the channels come last only as they are looked at.
     planes = np.empty((len(ANGLES), channels, 2 * height, 2 * width), np.float32)
     for channel, plane in enumerate(mosaic):
@@ -236,24 +252,22 @@ def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> DemosaicedPict
             for index, angle in enumerate(ANGLES):
                 bilinear_cells(plane, *at[angle], out=planes[index, channel])
         else:
-            planes[:, channel] = guided_polarization(plane, tiled(pattern.angles[:2, :2], bad.shape))
-    # Around every pixel the 3x3 pixels hold what is used of all angles.
-    invalid = _dilated(bad, 1 if interpolation == "bilinear" else GUIDED_RADIUS)
-    return DemosaicedPicture(np.moveaxis(planes, 1, -1), invalid)
+            planes[:, channel] = guided_polarization(plane, tiled(pattern.angles[:2, :2], plane.shape))
+    return np.moveaxis(planes, 1, -1)
 
 
-def _registered(plain: DemosaicedPicture, full: DemosaicedPicture, interpolation: str) -> DemosaicedPicture:
+def _registered(plain: Array, full: Array, interpolation: str) -> Array:
     """Half size, all angles at the centers of the cells."""
-    angles, height, width, channels = plain.intensities.shape
-    cells = full.intensities.reshape(angles, height, 2, width, 2, channels)
-    centered = cells.mean(axis=(2, 4), dtype=np.float32)
+    angles, height, width, channels = plain.shape
+    cells = full.reshape(angles, height, 2, width, 2, channels)
+    upper, lower = (cells[:, :, row, :, 0] + cells[:, :, row, :, 1] for row in (0, 1))
+    centered: Array = np.divide(upper + lower, np.float32(4), dtype=np.float32)
     if interpolation == "bilinear":
-        centered += (plain.intensities.sum(axis=0) - centered.sum(axis=0)) / np.float32(4)
-    invalid = full.invalid.reshape(height, 2, width, 2).any(axis=(1, 3))
-    return DemosaicedPicture(centered, np.asarray(plain.invalid | invalid))
+        centered += (plain.sum(axis=0) - centered.sum(axis=0)) / np.float32(4)
+    return centered
 
 
-def _superpixels(values: Array, bad: Mask, pattern: Pattern) -> DemosaicedPicture:
+def _superpixels(values: Array, pattern: Pattern) -> Array:
     """Quarter size: means over the samples of one angle and color in each 4x4 pixels."""
     repeat = 4 // pattern.period
     angles = np.tile(pattern.angles, (repeat, repeat))
@@ -266,7 +280,7 @@ def _superpixels(values: Array, bad: Mask, pattern: Pattern) -> DemosaicedPictur
             chosen = angles == angle if colors is None else (angles == angle) & (colors == channel)
             samples = [blocks[:, row, :, column] for row, column in np.argwhere(chosen)]
             picture[index, ..., channel] = np.mean(samples, axis=0, dtype=np.float32)
-    return DemosaicedPicture(picture, np.asarray(bad.reshape(rows, 4, columns, 4).any(axis=(1, 3))))
+    return picture
 
 
 def _dilated(mask: Mask, radius: int) -> Mask:
@@ -340,7 +354,10 @@ def _noise(rise: NDArray[np.float32], middle: NDArray[np.float32]) -> NDArray[np
     common = edges[1:][np.diff(edges) == 0]
     edges = np.unique(np.concatenate((edges, np.nextafter(common, np.float32(np.inf)))))
     number = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, max(0, len(edges) - 2))
-    medians = [float(np.median(deviation[number == k])) for k in range(max(1, len(edges) - 1))]
+    bins = max(1, len(edges) - 1)
+    together = deviation[np.argsort(number.astype(np.uint8), kind="stable")]  # by bin
+    ends = np.cumsum(np.bincount(number, minlength=bins))
+    medians = [float(np.median(each)) for each in np.split(together, ends[:-1])]
     place = np.clip(np.searchsorted(edges, middle, side="right") - 1, 0, len(medians) - 1)
     # Whole numbers are rounded: no noise is less than a third of a step.
     return np.maximum(1.4826 * np.asarray(medians, np.float32), 1 / 3)[place]

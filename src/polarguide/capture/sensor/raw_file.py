@@ -193,7 +193,9 @@ def is_tiled(values: NDArray[Any]) -> bool:
     detail = []
     for row, column in ((0, 0), (0, half[1]), (half[0], 0), (half[0], half[1])):
         part = values[row : row + down * _CELLS, column : column + across * _CELLS]
-        means = part.reshape(down, _CELLS, across, _CELLS).mean(axis=(1, 3))
+        # Sums of 16 values of 16 bits are whole numbers of 20, which single precision holds.
+        rows = part.reshape(down, _CELLS, across * _CELLS).sum(axis=1, dtype=np.float32)
+        means = rows.reshape(down, across, _CELLS).sum(axis=2).astype(np.float64) / _CELLS**2
         around = sum(np.roll(means, (y, x), (0, 1)) for y in (-1, 0, 1) for x in (-1, 0, 1))
         # Logarithms of ratios: a quarter that is brighter everywhere has the same detail.
         fine = np.log((means + 1) / (around / 9 + 1))[1:-1, 1:-1].ravel()
