@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from polarguide.api import open_run
+from polarguide import open_run
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.gaussians.ply import read_ply
 from polarguide.optics.color import srgb_encode

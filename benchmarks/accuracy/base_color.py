@@ -18,7 +18,7 @@ import torch
 import trimesh
 from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
-from polarguide.api import open_run
+from polarguide import open_run
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import srgb_decode_array, srgb_encode_array
 

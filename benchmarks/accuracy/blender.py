@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 import torch
 
-from polarguide.api import open_run
+from polarguide import open_run
 from polarguide.capture.formats.arrays import read_radiance
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import srgb_encode_array

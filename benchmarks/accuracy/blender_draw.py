@@ -23,7 +23,7 @@ def set_light(scene, environment: str, *, unlit: bool) -> None:
     texture, place = nodes.new("ShaderNodeTexEnvironment"), nodes.new("ShaderNodeMapping")
     texture.image = bpy.data.images.load(environment)
     texture.image.colorspace_settings.name = "Linear Rec.709"
-    place.inputs["Rotation"].default_value = (0, 0, math.pi / 2)
+    place.inputs["Rotation"].default_value = (0, 0, -math.pi / 2)  # the middle is +x there
     links.new(nodes.new("ShaderNodeTexCoord").outputs["Generated"], place.inputs["Vector"])
     links.new(place.outputs["Vector"], texture.inputs["Vector"])
     links.new(texture.outputs["Color"], background.inputs["Color"])

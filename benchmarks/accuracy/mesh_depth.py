@@ -18,7 +18,7 @@ import torch
 import trimesh
 from plyfile import PlyData
 
-from polarguide.api import open_run
+from polarguide import open_run
 from polarguide.gaussians.initialize import scene_extent
 from polarguide.visualization import figures
 

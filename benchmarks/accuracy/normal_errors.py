@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from polarguide import optics
-from polarguide.api import open_run
+from polarguide import open_run, optics
 from polarguide.results.evaluation.metrics import normal_angles_deg
 
 NEAR = np.ones((5, 5), dtype=np.uint8)

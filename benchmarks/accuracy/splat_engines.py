@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 import torch
 
-from polarguide.api import open_run
+from polarguide import open_run
 from polarguide.geometry.camera import Camera
 from polarguide.visualization import figures
 

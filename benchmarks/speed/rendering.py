@@ -19,8 +19,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does,
 
 import torch
 
-from polarguide import _native
-from polarguide.api import Run, open_run
+from polarguide import Run, _native, open_run
 from polarguide.core.system import keep_freed_memory
 from polarguide.geometry.camera import Camera
 from polarguide.raster import use_threads

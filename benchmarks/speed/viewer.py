@@ -19,7 +19,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does,
 import cv2
 import torch
 
-from polarguide.api import open_run
+from polarguide import open_run
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.trajectory import orbit
