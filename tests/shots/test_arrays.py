@@ -48,6 +48,8 @@ def test_a_mosaic(tmp_path: Path, sensor: str, change: Callable[[np.ndarray], An
     options = replace(MONO, sensor=sensor)  # type: ignore[arg-type]
     filed, made = read_shot(tmp_path / "part.png", options), read_shot(change(values), options)
     same(made, filed)
+    usable = f"{float(made.usable.mean()):.1%} usable"
+    assert repr(made).startswith(f"<ShotMaps array: {made.size[0]}x{made.size[1]} pixels\n {usable}, ")
     assert (made.name, made.files, made.notes) == ("array", (), filed.notes)
     np.testing.assert_array_equal(values, kept)
 

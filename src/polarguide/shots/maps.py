@@ -139,6 +139,11 @@ class ShotMaps:
     origin: tuple[int, int] = (0, 0)
     whole: tuple[int, int] | None = None
 
+    def __repr__(self) -> str:
+        shares = (f"{float((self.reason == each).mean()):.1%} {each.name.lower()}" for each in Reason)
+        width, height = self.size
+        return f"<ShotMaps {self.name}: {width}x{height} pixels\n {', '.join(shares)}; noise {self.noise.source}>"
+
     @property
     def s0(self) -> Map:
         """S0 of the luminance, [H, W]; a photograph shows half of it."""
