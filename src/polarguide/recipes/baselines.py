@@ -35,7 +35,7 @@ RECIPE_3DGS = Recipe(
 PROPAGATION_DR = Rounds(("propagate_normals", "reset_opacity"), 1.5 / 61, minimum=350)
 RESET_DR = Repeat("reset_opacity", fraction=3 / 61, minimum=700)
 
-# The release's first values (0.001, 5, 0.05, 128) need its 61,000 steps: see docs/explanation/recipes.md.
+# The release's first values (0.001, 5, 0.05, 128) need its 61,000 steps: see docs/explanation/baselines.md.
 SHADING_3DGS_DR = DeferredShading(
     first_strength=0.05,
     environment_spread=0.2,
