@@ -5,8 +5,9 @@
     done
     python benchmarks/front/front_pictures.py SCENE RUNS --view v040
 
-Writes ``docs/images/front.jpg`` and ``docs/images/front.webp``. Pictures have the size of the scene's own, whatever the
-training's was.
+Writes ``docs/images/front.jpg`` and ``docs/images/front.webp``; with ``--control RUN``, a training without
+polarization, only the pairs that the gallery wipes, into ``docs/extra/scenes``. Pictures have the size of the scene's
+own, whatever the training's was.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from polarguide.visualization.figures import Picture, contact_sheet
 from polarguide.visualization.layers import ground_truth_pictures, layer_picture
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
+PAGES = IMAGES.parent / "extra" / "scenes"
 RECIPES = ("3dgs", "3dgs-dr", "polarguide-stokes")
 LAYERS = {"final": "picture", "specular": "specular", "diffuse": "diffuse", "normal": "normals"}
 FRAMES_PER_SECOND = 12
@@ -49,6 +51,18 @@ def sheet(scene: pg.Scene, runs: dict[str, pg.Run], name: str) -> Picture:
         ["photograph, truth", *runs],
         minimum_width=1,
     )
+
+
+def write_pairs(scene: pg.Scene, ours: pg.Run, control: pg.Run, name: str, folder: Path) -> None:
+    """A held-out view: the photograph and ours, and each layer without and with polarization, as JPEG files."""
+    view = scene.view(name)
+    with_it, without = drawn(ours, view.camera), drawn(control, view.camera)
+    pairs = {layer: (without[layer], with_it[layer]) for layer in LAYERS}
+    pairs["final"] = (ground_truth_pictures(view)["final"], with_it["final"])
+    for layer, pair in pairs.items():
+        for side, picture in zip(("left", "right"), pair, strict=True):
+            assert picture is not None
+            Image.fromarray(picture).save(folder / f"wipe-{layer}-{side}.jpg", quality=88)
 
 
 def absent(width: int, height: int) -> Picture:
@@ -112,8 +126,13 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(448, 336), help="of the film")
     parser.add_argument("--quality", type=int, default=65, help="of the film")
     parser.add_argument("--no-film", action="store_true", help="draw the sheet alone")
+    parser.add_argument("--control", type=Path, help="a run of polarguide-stokes:unpolarized")
     parser.add_argument("--out", type=Path, default=IMAGES)
     given = parser.parse_args()
+    if given.control is not None:
+        ours, control = pg.open_run(given.runs / RECIPES[-1]), pg.open_run(given.control)
+        write_pairs(pg.load_scene(given.scene), ours, control, given.view, PAGES)
+        return
     runs = {recipe: pg.open_run(given.runs / recipe) for recipe in RECIPES}
     picture = Image.fromarray(sheet(pg.load_scene(given.scene), runs, given.view))
     picture.save(given.out / "front.jpg", quality=90)
