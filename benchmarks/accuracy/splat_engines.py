@@ -37,6 +37,19 @@ FLAGS = (
 STILL = 6  # equal pictures in a row
 NEAR, FAR = 0.01, 1000.0
 
+DRAWS_WITH_THREE = """
+  camera.matrixAutoUpdate = false;
+  return (frame) => {
+    renderer.setSize(frame.width, frame.height, false);
+    camera.matrix.fromArray(frame.pose);
+    camera.updateMatrixWorld(true);
+    camera.projectionMatrix.fromArray(frame.projection);
+    camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+    renderer.render(scene, camera);
+  };
+};
+"""
+
 # Each starts with a canvas and a file, and gives a function that draws with a camera: its view and pose (camera to
 # world) in OpenGL's axes, its projection, all as WebGL counts matrices, and its size.
 ENGINES = {
@@ -51,16 +64,8 @@ export default async (canvas, url) => {
   const scene = new THREE.Scene(), camera = new THREE.PerspectiveCamera();
   scene.background = new THREE.Color(0);
   scene.add((await loader.loadAsync(url)).scene);
-  camera.matrixAutoUpdate = false;
-  return (frame) => {
-    renderer.setSize(frame.width, frame.height, false);
-    camera.matrix.fromArray(frame.pose);
-    camera.updateMatrixWorld(true);
-    camera.projectionMatrix.fromArray(frame.projection);
-    camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
-    renderer.render(scene, camera);
-  };
-};""",
+"""
+    + DRAWS_WITH_THREE,
     "babylon": """
 import { Engine } from "@babylonjs/core/Engines/engine.js";
 import { Scene } from "@babylonjs/core/scene.js";
@@ -128,16 +133,8 @@ export default async (canvas, url) => {
   if (url.endsWith(".spz")) mesh.quaternion.set(1, 0, 0, 0);  // from its own axes (right, up, back) to the world's
   scene.add(mesh);
   await mesh.initialized;
-  camera.matrixAutoUpdate = false;
-  return (frame) => {
-    renderer.setSize(frame.width, frame.height, false);
-    camera.matrix.fromArray(frame.pose);
-    camera.updateMatrixWorld(true);
-    camera.projectionMatrix.fromArray(frame.projection);
-    camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
-    renderer.render(scene, camera);
-  };
-};""",
+"""
+    + DRAWS_WITH_THREE,
 }
 FILES = {
     "three": ("splat-glb", "splats-linear.glb"),

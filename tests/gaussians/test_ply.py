@@ -194,8 +194,8 @@ def test_refit_reproduces_harmonics(monkeypatch):
     normals = torch.nn.functional.normalize(rand(5, 20, 3), dim=-1)
     for slope in (None, lambda colors: 1 + colors.square()):
         found = refit_sh(lambda part, d: release_color(dc[part], rest[part], d), normals, slope)
-        assert torch.allclose(found[0], dc, atol=1e-4)
-        assert torch.allclose(found[1], rest, atol=1e-4)
+        assert torch.allclose(found[0], dc, atol=1e-5)
+        assert torch.allclose(found[1], rest, atol=1e-5)
 
 
 def highlight(part, directions):
