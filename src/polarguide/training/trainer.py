@@ -266,9 +266,8 @@ def warn_of_unused_materials(
     scene: Scene, recipe: Recipe, settings: ResolvedSettings, backend: Backend, warn: Callable[[str], None]
 ) -> None:
     """Warn if ``materials/``, or refractive indices of single materials, have no effect on a training."""
-    steps, shading = settings.steps, recipe.shading.bind(settings.refractive_index)
-    schedule = Schedule(recipe, steps)
-    refreshes = [step / steps for step in range(steps) if "refresh_priors" in schedule.at(step).actions]
+    shading = recipe.shading.bind(settings.refractive_index)
+    refreshes = [step / settings.steps for step in _refreshes(recipe, settings.steps)]
     MetalSearch(scene, recipe, settings, shading, backend, ALONE, warn, UNBOUNDED).warn_if_never(refreshes)
     if not scene.indices:
         return
@@ -279,6 +278,20 @@ def warn_of_unused_materials(
     else:
         return
     warn(f"the refractive indices that scene.json lists under materials are not used: {why}.")
+
+
+def last_look(recipe: Recipe, settings: ResolvedSettings) -> int | None:
+    """The last step at which a training decides what is metal, as far as labels say it; None: there is none."""
+    if not recipe.shading.knows_metals or settings.materials != "auto":
+        return None
+    (first, last), steps = recipe.metals, settings.steps
+    return max((step for step in _refreshes(recipe, steps) if first <= step / steps < last), default=None)
+
+
+def _refreshes(recipe: Recipe, steps: int) -> list[int]:
+    """The steps of a training that refresh its priors."""
+    schedule = Schedule(recipe, steps)
+    return [step for step in range(steps) if "refresh_priors" in schedule.at(step).actions]
 
 
 def turned_behind(result: RenderResult, near: float, far: float) -> RenderResult:

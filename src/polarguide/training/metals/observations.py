@@ -54,13 +54,13 @@ def evenly(views: Sequence[View], most: int) -> Sequence[View]:
     return views[:: max(1, -(-len(views) // most))]
 
 
-def shares(gaussians: Parameters, view: View, target: Tensor, rasterize: Rasterize) -> Tensor:
+def shares(gaussians: Parameters, camera: Camera, target: Tensor, rasterize: Rasterize) -> Tensor:
     """Sums [N, C] over the pixels of a picture [H, W, C], each by what the Gaussian has in it."""
     with torch.no_grad():
         fixed = splats(gaussians)
     features = target.new_zeros(len(fixed.means), target.shape[-1], requires_grad=True)
     with torch.enable_grad():
-        (rasterize(fixed._replace(features=features), view.camera).features * target).sum().backward()
+        (rasterize(fixed._replace(features=features), camera).features * target).sum().backward()
     assert features.grad is not None
     return features.grad
 
@@ -82,7 +82,7 @@ def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal:
     one = torch.ones_like(x)[..., None]
     good = (reliable & ~(view.invalid | view.saturated))[..., None]
     target = torch.cat((one, s0, across, oblique, -dot(guide, rays)[..., None]), dim=-1) * good
-    return shares(gaussians, view, target.contiguous(), rasterize)
+    return shares(gaussians, view.camera, target.contiguous(), rasterize)
 
 
 def samples_of(looks: Sequence[Tensor], which: slice, limits: MetalViews) -> ViewSamples:
@@ -151,7 +151,7 @@ def _labels_in(gaussians: Parameters, view: View, rasterize: Rasterize) -> Tenso
     assert view.materials is not None
     kinds = view.materials.to(gaussians["means"].device)
     target = torch.stack(((kinds == 1) | (kinds > 2), kinds == 2), dim=-1).float()
-    return shares(gaussians, view, target, rasterize)
+    return shares(gaussians, view.camera, target, rasterize)
 
 
 # Pixels of a Gaussian in all views from which on what they say counts.
@@ -186,7 +186,7 @@ def index_offsets(
         target = torch.stack(((kinds == 1) | (kinds == 2), *(kinds == k for k in here)), dim=-1).float()
         columns = [0, *(1 + numbers.index(number) for number in here)]
         for some, part in zip(_batched(columns), target.split(MAX_CHANNELS, dim=-1), strict=True):
-            weights[:, some] += shares(gaussians, view, part.contiguous(), rasterize)
+            weights[:, some] += shares(gaussians, view.camera, part.contiguous(), rasterize)
     offsets = means.new_tensor([0.0, *(indices[number] - refractive_index for number in numbers)])
     most, chosen = weights.max(dim=1)
     specified = torch.where(most > LEAST_SEEN, offsets[chosen], torch.zeros_like(most))
