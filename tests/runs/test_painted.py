@@ -17,8 +17,8 @@ from polarguide.core.options import SceneOptions
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import RunConfiguration, RunLog, trained_steps
 from polarguide.runs.painted import FOLDER, read_painted, write_painted
+from polarguide.training.metals.search import looks
 from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import last_look
 
 READING = SceneOptions(downscale=4)
 STEPS = 60
@@ -96,7 +96,7 @@ def test_a_finished_training_goes_back_once_and_takes_what_was_painted(
     out = tmp_path / "run"
     shutil.copytree(finished, out)
     run = polarguide.open_run(out, recipe=RECIPE)
-    assert last_look(RECIPE, run.configuration.settings) == 51
+    assert looks(RECIPE, run.configuration.settings)[-1] == 51
     itself = float(run.gaussians["metalness"].mean())  # without a word of the user
     assert itself < 0.05
     write_painted(out, pictures(scene))

@@ -20,6 +20,7 @@ from polarguide.shading.metal import any_nonzero
 from polarguide.training.metals.cut import INFINITE, Graph, decide, minimum_cut, surfaces, unary
 from polarguide.training.metals.evidence import GOLD, Evidence, _tint_cost, errors, evidence
 from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights
+from polarguide.training.metals.search import looks
 from polarguide.training.rules import MetalRules, MetalViews
 from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer, warn_of_unused_materials
@@ -281,3 +282,20 @@ def test_the_users_words_need_no_polarization(tiny_scene: Scene) -> None:
     assert float(metal[ball["means"][:, 2] > 0.3].float().mean()) > 0.9
     views = [dataclasses.replace(view, materials=None) for view in views]
     assert not bool(found(ball, views).any())
+
+
+def test_the_prior_grows_from_look_to_look(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is likely is shaded as a metal at first; at the last look the whole prior counts."""
+    trainer = trainer_of(tiny_scene, TrainSettings(60, 3), [])
+    steps = looks(trainer.recipe, trainer.settings)
+    assert len(steps) >= 3
+    priors: list[float] = []
+
+    def decided_with(*given: object) -> Tensor:
+        priors.append(given[-1].prior)  # type: ignore[attr-defined]
+        return torch.zeros(len(trainer.state.gaussians), dtype=torch.bool)
+
+    monkeypatch.setattr("polarguide.training.metals.search.decide", decided_with)
+    trainer.run(lambda _: None)
+    expected = [RULES.prior * (k + 1) / len(steps) for k in range(len(steps))]
+    assert priors == pytest.approx(expected)

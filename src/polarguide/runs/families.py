@@ -29,9 +29,10 @@ from polarguide.runs.painted import FOLDER
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers, predicts_filters
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.distributed import Ranks
+from polarguide.training.metals.search import looks
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings
-from polarguide.training.trainer import last_look, warn_of_unused_materials
+from polarguide.training.trainer import warn_of_unused_materials
 from polarguide.training.view_store import ViewStore
 
 ANY = 90.0
@@ -236,7 +237,8 @@ class GaussianFamily(Family):
         self, state: Any, method: Recipe, settings: ResolvedSettings, out: Path, reporter: Reporter
     ) -> None:
         """See ``Family``: to the last step at which metals are looked for."""
-        step = last_look(method, settings)
+        steps = looks(method, settings)
+        step = steps[-1] if steps else None
         if step is None:
             super().go_back(state, method, settings, out, reporter)
         elif state is not None and state.step > step:

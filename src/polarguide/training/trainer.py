@@ -27,7 +27,7 @@ from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.feed import Feed
 from polarguide.training.losses import step_loss
 from polarguide.training.metals.observations import index_offsets, numbers_in
-from polarguide.training.metals.search import MetalSearch
+from polarguide.training.metals.search import MetalSearch, refreshes
 from polarguide.training.recipe import Action, Recipe, Schedule, Stage
 from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.state import TrainingState, first_state, seeded
@@ -231,7 +231,7 @@ class Trainer:
             self.ranks.broadcast(outward)
             state.gaussians.overwrite("outward", outward)
         else:
-            if self._metals.is_due(state.step / steps):
+            if self._metals.is_due(state.step):
                 self._metals.look(state, self._views)
             self._set_indices()
             state.frozen = state.gaussians.snapshot()
@@ -267,31 +267,16 @@ def warn_of_unused_materials(
 ) -> None:
     """Warn if ``materials/``, or refractive indices of single materials, have no effect on a training."""
     shading = recipe.shading.bind(settings.refractive_index)
-    refreshes = [step / settings.steps for step in _refreshes(recipe, settings.steps)]
-    MetalSearch(scene, recipe, settings, shading, backend, ALONE, warn, UNBOUNDED).warn_if_never(refreshes)
+    MetalSearch(scene, recipe, settings, shading, backend, ALONE, warn, UNBOUNDED).warn_if_never()
     if not scene.indices:
         return
-    if not (shading.knows_indices and refreshes):
+    if not (shading.knows_indices and refreshes(recipe, settings.steps)):
         why = f"the recipe {recipe.name} takes the run's for everything"
     elif not any(numbers_in(view) & scene.indices.keys() for view in scene.train_views):
         why = "no picture in materials/ of a training view has one of their numbers"
     else:
         return
     warn(f"the refractive indices that scene.json lists under materials are not used: {why}.")
-
-
-def last_look(recipe: Recipe, settings: ResolvedSettings) -> int | None:
-    """The last step at which a training decides what is metal, as far as labels say it; None: there is none."""
-    if not recipe.shading.knows_metals or settings.materials != "auto":
-        return None
-    (first, last), steps = recipe.metals, settings.steps
-    return max((step for step in _refreshes(recipe, steps) if first <= step / steps < last), default=None)
-
-
-def _refreshes(recipe: Recipe, steps: int) -> list[int]:
-    """The steps of a training that refresh its priors."""
-    schedule = Schedule(recipe, steps)
-    return [step for step in range(steps) if "refresh_priors" in schedule.at(step).actions]
 
 
 def turned_behind(result: RenderResult, near: float, far: float) -> RenderResult:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -19,7 +21,7 @@ from polarguide.training.distributed import Ranks
 from polarguide.training.metals.cut import decide
 from polarguide.training.metals.evidence import evidence
 from polarguide.training.metals.observations import contradicted, evenly
-from polarguide.training.recipe import Recipe
+from polarguide.training.recipe import Recipe, Schedule
 from polarguide.training.rules import MetalViews
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import TrainingState
@@ -91,22 +93,21 @@ class MetalSearch:
         self._index, self._backend, self._ranks, self._warn = settings.refractive_index, backend, ranks, warn
         self._memory = memory
         self._on = shading.knows_metals and settings.materials == "auto"
-        self._told = False
+        self._told, self._steps = False, settings.steps
+        self._refreshes, self._looks = refreshes(recipe, settings.steps), looks(recipe, settings)
 
-    def is_due(self, share: float) -> bool:
-        """Whether a refresh after this share of the steps looks for metals."""
-        first, last = self._between
-        return self._on and first <= share < last
+    def is_due(self, step: int) -> bool:
+        """Whether a refresh at this step looks for metals."""
+        return self._on and _within(self._between, step, self._steps)
 
-    def warn_if_never(self, refreshes: Iterable[float]) -> None:
-        """Say so where the user names materials and no refresh is due, of those after these shares of the steps.
+    def warn_if_never(self) -> None:
+        """Say so where the user names materials and no refresh is due.
 
         Recipes that never refresh their priors, such as controls, do not look for metals and get no warning.
         """
         if not self._on or not any(_names_metals(view) for view in self._scene.train_views):
             return
-        shares = list(refreshes)
-        if shares and not any(map(self.is_due, shares)):
+        if self._refreshes and not self._looks:
             first, last = (100 * share for share in self._between)
             self._warn(
                 f"materials/ is read at refreshes of the priors between {first:.0f} and {last:.0f} % of the steps. "
@@ -133,7 +134,8 @@ class MetalSearch:
         near = ~far_away(gaussians["means"].detach().cpu(), self._scene.points, centers, self._limits.reach)
         if not any(view.is_determined for view in views):  # then nothing tells how far a label reaches
             near = torch.zeros_like(near)
-        metal = decide(measured, gaussians, near.to(measured.ratio.device), self._rules).float()
+        rules = replace(self._rules, prior=self._share_of_prior(state.step) * self._rules.prior)
+        metal = decide(measured, gaussians, near.to(measured.ratio.device), rules).float()
         reflectance = measured.reflectance
         for values in (metal, reflectance):
             self._ranks.broadcast(values)
@@ -151,6 +153,32 @@ class MetalSearch:
         self._shading.become_metal(gaussians, state.light, metal > 0, reflectance, gain)
         del measured
         self._memory.clear()
+
+    def _share_of_prior(self, step: int) -> float:
+        """The prior grows from look to look, and counts whole at the last.
+
+        Normals of a metal that is shaded as a dielectric are wrong, and its evidence with them. What is likely is
+        therefore shaded as a metal first, and is a dielectric again where its own normals do not confirm it.
+        """
+        return max(1, bisect_right(self._looks, step)) / max(1, len(self._looks))
+
+
+def refreshes(recipe: Recipe, steps: int) -> list[int]:
+    """The steps of a training that refresh its priors."""
+    schedule = Schedule(recipe, steps)
+    return [step for step in range(steps) if "refresh_priors" in schedule.at(step).actions]
+
+
+def looks(recipe: Recipe, settings: ResolvedSettings) -> list[int]:
+    """The steps at which a training decides what is metal; none: it takes everything for dielectric."""
+    if not recipe.shading.knows_metals or settings.materials != "auto":
+        return []
+    steps = settings.steps
+    return [step for step in refreshes(recipe, steps) if _within(recipe.metals, step, steps)]
+
+
+def _within(shares: tuple[float, float], step: int, steps: int) -> bool:
+    return shares[0] <= step / steps < shares[1]
 
 
 def _names_metals(view: View) -> bool:
