@@ -25,6 +25,7 @@ from polarguide.shading.result import COLOR_CHANNELS, RenderResult
 from polarguide.training.actions import DensityControl, outward_directions, propagate_normals, reset_opacity
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.feed import Feed
+from polarguide.training.flat import Flat
 from polarguide.training.losses import step_loss
 from polarguide.training.metals.observations import index_offsets, numbers_in
 from polarguide.training.metals.search import MetalSearch
@@ -92,6 +93,16 @@ class Trainer:
         self._reach = orbit(scene.points.double().numpy(), centers.double().numpy())[1]
         self._rate = math.sqrt(settings.views_per_step)
         self._use_batch_rates()
+
+    @property
+    def flat(self) -> dict[str, dict[str, Flat]]:
+        """Flat surfaces that have been found, as of ``Feed``; what is put there is not looked for."""
+        return self._feed.flat
+
+    def looks_for_metals(self, step: int) -> bool:
+        """Whether metals are looked for before a step."""
+        refreshes = "refresh_priors" in self.schedule.at(step).actions
+        return refreshes and self._metals.is_due(step / self.settings.steps)
 
     def set_exposures(self, exposures: Mapping[str, tuple[Exposure, ...]]) -> None:
         """Take views, by name, for captured with these exposures from now on; their targets are made anew."""
