@@ -145,7 +145,7 @@ def test_the_time_left_follows_stages_priors_growth_and_looks() -> None:
     looks = np.isin(np.arange(steps), (2000, 3000, 3500))
     costs = np.stack([least + looks, 2 * least + 9 * looks])
     expected = forecasts.Forecast(0, 0, first, most, limit, 0, costs, priors)
-    added = np.cumsum(160 * np.sqrt(np.minimum(np.arange(1, 26), 5)))
+    added = np.cumsum(120 * np.minimum(np.arange(1, 26), 5))
     grown = np.minimum(first + np.append(0, added)[np.arange(steps) // 100 % 26], limit)
     grown[2500:] = 0.7 * grown[2499]
     true = 2 * (costs[0] + (costs[1] - costs[0]) * (grown - first) / (most - first))

@@ -216,11 +216,11 @@ LEAST_STEPS = 500
 GROWTH = 16
 """Of the Gaussians, up to which the time is estimated: the density control decides it on the way."""
 # Of 15 trainings of six scenes, 1,000 to 5,000 steps.
-SPROUTING = 5
-"""Rounds of the density control each of which adds more than the last, as the square root of their number; later ones
-add about as many."""
+SPROUTING, FIRST_ROUND = 5, 0.15
+"""Rounds of the density control that add in proportion to their number, later ones add about as many each; and what the
+first adds, as a share of the Gaussians: 0.07 to 0.25."""
 NOT_FAINT = 0.65
-"""Of the Gaussians, those that stay when the density control ends and the faint ones go: 0.43 to 0.76."""
+"""Of the Gaussians, those that stay when the density control ends and the faint ones go: 0.43 to 0.81."""
 
 
 @dataclass(frozen=True)
@@ -231,8 +231,8 @@ class Forecast:
         seconds: as long as there are as many Gaussians as at the beginning. most_seconds: with ``most`` of them.
         gaussians: at the beginning. most: see above. limit: most that the density control allows.
         peak: bytes of memory, at most.
-        costs: [2, steps] seconds of every step with either number of Gaussians, priors of views and looks for metals
-            included.
+        costs: [2, steps] seconds of every step with either number of Gaussians, with priors of views, looks for
+            metals, and what ends the density control.
         priors: [steps] bool, which steps compute the priors of a view.
         flat: flat surfaces of the views, which the training need not find again. spent: seconds that they took.
     """
@@ -278,22 +278,20 @@ def forecast(
     first = len(trainer.state.gaussians)
     most = max(first, min(GROWTH * first, settings.gaussians))
     coarse = coarse_steps(recipe, scene.train_views, settings.steps)
-    seconds, of_view, spent = _measured(trainer, coarse)
     computed = np.array(_priors_made(recipe, settings, len(scene.train_views), coarse))
-    small = np.arange(settings.steps) < coarse
-    priors = computed * np.where(small, of_view.get(True, 0.0), of_view.get(False, 0.0))
+    small, costs = np.arange(settings.steps) < coarse, []
+    plain, of_view, spent = _measured(trainer, coarse)
+    events = _events(trainer, plain)
+    for count in (first, most):
+        if count != first:
+            _multiply(trainer, count)
+            plain, of_view, _ = _measured(trainer, coarse)
+        priors = computed * np.where(small, of_view.get(True, 0.0), of_view.get(False, 0.0))
+        costs.append(plain + priors + events * (count / first))
     again = 1 + _search_share(scene, recipe, settings)
-    looks = np.array([trainer.looks_for_metals(step) for step in range(settings.steps)], float)
-    if looks.any():  # a look takes time in proportion to the Gaussians
-        first_look = int(looks.argmax())
-        looks *= max(0.0, _timed(trainer, first_look) - seconds[first_look])
-    costs = np.stack([seconds + priors + looks, seconds + priors + looks * (most / first)])
-    if most != first:
-        _multiply(trainer, most)
-        costs[1] += _measured(trainer, coarse)[0] - seconds
     least, greatest = (spent + again * float(each.sum()) for each in costs)
-    limit = max(first, settings.gaussians)
-    return Forecast(least, greatest, first, most, limit, peak, costs, computed > 0, trainer.flat, spent)
+    of_all = np.stack(costs), computed > 0, trainer.flat, spent
+    return Forecast(least, greatest, first, most, max(first, settings.gaussians), peak, *of_all)
 
 
 class TimeLeft:
@@ -317,11 +315,7 @@ class TimeLeft:
         self._ratios: dict[bool, deque[float]] = {kind: deque(maxlen=tenth) for kind in (False, True)}
 
     def take(self, done: int, gaussians: int, seconds: float) -> float:
-        """The seconds left after so many steps; ``seconds``: that those since the last call took.
-
-        Args:
-            gaussians: of the last of these steps, before the density control that may follow it.
-        """
+        """The seconds left after so many steps, the last with so many Gaussians; ``seconds``: since the last call."""
         before = self._counts[-1][0]
         self._counts.append((done, gaussians))
         wanted = float(self._costs(np.arange(before, done), np.full(done - before, gaussians)).sum())
@@ -341,11 +335,14 @@ class TimeLeft:
         done = self._counts[-1][0]
         past = int((self._rounds < done).sum())
         counts = np.full(len(steps), float(gaussians))
-        if past:
-            earlier = max(count for count in self._counts if count[0] <= self._rounds[past - 1])[1]
-            sizes = np.sqrt(np.minimum(np.arange(past, len(self._rounds) + 1), SPROUTING))
-            added = np.append(0.0, np.cumsum(max(0, gaussians - earlier) * sizes[1:] / sizes[0]))
-            counts += added[np.searchsorted(self._rounds[past:], steps, "right")]
+        if past < len(self._rounds):
+            sizes = np.minimum(np.arange(1, len(self._rounds) + 1), SPROUTING)
+            added = FIRST_ROUND * gaussians
+            if past:
+                before = max(count for count in self._counts if count[0] <= self._rounds[past - 1])[1]
+                added = max(0, gaussians - before) / sizes[past - 1]
+            total = np.append(0.0, np.cumsum(added * sizes[past:]))
+            counts += total[np.searchsorted(self._rounds[past:], steps, "right")]
         counts = counts.clip(max=max(gaussians, self.expected.limit))
         return np.where((steps >= self._ends) & (done <= self._ends), NOT_FAINT, 1.0) * counts
 
@@ -404,6 +401,18 @@ def _measured(trainer: Trainer, coarse: int) -> tuple[NDArray[np.float64], dict[
             priors[small] = max(priors.get(small, 0.0), fresh - seconds[kind])
     kinds = ((step < coarse, stage.reflection, stage.weights) for step, stage in enumerate(stages))
     return np.array([seconds.get(kind, max(seconds.values())) for kind in kinds]), priors, once
+
+
+def _events(trainer: Trainer, plain: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Seconds of looks at all views (``Trainer.looks``), in proportion to the Gaussians; spoils the state."""
+    seconds, measured = np.zeros(len(plain)), dict[tuple[bool, ...], float]()
+    for step in range(len(plain)):
+        kind = trainer.looks(step)
+        if any(kind):
+            if kind not in measured:
+                measured[kind] = max(0.0, _timed(trainer, step) - float(plain[step]))
+            seconds[step] = measured[kind]
+    return seconds
 
 
 def _timed(trainer: Trainer, step: int) -> float:
