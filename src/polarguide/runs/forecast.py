@@ -29,6 +29,7 @@ from polarguide.capture.layout import (
 from polarguide.core.errors import PolarguideError
 from polarguide.core.system import (
     MEBIBYTE,
+    MemoryBound,
     free_memory,
     machine_busy_seconds,
     peak_memory_mib,
@@ -274,18 +275,18 @@ def forecast(
     """
     if settings.steps < LEAST_STEPS:
         return None
-    trainer = Trainer(scene, recipe, replace(settings, begin_again=False), backend)
+    trainer = Trainer(scene, recipe, replace(settings, begin_again=False), backend, memory=MemoryBound(peak))
     first = len(trainer.state.gaussians)
     most = max(first, min(GROWTH * first, settings.gaussians))
     coarse = coarse_steps(recipe, scene.train_views, settings.steps)
     computed = np.array(_priors_made(recipe, settings, len(scene.train_views), coarse))
-    small, costs = np.arange(settings.steps) < coarse, []
     plain, of_view, spent = _measured(trainer, coarse)
-    events = _events(trainer, plain)
+    events, costs = _events(trainer, plain), []
     for count in (first, most):
         if count != first:
             _multiply(trainer, count)
             plain, of_view, _ = _measured(trainer, coarse)
+        small = np.arange(settings.steps) < coarse
         priors = computed * np.where(small, of_view.get(True, 0.0), of_view.get(False, 0.0))
         costs.append(plain + priors + events * (count / first))
     again = 1 + _search_share(scene, recipe, settings)
