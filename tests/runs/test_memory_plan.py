@@ -153,7 +153,7 @@ def test_the_time_left_follows_stages_priors_growth_and_looks() -> None:
     for done in range(10, steps, 10):
         event = 60.0 if done == 510 else 0.0
         found = left.take(done, int(grown[done - 1]), float(true[done - 10 : done].sum()) + event)
-        if done >= 500:
+        if done > 100:  # one round of the density control was seen
             assert found == pytest.approx(true[done:].sum(), rel=0.1), done
 
 
