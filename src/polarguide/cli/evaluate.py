@@ -50,7 +50,7 @@ def print_scores(record: dict[str, Any], title: str) -> None:
     metrics = importlib.import_module("polarguide.results.evaluation.table")
     table = Table(title=Text(printable(title)))
     table.add_column("metric")
-    table.add_column("value", justify="right")
+    table.add_column("value", justify="right", overflow="fold")
     for label, text in metrics.shown_metrics(record):
         table.add_row(label, Text(printable(text)))
     console.print(table)

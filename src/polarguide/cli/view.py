@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from polarguide.cli.console import RunFolder, opened
 from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.options import LOOPBACK, ComputeOptions, VisitorOptions
@@ -13,6 +15,7 @@ def view(
     *,
     host: str = LOOPBACK[0],
     port: int = 8080,
+    beside: Path | None = None,
     visitors: VisitorOptions = VisitorOptions(),
     compute: ComputeOptions = ComputeOptions(),
 ) -> None:
@@ -22,6 +25,7 @@ def view(
         run: Run folder.
         host: Address to listen at. Others can reach it only if you give one of theirs (0.0.0.0: anyone's).
         port: To listen at; the next free one is taken if it is in use.
+        beside: Another run of the same scene, such as one without polarization, for the wipe between the two.
     """
     if run.is_file():
         raise PolarguideError(
@@ -33,4 +37,5 @@ def view(
         )
     require_package("viser", "the viewer")
     trained, reporter = opened(run, compute)
-    trained.view(host=host, port=port, visitors=visitors, reporter=reporter)
+    other = None if beside is None else opened(beside, compute)[0]
+    trained.view(host=host, port=port, visitors=visitors, reporter=reporter, beside=other)
