@@ -27,7 +27,7 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.optics.color import srgb_decode_array
 from polarguide.results.export.model import build
-from polarguide.results.export.model.build import require_room, textured_model
+from polarguide.results.export.model.build import charted_subject, require_room, textured_model
 from polarguide.results.export.model.gltf import Textured, color_pixels, write_glb
 from polarguide.results.export.model.irradiance import Surroundings, arriving_light, irradiance
 from polarguide.results.export.model.obj import write_obj
@@ -247,7 +247,9 @@ def model_of(
 ) -> Textured:
     folder.mkdir(exist_ok=True)
     chosen = ModelOptions(triangles=3000, texture=512, **options)
-    return textured_model(ball_run(light), ball_view, presentation, IN_PLACE, chosen, 64, folder, SILENT)
+    run = ball_run(light)
+    subject = charted_subject(run, ball_view, presentation, chosen, 64, folder, SILENT)
+    return textured_model(run, subject, presentation, IN_PLACE, chosen, SILENT)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -69,21 +69,36 @@ def require_room(texture: int) -> None:
         )
 
 
-def textured_model(
+@dataclass(frozen=True, eq=False)
+class Charted:
+    """The subject of a run as a mesh with texture coordinates.
+
+    Attributes:
+        mesh: with colors of the diffuse layer. inside: what belongs to it. voxel: side of those it was fused in.
+        unwrapped: the mesh, split along the borders of charts. texels: of the texture.
+    """
+
+    mesh: ColoredMesh
+    inside: Inside | None
+    voxel: float
+    unwrapped: Unwrapped
+    texels: Texels
+
+
+def charted_subject(
     run: OpenedRun,
     surface_view: SurfaceView,
     presentation: Presentation,
-    placement: Placement,
     options: ModelOptions,
     resolution: int,
     folder: Path,
     reporter: Reporter,
-) -> Textured:
-    """The subject of a run as a textured mesh, upright (+y) as glTF has it.
+) -> Charted:
+    """The surface of what is to be exported, with texture coordinates.
 
     Args:
         run: of Gaussians; its scene is read. surface_view: renders a view of what lies in the crop box.
-        presentation, placement: how it is presented. options: of the model. resolution: voxels along its longest side.
+        presentation: how it is presented. options: of the model. resolution: voxels along its longest side.
         folder: for temporary files. reporter: receives progress, counts and warnings.
 
     Raises:
@@ -91,8 +106,7 @@ def textured_model(
             is asked of a recipe that learns no radiance.
     """
     require_room(options.texture)
-    kind = options.resolved_base_color
-    if kind == "delit":
+    if options.resolved_base_color == "delit":
         needs_radiance(run.model.shading, what=WHAT)
         require_package("embreex", WHAT, extra="model")
     with reporter.track("fusing the surface"):
@@ -101,19 +115,37 @@ def textured_model(
         mesh = painted(surface, views, box)
     reporter.say(counted(mesh.surface))
     unwrapped = unwrap(mesh.surface.vertices, mesh.surface.faces, options.texture, folder, reporter)
-    texels = texels_of(unwrapped, options.texture)
+    return Charted(mesh, inside, box.size, unwrapped, texels_of(unwrapped, options.texture))
+
+
+def textured_model(
+    run: OpenedRun,
+    subject: Charted,
+    presentation: Presentation,
+    placement: Placement,
+    options: ModelOptions,
+    reporter: Reporter,
+) -> Textured:
+    """The subject of a run as a textured mesh, upright (+y) as glTF has it.
+
+    Args:
+        run: of Gaussians; its scene is read. subject: its surface. presentation, placement: how it is presented.
+        options: of the model. reporter: receives progress and counts.
+    """
+    mesh, unwrapped, texels = subject.mesh, subject.unwrapped, subject.texels
+    kind = options.resolved_base_color
     vertices, normals = (values[unwrapped.source] for values in (mesh.surface.vertices, mesh.surface.normals))
     facing = texels.interpolated(unwrapped.faces, normals)
     facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-9)
     places = texels.interpolated(unwrapped.faces, vertices)
-    baked = bake(run, run.scene.train_views, places, facing, SOURCES[kind], box.size, reporter)
+    baked = bake(run, run.scene.train_views, places, facing, SOURCES[kind], subject.voxel, reporter)
     reporter.say(
         f"{unwrapped.charts:,} charts, {len(texels.index) / options.texture**2:.0%} of the texture used; "
         f"{1 - baked.seen.mean():.1%} of the surface is in no view and has the nearest color"
     )
     light = None
     if kind == "delit":
-        arriving = _arriving(run, mesh, inside, reporter)[unwrapped.source]
+        arriving = _arriving(run, mesh, subject.inside, reporter)[unwrapped.source]
         light = _irradiance(texels, unwrapped.faces, arriving, _learned(baked.normal, facing), _index(run))
     color, baked = _presented(baked, light, presentation.color, _index(run), reporter)
     axes = run.frame.panorama_axes().numpy()
