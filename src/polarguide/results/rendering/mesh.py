@@ -274,7 +274,8 @@ def _in_pictures(cameras: Mapping[str, Camera], places: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class DepthSamples:
-    """Of one view: depth [H, W], where it counts [H, W], diffuse color and world normal [H, W, 3]."""
+    """Of one view: depth [H, W], where it counts [H, W], diffuse color and world normal [H, W, 3] in half precision,
+    since all views are held together."""
 
     depth: Tensor
     mask: Tensor
@@ -288,7 +289,9 @@ def _kept(result: RenderResult, camera: Camera) -> DepthSamples:
     normal = unit(result.normal, 1e-3)
     cosine = -dot(camera.world_rays(), normal)
     diffuse = result.base if result.diffuse is None else result.diffuse
-    return DepthSamples(result.depth, (result.alpha > OPAQUE) & (cosine > _STEEPEST), diffuse, normal)
+    return DepthSamples(
+        result.depth, (result.alpha > OPAQUE) & (cosine > _STEEPEST), diffuse.half(), normal.half()
+    )
 
 
 def painted(surface: Surface, views: list[tuple[Camera, DepthSamples]], box: Box) -> ColoredMesh:
