@@ -33,8 +33,9 @@ RAYS = 384
 """Rays from each vertex to all sides: the noise of their mean is a few percent, and textures smooth it between
 vertices."""
 DEGREE = 2
-"""Of the harmonics in which light is kept: a cosine lobe passes hardly any of the higher ones (Ramamoorthi and
-Hanrahan 2001)."""
+"""Of the harmonics that light is kept in: a cosine lobe passes hardly any of the others.
+
+Ramamoorthi and Hanrahan 2001 have shown it."""
 _TOGETHER = 1 << 19
 """Rays traced together: about 100 MB."""
 OFFSET = 2.5e-3
