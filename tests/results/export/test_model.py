@@ -171,6 +171,19 @@ def test_irradiance_beside_a_wall(wall: float, share: float) -> None:
     assert light.mean() == pytest.approx(2 * share * 0.908, rel=0.02)
 
 
+@pytest.mark.parametrize(
+    ("normal", "share"), [((0.0, 0.0, 1.0), 1.0), ((1.0, 0.0, 0.0), 0.5), ((0.0, 0.0, -1.0), 0.0)]
+)
+def test_irradiance_is_that_of_the_normal_asked_for(normal: tuple[float, float, float], share: float) -> None:
+    """Over a black floor under an even sky: all of its light for what looks up, half of it for what looks aside."""
+    both = wall_and_floor(0.0)
+    floor = ColoredMesh(replace(both.surface, faces=both.surface.faces[:2]), both.colors)
+    sky = Surroundings(lambda directions: np.full_like(directions, 2.0), floor)
+    light = arriving_light(np.zeros((40, 3)), np.tile([0.0, 0.0, 1.0], (40, 1)), sky, lambda *_, **__: None)
+    found = irradiance(light, np.tile(normal, (40, 1)), 1.5)
+    assert found.mean() == pytest.approx(2 * share * 0.908, abs=0.04)
+
+
 def glb_tree(path: Path) -> dict[str, Any]:
     data = path.read_bytes()
     assert data[:4] == b"glTF"

@@ -94,7 +94,7 @@ def irradiance(light: NDArray[Any], normals: NDArray[Any], index: float) -> NDAr
         for legendre in map(np.polynomial.Legendre.basis, range(DEGREE + 1))
     ]
     each = np.repeat(lobe, 2 * np.arange(DEGREE + 1) + 1)  # a harmonic of degree l has 2 l + 1 orders
-    return np.einsum("mk,mkc->mc", each * _basis(normals), light).astype(np.float32)
+    return np.asarray(np.einsum("mk,mkc->mc", each * _basis(normals), light), np.float32)
 
 
 def _basis(directions: NDArray[Any]) -> Places:
