@@ -104,7 +104,8 @@ def _basis(directions: NDArray[Any]) -> Places:
 def delit(diffuse: NDArray[np.float32], light: NDArray[np.float32], index: float) -> NDArray[np.float32]:
     """Base color [..., 3] of the diffuse layer and irradiance; see the module's text."""
     floored = np.maximum(light, np.float32(FLOOR * light.mean()))
-    return diffuse / (floored * np.float32(1 - _reflectance(np.ones(1), index)[0]))
+    passed = np.float32(1 - _reflectance(np.ones(1), index)[0])
+    return np.asarray(diffuse / (floored * passed), np.float32)
 
 
 def _reflectance(cosine: NDArray[np.float64], index: float) -> NDArray[np.float64]:
