@@ -132,7 +132,7 @@ def rough_time(seconds: float) -> str:
 PRESETS = (
     *("figure", "kit", "car", "cup", "water"),
     *("metals-a", "metals-b", "ceramic-a", "ceramic-b", "rough", "lacquer"),
-    "proof",
+    *("glossy", "proof"),
 )
 TEST_EVERY = 8
 """As reports of 3DGS do."""
