@@ -22,7 +22,7 @@ from polarguide.experiments.charts import Curve
 from polarguide.experiments.report import _ground_truth_tile, report_html
 from polarguide.experiments.results import Results
 from polarguide.experiments.tables import sections
-from polarguide.visualization.embedded import Tile, chosen_views, data_uri, embed
+from polarguide.visualization.pages import Tile, chosen_views, data_uri, embed
 
 FREE = ("r:unpolarized", "r:unpolarized-without-consistency")
 EVIL = "</script><img src=x onerror=alert(1)>&\"'"

@@ -24,7 +24,7 @@ from polarguide.fields.recipe import FieldShape, NeuralRecipe, Sampling
 from polarguide.fields.state import FieldState
 from polarguide.fields.trainer import FieldTrainer
 from polarguide.geometry.vectors import dot, unit
-from polarguide.recipes.gnerp import ABLATIONS_GNERP, RECIPE_GNERP
+from polarguide.recipes.baselines import ABLATIONS_GNERP, RECIPE_GNERP
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint, trained_steps
 from polarguide.runs.train import train
 from polarguide.training.settings import TrainSettings

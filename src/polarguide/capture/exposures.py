@@ -20,8 +20,7 @@ from polarguide.capture.calibration import Calibration
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
 from polarguide.core.records import shortened
-from polarguide.core.spreadsheet import csv_lines
-from polarguide.core.text import number_or_nan
+from polarguide.core.text import csv_lines, number_or_nan
 from polarguide.geometry.polarizer import ANGLES
 from polarguide.optics import Mount
 

@@ -106,7 +106,7 @@ def evaluate(
         warn(warning)
     say(f"polarization: {trained.polarization}")
     say("health: not recorded, the training was not checked" if health is None else health.summary)
-    sheet = importlib.import_module("polarguide.results.evaluation.error_sheet").ERRORS_FILE
+    sheet = importlib.import_module("polarguide.results.evaluation.evaluate").ERRORS_FILE
     say(f"metrics: {run / 'metrics.json'}")
     say(f"where the errors are: {run / sheet}")
 

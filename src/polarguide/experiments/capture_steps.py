@@ -37,8 +37,8 @@ from polarguide.runs.folder import CONFIGURATION
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import train
 from polarguide.visualization import figures
-from polarguide.visualization.embedded import data_uri
 from polarguide.visualization.layers import layer_picture
+from polarguide.visualization.pages import data_uri
 
 THUMBNAIL = 320
 """Longest side of the pictures on the page of a batch, in pixels."""

@@ -35,7 +35,7 @@ from polarguide.experiments.writing import write_tables
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.recipes.registry import ABLATIONS, ablations_of
-from polarguide.results.evaluation.sources import code_digest, commit
+from polarguide.results.evaluation.record import code_digest, commit
 from polarguide.results.evaluation.table import COLUMNS, PART_METRICS
 from polarguide.training.recipe import Method
 from polarguide.training.settings import TrainSettings

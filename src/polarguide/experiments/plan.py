@@ -22,8 +22,7 @@ from polarguide.core.options import Exposures, SceneOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.experiments.options import CompareOptions
 from polarguide.recipes.registry import ablations_of
-from polarguide.results.evaluation.record import read_metrics
-from polarguide.results.evaluation.sources import code_digest, model_digest
+from polarguide.results.evaluation.record import code_digest, model_digest, read_metrics
 from polarguide.results.evaluation.target import SceneFacts
 from polarguide.runs.families import family_of
 from polarguide.runs.folder import CONFIGURATION, RunConfiguration, compared_steps, trained_steps

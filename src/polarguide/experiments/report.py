@@ -23,9 +23,8 @@ from polarguide.results.evaluation.table import COLUMNS
 from polarguide.runs.health import Health
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.visualization import figures
-from polarguide.visualization.embedded import LAYERS, EmbeddedView, Tile, chosen_views, embed
 from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture
-from polarguide.visualization.pages import page, page_part
+from polarguide.visualization.pages import LAYERS, EmbeddedView, Tile, chosen_views, embed, page, page_part
 
 REPORT = "report.html"
 ERROR_SHEET = "errors.png"

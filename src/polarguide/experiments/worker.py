@@ -21,7 +21,7 @@ from polarguide.experiments.collection import RUN, Processing
 from polarguide.experiments.tasks import Message, Scoring, Task, files_digest
 from polarguide.raster import use_threads
 from polarguide.results.evaluation.evaluate import evaluate
-from polarguide.results.evaluation.sources import code_digest
+from polarguide.results.evaluation.record import code_digest
 from polarguide.runs.folder import CONFIGURATION, writing_to
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import train

@@ -9,8 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from polarguide.core.files import write_text
-from polarguide.core.spreadsheet import plain
-from polarguide.core.text import printable
+from polarguide.core.text import plain, printable
 from polarguide.experiments.results import Results
 from polarguide.experiments.tables import MINUS, Section, sections
 from polarguide.visualization.pages import templates

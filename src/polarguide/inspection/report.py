@@ -20,10 +20,9 @@ from polarguide.inspection.inspect import Inspection
 from polarguide.inspection.settings import plain
 from polarguide.inspection.shots import ShotFindings
 from polarguide.visualization import figures
-from polarguide.visualization.embedded import data_uri
 from polarguide.visualization.figures import Picture
 from polarguide.visualization.layers import AOLP_FULL_DOLP, DOLP_HIGH
-from polarguide.visualization.pages import page
+from polarguide.visualization.pages import data_uri, page
 
 SIDE = 240
 """Longest side of the pictures in pixels."""

@@ -18,10 +18,14 @@ from polarguide.recipes.ablations import (
     ABLATIONS_POLARGUIDE,
     ABLATIONS_STOKES,
 )
-from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
-from polarguide.recipes.gnerp import ABLATIONS_GNERP, RECIPE_GNERP
+from polarguide.recipes.baselines import (
+    ABLATIONS_GNERP,
+    RECIPE_3DGS,
+    RECIPE_3DGS_DR,
+    RECIPE_GNERP,
+    RECIPE_REF_GS,
+)
 from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_PAPER, RECIPE_POLARGUIDE_STOKES
-from polarguide.recipes.ref_gs import RECIPE_REF_GS
 from polarguide.training.recipe import Method
 
 GROUP = "polarguide.recipes"

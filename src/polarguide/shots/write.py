@@ -36,8 +36,7 @@ from polarguide.shots.pictures import (
 from polarguide.shots.read import UNREADABLE, SurfaceMaps, camera_of, fault_of, read_shot, surface_maps
 from polarguide.shots.sets import ExposureSet
 from polarguide.visualization import figures
-from polarguide.visualization.embedded import data_uri
-from polarguide.visualization.pages import page, page_part, script_json
+from polarguide.visualization.pages import data_uri, page, page_part, script_json
 
 FORMATS = ("png", "exr", "npy", "page")
 UNITS_FILE = "maps.json"
