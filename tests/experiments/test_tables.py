@@ -25,12 +25,15 @@ from polarguide.experiments.tables import (
     Section,
     against_section,
     control_section,
+    csv_text,
+    latex_text,
     notes,
     part_section,
+    readable,
     scores_section,
     sections,
+    write_tables,
 )
-from polarguide.experiments.writing import csv_text, latex_text, readable, write_tables
 from polarguide.results.evaluation.table import COLUMNS
 
 FREE, LOOSE = "r:unpolarized", "r:unpolarized-without-consistency"

@@ -28,10 +28,10 @@ from polarguide.runs.model import GaussianModel, Model, write_run_ply
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers, predicts_filters
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.distributed import Ranks
+from polarguide.training.feed import ViewStore
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.trainer import warn_of_unused_materials
-from polarguide.training.view_store import ViewStore
 
 ANY = 90.0
 """Degrees: as far as two angles can be apart."""

@@ -40,10 +40,10 @@ from polarguide.runs.forecast import MemoryPlan, Stopwatch, TimeLeft, pixels_of
 from polarguide.runs.health import examine
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.training.distributed import Ranks, backend_of, process_group
+from polarguide.training.feed import ViewStore
 from polarguide.training.losses import refuse_diverged
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings, StepReport, TrainSettings
-from polarguide.training.view_store import ViewStore
 
 LOG_EVERY = 10
 Ends = Callable[[], bool]

@@ -16,11 +16,11 @@ from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import ShadingModel
 from polarguide.training.angles.polarizers import Polarizers, search_steps
 from polarguide.training.distributed import ALONE, Ranks
+from polarguide.training.feed import ViewStore
 from polarguide.training.recipe import Recipe, Schedule
 from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import Trainer
-from polarguide.training.view_store import ViewStore
 
 
 class AngleTrainer:
