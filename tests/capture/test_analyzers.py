@@ -222,7 +222,7 @@ def test_other_sizes_and_sensors_are_refused(saved: Path) -> None:
     )
     Fault(found="one of 32x24 pixels").raised_by(calibration.apply, np.zeros((4, 13, 16), np.float32))
     Fault(expected="column 20").raised_by(calibration.apply, np.zeros((24, 16), np.float32), offset=(20, 0))
-    Fault(expected="a calibration of the sensor IMX250MYR", found="one of IMX250MZR").raised_by(
+    Fault(expected="a calibration of the sensor IMX250MYR", found="the calibration of IMX250MZR").raised_by(
         calibration.require_sensor, "IMX250MYR", saved
     )
     with pytest.raises(ValueError, match="expected"):

@@ -26,7 +26,7 @@ from polarguide.capture.filter.camera_files import (
     apply_orientation,
     orientation_calibration,
     read_camera_raw,
-    read_taken,
+    read_exposure_data,
     taken,
 )
 from polarguide.capture.filter.ring_scale import BAND, place, ring_scale
@@ -293,7 +293,7 @@ def test_what_files_say_about_exposure(tmp_path: Path) -> None:
     for shot in (FilterShot(0, 1.0), FilterShot(0, -0.5, 6)):
         path = tmp_path / f"{shot.orientation}.jpg"
         path.write_bytes(filter_jpeg(stokes, rays, shot, 0, np.random.default_rng(0), Sensor()))
-        assert read_taken(path).light == pytest.approx(2**shot.stops / 60 * 100 / 64, rel=1e-4)
+        assert read_exposure_data(path).light == pytest.approx(2**shot.stops / 60 * 100 / 64, rel=1e-4)
         assert cv2.imread(str(path)).shape[:2] == (16, 24)  # OpenCV turns it upright
     plain = FilterShot(0, 0.3, noted=False)
     assert taken(filter_jpeg(stokes, rays, plain, 0, np.random.default_rng(0), Sensor())).light is None

@@ -102,7 +102,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     root = scene(tmp_path / "gray", PLAIN)
     other = true_calibration(made_sensor("IMX250MYR", SIZE))
     write_analyzers(tmp_path / "color.safetensors", other)
-    Fault(expected="a calibration of the sensor IMX250MZR", found="one of IMX250MYR").raised_by(
+    Fault(expected="a calibration of the sensor IMX250MZR", found="the calibration of IMX250MYR").raised_by(
         corrected, read_capture(root), tmp_path / "color.safetensors"
     )
     small = true_calibration(made_sensor("IMX250MZR", (32, 48)))

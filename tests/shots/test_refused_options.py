@@ -30,7 +30,7 @@ MOSAIC_ONLY: list[dict[str, Any]] = [
 def test_options_of_mosaics_are_refused_for_four_shots(tmp_path: Path, given: dict[str, Any]) -> None:
     paths = write_four(tmp_path, CUP)
     option = "--" + next(iter(given)).replace("_", "-")
-    fault = Fault(option, "raw mosaics, which it is for", "cup, a shot through a filter")
+    fault = Fault(option, "raw mosaics: the option is for these", "cup, a shot through a filter")
     fault.raised_by(find_shots, paths, ShotOptions(**given))
     fault.raised_by(read_shot, find_shots(paths)[0], ShotOptions(**given))
 

@@ -106,8 +106,8 @@ def find_layout(root: Path) -> Layout:
     without = sorted(names - sides["masks"].keys())
     if sides["masks"] and without:
         warnings.append(f"masks/ has no file for {len(without)} of {len(names)} views ({listed(without)}).")
-    given = sides["masks"], sides["invalid"], sides["gt"]
-    return Layout(root, pictures, *given, tuple(warnings), others, table, sides["materials"])
+    folders = sides["masks"], sides["invalid"], sides["gt"]
+    return Layout(root, pictures, *folders, tuple(warnings), others, table, sides["materials"])
 
 
 def refuse_scene(out: Path) -> None:
@@ -199,8 +199,8 @@ def _read_flat(
             )
     pictures: dict[str, dict[int, Path]] = {}
     strangers = []
-    told = {item.file for item in lines}
-    for stem, path in index_files(folder, SUFFIXES, told).items():
+    listed_files = {item.file for item in lines}
+    for stem, path in index_files(folder, SUFFIXES, listed_files).items():
         match = _PICTURE_STEM.fullmatch(stem)
         if match is None:
             strangers.append(path.name)
@@ -324,7 +324,7 @@ def ambiguous(folder: Path, expected: str, first: Path, second: Path) -> Polargu
 
 
 def describe_contents(root: Path) -> str:
-    """What a folder holds, for messages."""
+    """A description of a folder's contents, for messages."""
     names = sorted(path.name for path in root.iterdir())
     return f"a folder with {listed(names)}" if names else "an empty folder"
 
@@ -334,9 +334,9 @@ SHARE = 0.8
 """Of the free memory, that the pictures may take where nothing else was asked for."""
 # Bytes for each pixel of a view: peak, black, invalid, saturated, mask; with codes of four pictures in three channels.
 MASKS = 2 + 4
-KEPT = 4 * 3 * 2 + MASKS
+VIEW_BYTES = 4 * 3 * 2 + MASKS
 # While one view is read: what is decoded of it, its copy in linear codes, and channels apart.
-READ = 4 * 3 * 2 * 3
+READING_BYTES = 4 * 3 * 2 * 3
 
 
 def check_memory(
@@ -353,8 +353,8 @@ def check_memory(
         PolarguideError: the least that suffices is more.
     """
     pixels = stated_pixels(layout, names)
-    kept = sum((KEPT if hold else MASKS) * count // factor**2 for count in pixels)
-    needed = kept + sum(READ * count for count in sorted(pixels, reverse=True)[:at_once])
+    kept = sum((VIEW_BYTES if hold else MASKS) * count // factor**2 for count in pixels)
+    needed = kept + sum(READING_BYTES * count for count in sorted(pixels, reverse=True)[:at_once])
     remedy = "Give --downscale 2 or more, fewer views, or more --memory."
     require_memory(layout.root, needed, f"{len(names)} views", limit=limit, remedy=remedy)
 

@@ -212,7 +212,7 @@ def _require_place() -> None:
     except FileNotFoundError:
         raise PolarguideError(
             "the current folder",
-            expected="one that exists",
+            expected="an existing folder",
             found="that it was removed or renamed",
             remedy="Change to another folder (cd), and repeat the command.",
         ) from None

@@ -105,7 +105,7 @@ def _fix(inspected: Any, out: Path, reporter: ConsoleReporter) -> None:
         raise PolarguideError(
             "--fix",
             expected="a scene with four pictures of each view",
-            found="one with other pictures, whose angles are given in a table",
+            found="a scene whose angles stand in a table",
             remedy="Correct SCENE/angles.csv as the report says, or repeat prepare.",
         )
     change = fixing.correction(inspected.capture, inspected.angles)

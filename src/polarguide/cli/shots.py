@@ -258,7 +258,9 @@ def scale(*, diameter: float, out: Path = Path("filter-scale.svg")) -> None:
     check_finite("diameter", diameter, 20.0, 160.0)
     data = ring_scale(diameter).encode()
     if out.exists() and (out.is_dir() or read_file(out) != data):
-        raise PolarguideError(out, expected="a new file", found="another one", remedy="Give another --out.")
+        raise PolarguideError(
+            out, expected="a new file", found="a file with other contents", remedy="Give another --out."
+        )
     make_folder(out.parent)
     write_whole(out, data)
     console.print(f"scale: {out} (print at 100 %, and measure the 50 mm line)", markup=False)

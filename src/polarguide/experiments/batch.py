@@ -73,7 +73,7 @@ class Row:
             return {}
 
     def remarks(self) -> tuple[str, ...]:
-        """What the inspection found, and what the training says of itself."""
+        """Findings of the inspection, and warnings of the training."""
         if self.record is None:
             return ()
         health = Health.load(self.folder / RUN) if "train" in self.record.done else None
@@ -250,7 +250,7 @@ def _task(capture: Capture, root: Path, options: BatchOptions) -> Processing:
 
 
 def _job(task: Processing) -> Job:
-    """What takes a capture to its end; it counts as one piece of work: its steps take very different times."""
+    """The job that processes a capture. It counts as one piece of work, since its steps take very different times."""
     folder = Path(task.folder)
 
     def progress() -> tuple[int, str]:

@@ -76,7 +76,7 @@ Task = Training | Scoring | Processing
 
 
 class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a child reads, on one line: its task, and the code of who gives it.
+    """The line that a child process reads: its task, and a digest of the code of the process that sends it.
 
     Attributes:
         files: its ``files_digest``. code: its ``code_digest``, which takes seconds, and counts where ``files`` differs.
@@ -88,7 +88,7 @@ class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """What became of a job on a worker.
+    """The outcome of a job on a worker.
 
     Attributes:
         state: "done"; "failed", with the last line of its ``stderr.txt``; "lost", when it was ended from outside, so

@@ -198,7 +198,7 @@ def _checked_recipes(recipes: Sequence[str | Method]) -> tuple[Method, ...]:
             raise PolarguideError(
                 "recipes",
                 expected=f"the registered recipe {own.name}",
-                found="one of this name with other values",
+                found="a recipe of this name with other values",
                 remedy="Give it a name of its own, and register it under the entry points polarguide.recipes.",
             )
     if not registered:

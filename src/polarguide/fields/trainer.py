@@ -202,7 +202,7 @@ class FieldTrainer:
 
     @property
     def done(self) -> int:
-        """Those of them that are done."""
+        """Number of finished steps."""
         return self.state.step
 
     def step(self) -> StepReport:

@@ -185,21 +185,21 @@ def pose_check(capture: Capture) -> Check:
     typical = float(np.median(list(errors.values())))
     bad = tuple(name for name, e in errors.items() if e > max(VIEW_PX, STANDS_OUT * typical))
     figures = {"median_px": typical, "views": errors, "without_pose": len(missing)}
-    said = f"Matches lie {typical:.2f} px from their epipolar lines (median view of {len(errors)})."
+    finding = f"Matches lie {typical:.2f} px from their epipolar lines (median view of {len(errors)})."
     verdict: Verdict = "ok"
     remedies = []
     if bad:
         verdict = "warning"
-        said += f" Far worse: {listed([f'{name} ({errors[name]:.1f} px)' for name in bad])}."
+        finding += f" Far worse: {listed([f'{name} ({errors[name]:.1f} px)' for name in bad])}."
         remedies.append("Leave these views out, or register them again.")
     if missing:
         verdict = "warning"
-        said += f" Without a pose: {len(missing)} views ({listed(list(missing))})."
+        finding += f" Without a pose: {len(missing)} views ({listed(list(missing))})."
         remedies.append("Remove the pictures of views without a pose, which train refuses, or register them.")
     if typical > TYPICAL_PX:
         verdict = "wrong" if typical > 2 * TYPICAL_PX else "warning"
         remedies.append("Refine the model (bundle adjustment), and check that it belongs to these pictures.")
-    return Check(key, title, verdict, said, " ".join(remedies), (*bad, *missing), figures)
+    return Check(key, title, verdict, finding, " ".join(remedies), (*bad, *missing), figures)
 
 
 def coverage_check(capture: Capture) -> Check:
@@ -215,17 +215,17 @@ def coverage_check(capture: Capture) -> Check:
     spread = float(np.degrees(np.arccos(np.clip(seen @ unit_array(seen.mean(axis=0)), -1, 1))).max())
     figures = {"views": len(seen), "median_step_deg": float(np.median(nearest)),
                "largest_step_deg": float(nearest.max()), "half_angle_deg": spread}  # fmt: skip
-    said = (
+    finding = (
         f"{len(seen)} views, {np.median(nearest):.0f}° from the nearest view (median; at most {nearest.max():.0f}°), "
         f"within {spread:.0f}° of their mean direction."
     )
     lonely = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > GAP_DEG)
     if lonely or len(seen) < FEW_VIEWS:
         return Check(
-            key, title, "warning", said,
+            key, title, "warning", finding,
             "Reconstruction is unreliable across gaps: add views at most 15 degrees apart.", lonely, figures,
         )  # fmt: skip
-    return Check(key, title, "ok", said, figures=figures)
+    return Check(key, title, "ok", finding, figures=figures)
 
 
 SURE = 0.98
@@ -296,7 +296,7 @@ def inspect_scene(
         raise PolarguideError(
             "--calibration",
             expected="a scene with four pictures of each view",
-            found="one with other pictures",
+            found="a scene with pictures at other angles",
             remedy="Leave --calibration out.",
         )
     if settings.calibration is not None:

@@ -1,4 +1,4 @@
-"""What ``prepare`` may be asked for. Nothing here imports torch, OpenCV or pycolmap."""
+"""Settings of ``prepare``. Nothing here imports torch, OpenCV or pycolmap."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _OPTIONS = {
 
 @dataclass(frozen=True)
 class PrepareSettings(MosaicOptions):
-    """What a scene folder is made from, and how.
+    """Source of a scene folder, and how it is prepared.
 
     Attributes:
         format: What the source is; auto looks for datasets, the four shots of a filter, and singles (photographs

@@ -151,7 +151,7 @@ class Family(ABC):
             raise PolarguideError(
                 out / CHECKPOINT,
                 expected=f"the state of a training of {settings.steps} steps",
-                found=f"one after step {state.step}",
+                found=f"the state after step {state.step}",
                 remedy="Train again into a new folder.",
             )
 
@@ -209,7 +209,7 @@ class GaussianFamily(Family):
             raise PolarguideError(
                 out / CHECKPOINT,
                 expected=f"the state of a training with {settings.views_per_step} views a step",
-                found=f"one with {views}",
+                found=f"a training with {views}",
                 remedy="Train again into a new folder.",
             )
 

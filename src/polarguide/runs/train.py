@@ -381,7 +381,7 @@ def _check_scene(scene: Scene) -> None:
         raise PolarguideError(
             scene.root,
             expected="training views from at least two places",
-            found=f"{len(centers)} from one",
+            found=f"{len(centers)} from one place",
             remedy="Add views, or correct the poses.",
         )
     cameras = [view.camera for view in scene.train_views]

@@ -44,7 +44,7 @@ UNITS_FILE = "maps.json"
 
 @dataclass(frozen=True)
 class WrittenShots:
-    """What came of several shots.
+    """The outcome of several shots.
 
     Attributes:
         folders: of the shots that were written, by name.
@@ -349,7 +349,7 @@ def _facts(maps: ShotMaps, surface: SurfaceMaps) -> dict[str, str]:
 
 
 def _facts_of_set(maps: ShotMaps) -> dict[str, str]:
-    """What the pictures of a set say of their angles, and how well they agree."""
+    """Angles of a set as its pictures imply them, and their residuals."""
     rows = [
         f"{fit.label}: {fit.angle:g}°"
         + (f", looks like {fit.looks_like:.1f}°" if fit.looks_like is not None else "")

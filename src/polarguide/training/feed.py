@@ -52,7 +52,7 @@ class Packed(NamedTuple):
 
     @property
     def bytes(self) -> int:
-        """That it takes."""
+        """Size in bytes."""
         return self.codes.numel() * self.codes.element_size()
 
 

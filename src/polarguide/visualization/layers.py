@@ -89,7 +89,7 @@ def depth_picture(depth: Tensor, depths: Depths) -> Picture:
 
 
 def layer_scale(name: str, depths: Depths | None = None) -> Picture | None:
-    """What the colors of a layer mean, 256 pixels wide; None of radiance, and of depth without a range."""
+    """The color scale of a layer, 256 pixels wide; None for radiance, and for depth without a range."""
     name = name.partition(",")[0]
     if name in _SHARES:
         return figures.scale_bar(0.0, 1.0, "viridis")
@@ -133,7 +133,7 @@ def true_depths(view: View) -> Tensor | None:
 def reference_pictures(
     view: View, color: Tensor | None = None, depths: Depths | None = None
 ) -> dict[str, Picture]:
-    """What a view knows of layers, by ``NAME, true`` and ``NAME, measured``: the photograph as ``final``, ground truth,
+    """Reference pictures, ``NAME, true`` and ``NAME, measured``: the photograph as ``final``, ground truth,
     and the polarization that its pictures measure, as 8-bit pictures.
 
     Args:

@@ -38,7 +38,7 @@ def templates(package: str) -> Environment:
 
 
 def page_part(package: str, name: str) -> str:
-    """A file of the page that a package brings in its folder ``page``, as it is."""
+    """The text of a file in a package's folder ``page``, unchanged."""
     loader = templates(package).loader
     assert loader is not None
     return loader.get_source(templates(package), name)[0]

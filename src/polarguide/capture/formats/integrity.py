@@ -50,7 +50,7 @@ def damaged(path: Path, expected: str, found: str) -> PolarguideError:
 
 
 def find_damage(data: bytes) -> str | None:
-    """What is wrong with a picture file as far as its structure tells, or None.
+    """The damage that the structure of a picture file shows, in words, or None.
 
     Args:
         data: the whole file.

@@ -213,10 +213,10 @@ def linear_codes(pixels: NDArray[Any], transfer: str) -> NDArray[np.uint16]:
 @functools.cache
 def _table(full: int, transfer: str) -> NDArray[np.uint16]:
     """Linear code of every stored value in 0..full."""
-    shown = np.arange(full + 1) / full
+    levels = np.arange(full + 1) / full
     if transfer == "srgb":
-        shown = srgb_decode_array(shown)
-    return np.rint(shown * FULL_CODE).astype(np.uint16)
+        levels = srgb_decode_array(levels)
+    return np.rint(levels * FULL_CODE).astype(np.uint16)
 
 
 def rescaled(pixels: NDArray[Any], full: int) -> NDArray[Any]:

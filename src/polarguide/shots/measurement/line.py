@@ -43,7 +43,7 @@ from polarguide.visualization.figures import write_png
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredShot:
     """A shot that was measured.
 
     Attributes:
@@ -101,8 +101,8 @@ class Measurer:
         """
         return read_shot(shot, self._reading, part=None if whole else self._part)
 
-    def measured(self, shot: ExposureSet, maps: ShotMaps) -> Measured:
-        """What its maps say.
+    def measured(self, shot: ExposureSet, maps: ShotMaps) -> MeasuredShot:
+        """The figures of its maps.
 
         Raises:
             PolarguideError: it does not fit the regions or the reference.
@@ -115,7 +115,7 @@ class Measurer:
             "beyond" if "beyond" in statuses else "within" if "within" in statuses else "measured"
         )
         beyond = [(region, which) for region, _, which in found] if status == "beyond" else []
-        return Measured(maps, differences, tuple(figures for _, figures, _ in found), status, beyond)
+        return MeasuredShot(maps, differences, tuple(figures for _, figures, _ in found), status, beyond)
 
     def entry(self, shot: ExposureSet) -> Entry:
         """The line of a shot, which says why where it cannot be measured."""
@@ -147,7 +147,7 @@ class Measurer:
         return region, {**head, **figures}, beyond
 
     def settings(self) -> dict[str, Any]:
-        """What the figures depend on, as JSON."""
+        """The settings that the figures depend on, as JSON."""
         reading = {f.name: getattr(self._reading, f.name) for f in dataclasses.fields(self._reading)}
         named = [value for value in reading.values() if isinstance(value, Path)]
         made: dict[str, Any] = msgspec.to_builtins(
@@ -191,7 +191,7 @@ def ignore(entry: Entry) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a command has done.
+    """The outcome of a command.
 
     Attributes:
         folder: of the table; None where nothing was written.
@@ -261,8 +261,8 @@ class Line:
         if stamps(shot.paths) != files:
             raise ChangedWhileRead(
                 shot.where,
-                expected="a file that stays as it is",
-                found="that it was written to meanwhile",
+                expected="a file that does not change while it is read",
+                found="a file that was written to",
                 remedy="Repeat the command when it is complete; --watch waits for that.",
             )
         measured = self.measurer.measured(shot, maps)
@@ -276,7 +276,7 @@ class Line:
         self.table.add(entry)
         return entry
 
-    def _draw(self, shot: ExposureSet, measured: Measured) -> str:
+    def _draw(self, shot: ExposureSet, measured: MeasuredShot) -> str:
         """Write pictures before the line of the table: where that is, they are. Their name, "" if there are none."""
         maps, differences = measured.maps, measured.differences
         if not measured.beyond and differences is None:
@@ -388,9 +388,9 @@ def _shots_of(
         remedy = "Put it into a list: measure([array])."
         raise PolarguideError("paths", expected="several shots", found="one array", remedy=remedy)
     if not isinstance(paths, Sequence):
-        return (_given(shot, number, reading, angles) for number, shot in enumerate(paths, 1)), None
+        return (_array_set(shot, number, reading, angles) for number, shot in enumerate(paths, 1)), None
     if paths and all(isinstance(shot, ExposureSet) or is_array(shot) for shot in paths):
-        return [_given(shot, number, reading, angles) for number, shot in enumerate(paths, 1)], len(paths)
+        return [_array_set(shot, number, reading, angles) for number, shot in enumerate(paths, 1)], len(paths)
     files = [path for path in paths if isinstance(path, str | os.PathLike)]
     if len(files) < len(paths):
         remedy = "Measure files and arrays by calls of their own."
@@ -401,7 +401,7 @@ def _shots_of(
     return found, len(found)
 
 
-def _given(shot: Source, number: int, reading: ShotOptions, angles: Sequence[Angle]) -> ExposureSet:
+def _array_set(shot: Source, number: int, reading: ShotOptions, angles: Sequence[Angle]) -> ExposureSet:
     if isinstance(shot, ExposureSet):
         return shot
     name = f"{NAME}-{number}"

@@ -52,7 +52,7 @@ class FileStamp(msgspec.Struct, frozen=True):
 
 
 def stamps(paths: Sequence[Path]) -> tuple[FileStamp, ...]:
-    """What files are now.
+    """The present state of files.
 
     Raises:
         OSError: one is not there.

@@ -196,7 +196,7 @@ class Polarizers:
 
     @property
     def searched(self) -> int:
-        """Those of them that belong to searches that have ended."""
+        """Number of steps of finished searches."""
         return sum(times[-1] for times in self._rounds[: self.ended]) if self._unknown else 0
 
     def believed(self, view: View) -> View:

@@ -92,12 +92,12 @@ class AngleTrainer:
 
     @property
     def done(self) -> int:
-        """Those of them that are done."""
+        """Number of finished steps."""
         return (self.polarizers.searched if self.begins_again else 0) + self.state.step
 
     @property
     def state(self) -> TrainingState:
-        """That of the present search, or of the training."""
+        """The state of the current search, or of the training."""
         return self._trainer.state
 
     @property
