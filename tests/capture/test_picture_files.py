@@ -247,7 +247,7 @@ PICTURES: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
     "a cut TIFF": (cut(-3, ".tif"), Fault("v002_090.tif", found="file cut short")),
     "another kind": (
         lambda capture: capture.picture("v001", 0).write_bytes(b"GIF89a and so on"),
-        Fault("v001_000.png", found="a file that is none of these"),
+        Fault("v001_000.png", found="a file of another kind"),
     ),
     "a folder": (folder_of_a_picture, Fault("v001_000.png", "a readable file", "Is a directory")),
     "another size": (

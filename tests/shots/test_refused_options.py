@@ -61,7 +61,7 @@ def test_options_of_filters_are_refused_for_mosaics(tmp_path: Path, given: dict[
 
 
 def test_read_noise_needs_a_full_well() -> None:
-    Fault("--read-noise", expected="a full well beside it").raised_by(ShotOptions(read_noise=5.0).checked)
+    Fault("--read-noise", expected="--full-well with it").raised_by(ShotOptions(read_noise=5.0).checked)
     ShotOptions(read_noise=5.0, full_well=5000.0).checked()
 
 

@@ -280,7 +280,7 @@ def _alike_but_for_the_angle(folders: Sequence[Path]) -> dict[int, Path]:
 
 
 def angle_of_folder(path: Path) -> int | None:
-    """The polarizer angle that a folder is named after; None if it is none."""
+    """The polarizer angle that a folder is named after; None for other names."""
     match = _ANGLE_FOLDER.fullmatch(path.name)
     return int(match["angle"]) if match is not None and int(match["angle"]) in ANGLES else None
 

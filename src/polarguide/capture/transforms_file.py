@@ -187,7 +187,7 @@ def _lens_of(where: str, frame: _Lens, record: _Lens) -> dict[str, Any]:
     Focal lengths and coefficients are statements as a whole: a frame that makes one takes nothing of the file's.
 
     Raises:
-        PolarguideError: the matrix is none of a camera, or stands beside other numbers.
+        PolarguideError: the matrix is no camera matrix, or stands beside other numbers.
     """
     lens = {name: getattr(frame, name) for name in _Lens.__struct_fields__}
     whole = (_FOCAL, (*_COEFFICIENTS, "distortion_params"))
@@ -312,7 +312,7 @@ def _focal_lengths(
     """Focal lengths in x and y: in pixels, by an angle of view in radians, or in degrees.
 
     Raises:
-        PolarguideError: there is none that is positive, or two statements differ.
+        PolarguideError: no value is positive, or two values differ.
     """
     found: list[float | None] = []
     for axis, side in zip("xy", size, strict=True):
@@ -356,7 +356,7 @@ def camera_to_world(
         to_world: [4, 4], with axes right, down, forward; a scale is taken out.
 
     Raises:
-        PolarguideError: the pose is none.
+        PolarguideError: the matrix is not a pose.
     """
     scale = abs(np.linalg.det(to_world[:3, :3])) ** (1 / 3)
     if not 1e-6 < scale < 1e6:

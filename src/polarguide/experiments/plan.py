@@ -221,7 +221,7 @@ class PlannedRun:
 
 
 def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[SceneEntry]:
-    """Read every scene once: its digest and its test views; says what its scores will not mean.
+    """Read every scene once: its digest and its test views; warns where scores are not comparable.
 
     Raises:
         PolarguideError: a scene that cannot be read, has no test views, or is called like another.

@@ -127,7 +127,7 @@ def _write(capture: Capture, change: Calibration, folder: Path, reporter: Report
 
 
 def _require_inside(root: Path, source: Path) -> None:
-    """Refuse links that leave the scene: what they point to is none of its files, and would be copied for others.
+    """Refuse links that leave the scene: their targets are not files of the scene, and would be copied.
 
     Raises:
         PolarguideError: there is one.
@@ -245,7 +245,7 @@ def corrected(capture: Capture, path: Path) -> Capture:
         raise PolarguideError(
             capture.root,
             expected="a scene that was prepared without --calibration",
-            found=f"a scene with the calibration of {about.analyzers.sensor} (checksum {about.analyzers.sha256[:16]}...)",
+            found=f"the calibration of {about.analyzers.sensor} (checksum {about.analyzers.sha256[:16]}...)",
             remedy="Leave --calibration out.",
         )
     if isinstance(about.sensor, _Simulated) or (about.prepare is not None and about.sensor is None):

@@ -75,7 +75,7 @@ class MosaicFiles:
         self.pattern = pattern.shifted(*self.crop)
 
     def read(self, path: Path) -> NDArray[Any]:
-        """The values of a whole mosaic as the sensor lies, [H, W]: as stored, but for mirroring by the camera.
+        """The stored values of a whole mosaic, [H, W], in the sensor's orientation: the camera's mirroring is undone.
 
         Raises:
             PolarguideError: the file cannot be read, is too small, or does not fit into memory when it is developed.

@@ -231,7 +231,7 @@ def white_gains(text: str) -> tuple[float, float, float] | None:
     """Gains of R, G and B from a ``--white-balance``; None for "gray", which needs the pictures.
 
     Raises:
-        PolarguideError: it is none of the forms.
+        PolarguideError: it has another form.
     """
     if text in ("none", "gray", "grey"):
         return (1.0, 1.0, 1.0) if text == "none" else None

@@ -214,7 +214,7 @@ def load_checkpoint(run: Path, recipe: Method, device: torch.device | str = "cpu
 
 
 def trained_steps(run: Path) -> int | None:
-    """After how many steps a run's checkpoint was written; None where there is none that says so."""
+    """Number of steps of a run's checkpoint; None if no checkpoint states it."""
     try:
         with safe_open(run / CHECKPOINT, framework="pt") as file:
             record = (file.metadata() or {}).get("polarguide", "")

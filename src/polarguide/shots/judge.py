@@ -69,7 +69,7 @@ def judge(samples: SetSamples, gray: Floats) -> Judgment:
     """Compare the pictures of a set with one another, and choose those that are fitted.
 
     Each picture is fitted with Malus's law at an unknown angle and gain to the Stokes vectors of the others, over all
-    pixels at once. The picture that is off most is left out, as long as enough others agree without it.
+    pixels at once. The picture with the largest deviation is left out, as long as enough others agree without it.
 
     Args:
         samples: the set. gray: [K, N], its luminance at some pixels that are good in every picture.

@@ -228,8 +228,8 @@ def noise_line(x: NDArray[np.float64], y: NDArray[np.float64], least: float) -> 
 def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> NDArray[np.float32]:
     """Variance of each developed intensity, as a multiple of a sample's: [4, p, p] over a period p of the pattern.
 
-    Interpolated values are means of samples, which have less noise; each is read from what an impulse at every position
-    of the pattern becomes, by the demosaicing itself. Guided interpolation, which is not linear, is taken to be
+    Interpolated values are means of samples and have less noise. The weights of the samples are the responses of the
+    demosaicing to an impulse at each position of the pattern. Guided interpolation, which is not linear, is taken to be
     bilinear, and luminance as the mean of the colors. ``x`` and ``y`` are where the pattern of the sensor begins.
     """
     return _variances(sensor, x, y, mode)[0]

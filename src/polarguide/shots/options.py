@@ -103,7 +103,7 @@ class ShotOptions(MosaicOptions):
         if self.read_noise and self.full_well is None:
             raise PolarguideError(
                 "--read-noise",
-                expected="a full well beside it, without which noise is estimated from each shot",
+                expected="--full-well with it: without, noise is estimated from each shot",
                 found=f"{self.read_noise:g} without --full-well",
                 remedy="Give --full-well, or leave it out.",
             )

@@ -184,7 +184,7 @@ def _order(picture: SetPicture) -> tuple[bool, float, str, int]:
 
 
 def by_name(files: Sequence[Path]) -> tuple[list[ExposureSet], list[Path]]:
-    """Sets by the names of files, and the files that are none of a set: of four angles at most, or without an angle.
+    """Sets by the names of files, and the files that belong to no set: of four angles at most, or without an angle.
 
     Files named like angles alone are one set, called like their folder, where there is nothing else among the files.
     """

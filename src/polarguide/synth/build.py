@@ -345,7 +345,7 @@ def _radius(thing: Thing) -> float:
     """Of a ball.
 
     Raises:
-        PolarguideError: it is none, or the ball has other fields.
+        PolarguideError: the file is no such shape, or the ball has other fields.
     """
     only_fields(thing.shape, ("type", "radius"), f"{thing.name} shape")
     radius = thing.shape.get("radius", 1.0)

@@ -74,7 +74,7 @@ def find_damage(data: bytes) -> str | None:
         return plain_damage(data)
     if is_heif(data):
         return heif_damage(data)
-    return "a file that is none of these"
+    return "a file of another kind"
 
 
 def declared_size(data: bytes) -> tuple[int, int] | None:

@@ -158,7 +158,7 @@ class AnalyzerCalibration:
         if not inside:
             raise PolarguideError(
                 where,
-                expected=f"a calibration of {_region(offset, size)}, or more",
+                expected=f"a calibration that covers {_region(offset, size)}",
                 found=f"the calibration of {_region(self.offset, self.size)}",
                 remedy="Calibrate with the region of these files; --offset-x and --offset-y say where it starts.",
             )

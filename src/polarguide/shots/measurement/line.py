@@ -49,7 +49,7 @@ class MeasuredShot:
     Attributes:
         maps: of it. differences: to the reference, None without one.
         regions: by ``Field.key``, from ``region`` on. status: the worst of them.
-        beyond: all regions with the limits that they are beyond; empty where none is.
+        beyond: all regions with the limits that they are beyond; empty if all regions are within.
     """
 
     maps: ShotMaps
@@ -93,8 +93,7 @@ class Measurer:
         return () if self.reference is None else self.reference.shot.paths
 
     def read(self, shot: ExposureSet, *, whole: bool = False) -> ShotMaps:
-        """The maps of a shot: of all of it where ``whole``, or where it is compared with a reference; else at least of
-        the regions.
+        """The maps of a shot: of the whole picture if ``whole`` or with a reference, else at least of the regions.
 
         Raises:
             PolarguideError, OSError, MemoryError: it cannot be read.
@@ -330,7 +329,7 @@ def measure_shots(
         0.213
 
     Raises:
-        PolarguideError: there is no shot, an option is wrong, an array is none of a shot, or the table cannot be
+        PolarguideError: there is no shot, an option is wrong, an array is no shot, or the table cannot be
             written. A shot that cannot be read raises nothing: its line says why.
     """
     shots, total = _shots_of(paths, out, reading, angles)

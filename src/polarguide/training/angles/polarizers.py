@@ -175,7 +175,7 @@ class Polarizers:
         self.beliefs = self._beliefs()
 
     def due(self, step: int) -> bool:
-        """Whether angles are to be fitted before a step; none is once all fits have been made."""
+        """Whether angles are to be fitted before a step; False once all fits are made."""
         return not self.settled and step in self._rounds[self.ended]
 
     @property
