@@ -334,9 +334,9 @@ SHARE = 0.8
 """Of the free memory, that the pictures may take where nothing else was asked for."""
 # Bytes for each pixel of a view: peak, black, invalid, saturated, mask; with codes of four pictures in three channels.
 MASKS = 2 + 4
-VIEW_BYTES = 4 * 3 * 2 + MASKS
+KEPT = 4 * 3 * 2 + MASKS
 # While one view is read: what is decoded of it, its copy in linear codes, and channels apart.
-READING_BYTES = 4 * 3 * 2 * 3
+READ = 4 * 3 * 2 * 3
 
 
 def check_memory(
@@ -353,8 +353,8 @@ def check_memory(
         PolarguideError: the least that suffices is more.
     """
     pixels = stated_pixels(layout, names)
-    kept = sum((VIEW_BYTES if hold else MASKS) * count // factor**2 for count in pixels)
-    needed = kept + sum(READING_BYTES * count for count in sorted(pixels, reverse=True)[:at_once])
+    kept = sum((KEPT if hold else MASKS) * count // factor**2 for count in pixels)
+    needed = kept + sum(READ * count for count in sorted(pixels, reverse=True)[:at_once])
     remedy = "Give --downscale 2 or more, fewer views, or more --memory."
     require_memory(layout.root, needed, f"{len(names)} views", limit=limit, remedy=remedy)
 

@@ -24,8 +24,8 @@ from polarguide.capture.filter.develop import (
 from polarguide.capture.filter.shots import Shots, read_shots, require_four_shots, stacked
 from polarguide.capture.formats.pictures import is_lossy
 from polarguide.capture.layout import (
-    READING_BYTES,
-    VIEW_BYTES,
+    KEPT,
+    READ,
     find_layout,
     require_memory_of_each,
     select_views,
@@ -390,7 +390,7 @@ def _read_view(shot: ExposureSet, options: ShotOptions) -> tuple[ViewData, int |
     select_views(layout, [shot.view])
     require_memory_of_each(
         shot.paths,
-        max(1, len(shot.paths) // 4) * (VIEW_BYTES + READING_BYTES) + _MAPS,
+        max(1, len(shot.paths) // 4) * (KEPT + READ) + _MAPS,
         "a view",
         remedy="Free memory, or prepare the scene in a smaller size.",
     )
