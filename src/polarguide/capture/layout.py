@@ -106,8 +106,8 @@ def find_layout(root: Path) -> Layout:
     without = sorted(names - sides["masks"].keys())
     if sides["masks"] and without:
         warnings.append(f"masks/ has no file for {len(without)} of {len(names)} views ({listed(without)}).")
-    folders = sides["masks"], sides["invalid"], sides["gt"]
-    return Layout(root, pictures, *folders, tuple(warnings), others, table, sides["materials"])
+    by_view = sides["masks"], sides["invalid"], sides["gt"]
+    return Layout(root, pictures, *by_view, tuple(warnings), others, table, sides["materials"])
 
 
 def refuse_scene(out: Path) -> None:

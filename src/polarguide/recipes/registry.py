@@ -322,7 +322,7 @@ def recipe_named(name: str) -> Method:
         "recipe",
         expected="one of " + ", ".join(names),
         found=name + broken,
-        remedy="Take one of these; a recipe of another version needs that version.",
+        remedy="Take one of these; a recipe of a package or of another version needs that one.",
     )
 
 
