@@ -249,7 +249,12 @@ def test_a_changed_recipe_is_warned_of_on_opening(copy: Path) -> None:
 
 def test_a_run_whose_version_recorded_fewer_constants_opens_in_silence(copy: Path) -> None:
     data = json.loads((copy / CONFIGURATION).read_text())["recipe_data"]
-    del data["metal_rules"], data["priors"]["flat_rules"], data["stages"][1]["weights"]["coverage"]
+    del (
+        data["metal_rules"],
+        data["metal_views"],
+        data["priors"]["flat_rules"],
+        data["stages"][1]["weights"]["coverage"],
+    )
     edit(copy, recipe_data=data)
     assert "Gaussians" in repr(polarguide.open_run(copy))
 

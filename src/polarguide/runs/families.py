@@ -25,10 +25,12 @@ from polarguide.runs.folder import CHECKPOINT, PLY
 from polarguide.runs.forecast import Forecast, MemoryPlan, forecast, plan_field_memory, plan_memory
 from polarguide.runs.health import Evidence, Polarization
 from polarguide.runs.model import GaussianModel, Model, write_run_ply
+from polarguide.runs.painted import FOLDER
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers, predicts_filters
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.distributed import Ranks
 from polarguide.training.feed import ViewStore
+from polarguide.training.metals.search import looks
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.trainer import warn_of_unused_materials
@@ -155,6 +157,24 @@ class Family(ABC):
                 remedy="Train again into a new folder.",
             )
 
+    def go_back(
+        self, state: Any, method: Any, settings: ResolvedSettings, out: Path, reporter: Reporter
+    ) -> None:
+        """Take a run back to where what was painted over it still counts.
+
+        Args:
+            state: of the training; changed. None: it has not begun.
+
+        Raises:
+            PolarguideError: materials mean nothing to the recipe, or to a training this short.
+        """
+        raise PolarguideError(
+            out / FOLDER,
+            expected="a training that asks at some step what is metal",
+            found=f"one of {method.name} in {settings.steps} steps, with --materials {settings.materials}",
+            remedy="Remove the folder, or train polarguide-stokes in 1,500 steps or more.",
+        )
+
     @abstractmethod
     def trainer(
         self,
@@ -212,6 +232,20 @@ class GaussianFamily(Family):
                 found=f"a training with {views}",
                 remedy="Train again into a new folder.",
             )
+
+    def go_back(
+        self, state: Any, method: Recipe, settings: ResolvedSettings, out: Path, reporter: Reporter
+    ) -> None:
+        """See ``Family``: to the last step at which metals are looked for."""
+        steps = looks(method, settings)
+        step = steps[-1] if steps else None
+        if step is None:
+            super().go_back(state, method, settings, out, reporter)
+        elif state is not None and state.step > step:
+            reporter.say(
+                f"{out / FOLDER} has changed: training goes on from step {step}, which decides on metals"
+            )
+            state.step, state.frozen, state.footprints = step, None, None
 
     def trainer(
         self,

@@ -62,6 +62,7 @@ class RunConfiguration:
         downscale: side of the averaged pixel boxes. transfer: how the files were read.
         device: what it trained on. version: of the program.
         test_views: those held out; None in runs of the first versions, which held out every 8th without a split.json.
+        painted: digest of the materials that were painted over the run and are in it, see ``runs.painted``; None: none.
     """
 
     scene: Annotated[str, msgspec.Meta(min_length=1)]
@@ -74,6 +75,7 @@ class RunConfiguration:
     device: str
     version: str = __version__
     test_views: tuple[str, ...] | None = None
+    painted: str | None = None
 
     @classmethod
     def of(
@@ -82,6 +84,7 @@ class RunConfiguration:
         recipe: Method,
         settings: ResolvedSettings,
         device: torch.device,
+        painted: str | None = None,
     ) -> RunConfiguration:
         """The record of a training."""
         return cls(
@@ -94,6 +97,7 @@ class RunConfiguration:
             transfer="srgb" if scene.transfer == "srgb" else "linear",
             device=str(device),
             test_views=scene.test_names,
+            painted=painted,
         )
 
     def save(self, run: Path) -> None:

@@ -39,6 +39,7 @@ from polarguide.runs.folder import (
 from polarguide.runs.forecast import MemoryPlan, Stopwatch, TimeLeft, pixels_of
 from polarguide.runs.health import examine
 from polarguide.runs.opened import OpenedRun, read_scene
+from polarguide.runs.painted import read_painted
 from polarguide.training.distributed import Ranks, backend_of, process_group
 from polarguide.training.feed import ViewStore
 from polarguide.training.losses import refuse_diverged
@@ -121,15 +122,24 @@ def train(
             reporter.warn(f"{idle} of {ranks.world} processes have no view to look at")
         if settings.background == "auto" and resolved.background == "black" and leads:
             reporter.say("the edges of the pictures are black: nothing is taken to be behind the subject")
-        configuration = RunConfiguration.of(loaded, chosen, resolved, backend.device)
+        painted = read_painted(out, loaded) if resume else None
+        if painted is not None:
+            loaded = painted.over(loaded)
+        digest = None if painted is None else painted.digest
+        configuration = RunConfiguration.of(loaded, chosen, resolved, backend.device, digest)
         state = None
         if resume:
             if leads:
                 locked.enter_context(writing_to(out))
-            _check_same(RunConfiguration.load(out), configuration, out)
+            recorded = RunConfiguration.load(out)
+            _check_same(recorded, configuration, out)
             if (out / CHECKPOINT).exists():
                 state = load_checkpoint(out, chosen, backend.device)
                 family.check(state, resolved, out)
+            if recorded.painted != digest:
+                family.go_back(state, chosen, resolved, out, reporter)
+                if state is not None and leads:
+                    save_checkpoint(out, state)  # before run.json says that what was painted is in it
         expected = None
         if ranks.world == 1 and not resume:
             expected = family.forecast(loaded, chosen, resolved, backend, plan.peak)
@@ -402,8 +412,8 @@ def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None
             remedy="The stages of a training are shares of its steps, so that it cannot be made longer or shorter: "
             f"give --steps {old.settings.steps}, or train with --steps {new.settings.steps} into a new folder.",
         )
-    # All but where the scene lies and the device decide the result.
-    for field in sorted(old.__annotations__.keys() - {"scene", "device"}):
+    # All but where the scene lies and the device decide the result; what is painted may change.
+    for field in sorted(old.__annotations__.keys() - {"scene", "device", "painted"}):
         a, b = getattr(old, field), getattr(new, field)
         if a != b and a is not None:
             name, a, b = first_difference(field, a, b)

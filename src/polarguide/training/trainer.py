@@ -27,7 +27,7 @@ from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.feed import Feed, ViewStore
 from polarguide.training.losses import step_loss
 from polarguide.training.metals.observations import index_offsets, numbers_in
-from polarguide.training.metals.search import MetalSearch
+from polarguide.training.metals.search import MetalSearch, refreshes
 from polarguide.training.recipe import Action, Recipe, Schedule, Stage
 from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.state import TrainingState, first_state, seeded
@@ -230,7 +230,7 @@ class Trainer:
             self.ranks.broadcast(outward)
             state.gaussians.overwrite("outward", outward)
         else:
-            if self._metals.is_due(state.step / steps):
+            if self._metals.is_due(state.step):
                 self._metals.look(state, self._views)
             self._set_indices()
             state.frozen = state.gaussians.snapshot()
@@ -265,13 +265,11 @@ def warn_of_unused_materials(
     scene: Scene, recipe: Recipe, settings: ResolvedSettings, backend: Backend, warn: Callable[[str], None]
 ) -> None:
     """Warn if ``materials/``, or refractive indices of single materials, have no effect on a training."""
-    steps, shading = settings.steps, recipe.shading.bind(settings.refractive_index)
-    schedule = Schedule(recipe, steps)
-    refreshes = [step / steps for step in range(steps) if "refresh_priors" in schedule.at(step).actions]
-    MetalSearch(scene, recipe, settings, shading, backend, ALONE, warn, UNBOUNDED).warn_if_never(refreshes)
+    shading = recipe.shading.bind(settings.refractive_index)
+    MetalSearch(scene, recipe, settings, shading, backend, ALONE, warn, UNBOUNDED).warn_if_never()
     if not scene.indices:
         return
-    if not (shading.knows_indices and refreshes):
+    if not (shading.knows_indices and refreshes(recipe, settings.steps)):
         why = f"the recipe {recipe.name} takes the run's for everything"
     elif not any(numbers_in(view) & scene.indices.keys() for view in scene.train_views):
         why = "no picture in materials/ of a training view has one of their numbers"

@@ -25,7 +25,7 @@ from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
 from polarguide.shading.result import POLARIZED, RenderResult
 from polarguide.training.angles.trainer import AngleTrainer
-from polarguide.viewer.cameras import letterbox
+from polarguide.viewer.cameras import drawn_camera, letterbox
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
 from polarguide.visualization.layers import (
@@ -278,8 +278,7 @@ class Painter:
         if view is not None and layer in MEASURED:
             place = letterbox(view.camera, (camera.width, camera.height))
             return self._with_scale(place.apply(self._measured(scenery, view, appearance)), layer)
-        if view is not None:
-            camera = letterbox(view.camera, (camera.width, camera.height)).camera(view.camera)
+        camera = drawn_camera(camera, view)
         result = self._result(scenery, camera, appearance)
         if layer in POLARIZED:
             result = replace(result, predicted=scenery.stokes(result, camera))
@@ -325,8 +324,7 @@ class Painter:
         place: tuple[float, float],
     ) -> SurfacePoint | None:
         """The surface at a place of the picture that ``paint`` draws, in shares of its width and height."""
-        if view is not None:
-            camera = letterbox(view.camera, (camera.width, camera.height)).camera(view.camera)
+        camera = drawn_camera(camera, view)
         plain = Appearance(layer="depth", crop=appearance.crop)
         result = self._result(scenery, camera, plain)
         return surface_at(result, camera, place[0] * camera.width, place[1] * camera.height)
