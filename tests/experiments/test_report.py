@@ -18,8 +18,7 @@ from comparison_records import part, results, run, unfinished
 
 from polarguide.capture import GroundTruth, Scene
 from polarguide.capture.ground_truth import Material, SceneObject
-from polarguide.experiments.charts import Curve
-from polarguide.experiments.report import _ground_truth_tile, report_html
+from polarguide.experiments.report import Curve, _ground_truth_tile, report_html
 from polarguide.experiments.results import Results
 from polarguide.experiments.tables import sections
 from polarguide.visualization.pages import Tile, chosen_views, data_uri, embed

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from comparison_records import part, results, run, unfinished
 
-from polarguide.experiments.charts import (
+from polarguide.experiments.report import (
     curves_svg,
     exposure_svg,
     read_curve,

@@ -20,7 +20,6 @@ from polarguide.core.options import MOST, ComputeOptions, PathLike, check_choice
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import decode
 from polarguide.core.system import only_writer
-from polarguide.experiments.charts import exposure_svg, read_study, study_svg
 from polarguide.experiments.children import STDERR, Scoring, Task, Training
 from polarguide.experiments.cluster import workers
 from polarguide.experiments.job_queue import Job, run_job, run_jobs
@@ -36,7 +35,7 @@ from polarguide.experiments.plan import (
     scene_entries,
 )
 from polarguide.experiments.record import FORMAT, REMEDY, Record
-from polarguide.experiments.report import write_report
+from polarguide.experiments.report import exposure_svg, read_study, study_svg, write_report
 from polarguide.experiments.results import Results
 from polarguide.experiments.tables import write_tables
 from polarguide.raster import choose_backend

@@ -17,8 +17,10 @@ from msgspec import UNSET
 from polarguide.core.files import write_text
 from polarguide.core.text import plain, printable
 from polarguide.experiments.record import RunRecord
-from polarguide.experiments.results import Cell, Results, Row
-from polarguide.experiments.statistics import (
+from polarguide.experiments.results import (
+    Cell,
+    Results,
+    Row,
     Values,
     controlled,
     known,
