@@ -230,6 +230,11 @@ def _capture(kind: type[Capture], line: _Line, scene: bool, common: str) -> Capt
             found=shlex.join(words),
             remedy="polarguide train --help and polarguide prepare --help list them.",
         ) from None
+    except PolarguideError as error:
+        where = f"{line.where}, {error.where}"
+        raise PolarguideError(
+            where, expected=error.expected, found=error.found, remedy=error.remedy
+        ) from None
     capture = kind(line.name, line.path, recipe=recipe, settings=settings, reading=reading)
     return capture if own is None else replace(capture, prepare=own)
 

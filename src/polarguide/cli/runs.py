@@ -116,7 +116,7 @@ def print_scores(record: dict[str, Any], title: str) -> None:
     metrics = importlib.import_module("polarguide.results.evaluation.table")
     table = Table(title=Text(printable(title)))
     table.add_column("metric")
-    table.add_column("value", justify="right")
+    table.add_column("value", justify="right", overflow="fold")
     for label, text in metrics.shown_metrics(record):
         table.add_row(label, Text(printable(text)))
     console.print(table)
@@ -300,6 +300,7 @@ def view(
     *,
     host: str = LOOPBACK[0],
     port: int = 8080,
+    beside: Path | None = None,
     visitors: VisitorOptions = VisitorOptions(),
     compute: ComputeOptions = ComputeOptions(),
 ) -> None:
@@ -309,6 +310,7 @@ def view(
         run: Run folder.
         host: Address to listen at. Others can reach it only if you give one of theirs (0.0.0.0: anyone's).
         port: To listen at; the next free one is taken if it is in use.
+        beside: Another run of the same scene, such as one without polarization, for the wipe between the two.
     """
     if run.is_file():
         raise PolarguideError(
@@ -320,7 +322,8 @@ def view(
         )
     require_package("viser", "the viewer")
     trained, reporter = opened(run, compute)
-    trained.view(host=host, port=port, visitors=visitors, reporter=reporter)
+    other = None if beside is None else opened(beside, compute)[0]
+    trained.view(host=host, port=port, visitors=visitors, reporter=reporter, beside=other)
 
 
 def share(

@@ -143,7 +143,7 @@ def reconciled(points: Array, files: Array, unfiltered: NDArray[np.bool_]) -> Ex
 _DARK = 0.004
 # Logarithm of a gain that is warned of where files do not state it: one and a half stops from the others.
 _FAR = math.log(2.0) * 1.5
-_LISTED = 40
+_LISTED = 12
 _PATCH = (3, 3)
 
 

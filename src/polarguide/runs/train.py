@@ -40,10 +40,11 @@ from polarguide.runs.forecast import MemoryPlan, Stopwatch, TimeLeft, pixels_of
 from polarguide.runs.health import examine
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.runs.painted import read_painted
+from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.distributed import Ranks, backend_of, process_group
 from polarguide.training.feed import ViewStore
 from polarguide.training.losses import refuse_diverged
-from polarguide.training.recipe import Method, Recipe
+from polarguide.training.recipe import Method
 from polarguide.training.settings import ResolvedSettings, StepReport, TrainSettings
 
 LOG_EVERY = 10
@@ -158,8 +159,9 @@ def train(
                         raise problem
                 configuration.save(out)
             left = None
-            if expected is not None and isinstance(chosen, Recipe) and not resolved.begin_again:
-                left = TimeLeft(expected, chosen)
+            if expected is not None and isinstance(trainer, AngleTrainer) and not trainer.begins_again:
+                left = TimeLeft(expected, trainer.recipe)
+                trainer.flat.update(expected.flat)
             seconds = _Loop(trainer, out, session, reporter, should_stop, look, bound, left).run()
         model = family.model(trainer.state, chosen, resolved, backend)
         if expected is not None:
@@ -210,7 +212,8 @@ class _Loop:
         self._log = RunLog(out) if trainer.ranks.rank == 0 else None
         if self._log is not None:
             self._log.cut(trainer.state.step)
-        self._stopwatch = Stopwatch(*self._log.elapsed()) if self._log else Stopwatch()
+        seconds, alone = self._log.elapsed() if self._log else (0.0, True)
+        self._stopwatch = Stopwatch(seconds + (left.expected.spent if left else 0.0), alone)
 
     def run(self) -> float:
         """Train; see ``train``. Returns the seconds that it took."""

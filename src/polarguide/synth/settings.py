@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
+from polarguide.capture.sensor.pattern import SENSORS, any_case, sensor_named
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.records import check_options
 from polarguide.synth.schema import SceneSpec, parse_scene, read_scene_file
@@ -155,12 +156,18 @@ class SynthSettings:
     size: str = "256x192"
     samples: Annotated[int, Meta(ge=1, le=65536)] = 64
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
-    sensor: Literal["ideal", "imx250myr", "imx250mzr", "filter"] = "ideal"
+    sensor: Annotated[
+        Literal["ideal", "IMX250MYR", "IMX264MYR", "IMX250MZR", "filter"],
+        any_case("ideal", *SENSORS, "filter"),
+    ] = "ideal"
     noise: Annotated[float, Meta(ge=0, le=100)] = 0.0
     color: Color = "rgb"
     ground_truth: Literal["test", "all"] = "test"
     points: Annotated[int, Meta(ge=0)] = 5000
     test_every: Annotated[int, Meta(ge=2)] = TEST_EVERY
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sensor", sensor_named(self.sensor))
 
     @property
     def width(self) -> int:
@@ -176,6 +183,7 @@ class SynthSettings:
         """As JSON."""
         values = asdict(self)
         del values["size"]
+        values["sensor"] = self.sensor.lower()  # as folders of earlier versions have it
         if self.test_every == TEST_EVERY:  # folders of versions without this setting go on
             del values["test_every"]
         return {"width": self.width, "height": self.height, **values}

@@ -25,6 +25,7 @@ from polarguide.shading.result import COLOR_CHANNELS, RenderResult
 from polarguide.training.actions import DensityControl, outward_directions, propagate_normals, reset_opacity
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.feed import Feed, ViewStore
+from polarguide.training.flat import Flat
 from polarguide.training.losses import step_loss
 from polarguide.training.metals.observations import index_offsets, numbers_in
 from polarguide.training.metals.search import MetalSearch, refreshes
@@ -92,6 +93,17 @@ class Trainer:
         self._rate = math.sqrt(settings.views_per_step)
         self._use_batch_rates()
 
+    @property
+    def flat(self) -> dict[str, dict[str, Flat]]:
+        """Flat surfaces that have been found, as of ``Feed``; what is put there is not looked for."""
+        return self._feed.flat
+
+    def looks(self, step: int) -> tuple[bool, bool, bool]:
+        """Whether a step looks for metals, for the outer sides of normals, and for faint Gaussians."""
+        stage, actions = (position := self.schedule.at(step)).stage, position.actions
+        metals = "refresh_priors" in actions and self._metals.is_due(step / self.settings.steps)
+        return metals, "orient_normals" in actions, stage.densify and not self._densifies(step + 1)
+
     def set_exposures(self, exposures: Mapping[str, tuple[Exposure, ...]]) -> None:
         """Take views, by name, for captured with these exposures from now on; their targets are made anew."""
         self._exposures.update(exposures)
@@ -121,16 +133,15 @@ class Trainer:
         report = StepReport(state.step, stage.name, len(state.gaussians), mean, state.step + 1)
         state.step += 1
         if stage.densify:
-            self._density.after_step(state, last=not self._densifies_next())
+            self._density.after_step(state, last=not self._densifies(state.step))
         if state.step == self.settings.steps:
             cameras = (view.camera for view in self._views)
             state.footprints = footprints(state.gaussians["means"].detach(), cameras)
         self.whole = True
         return report
 
-    def _densifies_next(self) -> bool:
-        """Whether the next step belongs to a stage with density control."""
-        step = self.state.step
+    def _densifies(self, step: int) -> bool:
+        """Whether a step belongs to a stage with density control."""
         return step < self.settings.steps and self.schedule.at(step).stage.densify
 
     def exchange_statistics(self) -> None:

@@ -97,7 +97,9 @@ class Panel:
             self.view = gui.add_dropdown("Go to", (FREE_VIEW, *options.views))
             self.step = gui.add_button_group("", STEPS)
             self.frusta = gui.add_checkbox("Show cameras", True)
-            hint = "At a photograph's pose: what was measured, from the left, in percent of the width"
+            hint = (
+                "In percent of the width, from the left: the run beside, else what was measured at this pose"
+            )
             self.wipe = gui.add_slider("Wipe", *WIPE, 1, 0, hint=hint)
         with gui.add_folder("Crop", expand_by_default=False):
             self._use_crop = gui.add_checkbox("Crop", self._saved_crop is not None)

@@ -71,7 +71,7 @@ class Viewer:
             visitors can download it. That is all they can do where other machines may look.
         paintable: what can be painted, where nobody else may look; None: nothing.
         title: plain text.
-        warn: called with the reason why a browser was disconnected.
+        warn: called with the reason why a browser was disconnected. beside: another run, for wipes.
 
     Raises:
         PolarguideError: viser is not installed or not as it was tested, or the server cannot listen at the address.
@@ -92,11 +92,12 @@ class Viewer:
         paintable: Paintable | None = None,
         title: str = "polarguide",
         warn: Callable[[str], None] = lambda text: None,
+        beside: Scenery | None = None,
     ) -> None:
         viser = optional_import("viser", "the viewer")
         # viser warns of pictures for a browser that has just disconnected.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        self._current, self._photographs = current, photographs
+        self._current, self._photographs, self._beside = current, photographs, beside
         self._scene_frame = scene_frame([photograph.view.camera for photograph in photographs.values()])
         turns = shading.radiance_cubemap is not None
         others = visitors.allow_host or visitors.allow_origin
@@ -149,6 +150,7 @@ class Viewer:
                 save=None if self._save is None else self._saved,
                 paintable=self._paintable,
                 drop=drop,
+                beside=self._beside,
             )
             session.go(next(iter(self._photographs)))
         except Exception as error:
@@ -287,18 +289,26 @@ def view_run(
     port: int = 8080,
     visitors: VisitorOptions = VisitorOptions(),
     reporter: Reporter = SILENT,
+    beside: OpenedRun | None = None,
 ) -> None:
     """Serve a run to browsers: its layers from any side, beside the photographs. KeyboardInterrupt ends it.
 
     Args:
-        run: the run; its scene is read.
+        run: the run; its scene is read. beside: another of the same scene, which a wipe shows from the left.
         host: address to listen at. port: the next free one is taken if it is in use.
         visitors: who may look besides pages of this machine.
         reporter: receives the address.
 
     Raises:
-        PolarguideError: the address cannot be listened at.
+        PolarguideError: the address cannot be listened at, or the run beside is of another scene.
     """
+    if beside is not None and beside.configuration.scene_digest != run.configuration.scene_digest:
+        raise PolarguideError(
+            beside.folder,
+            expected=f"a run of {run.configuration.scene}",
+            found=f"one of {beside.configuration.scene}",
+            remedy="Name another run, or train one on this scene.",
+        )
     scenery = run_scenery(run)
     with _opened(
         lambda: scenery,
@@ -311,6 +321,7 @@ def view_run(
         visitors=visitors,
         presentation=run.presentation,
         save=functools.partial(save_to_run, run),
+        beside=None if beside is None else run_scenery(beside),
         paintable=paintable_run(run),
     ) as viewer:
         while True:

@@ -110,7 +110,7 @@ class Session:
         options: of the panel. wake: called when a picture may be due.
         gray_world: gives the gains of the photographs' mean.
         save: writes a presentation to the run, and returns a message; None: the browser downloads it.
-        drop: called with what a callback has raised, to let the browser go.
+        drop: called with what a callback has raised, to let the browser go. beside: as of ``Painter``.
     """
 
     def __init__(
@@ -125,11 +125,12 @@ class Session:
         save: Callable[[Presentation], str] | None = None,
         paintable: Paintable | None = None,
         drop: Callable[[Exception], None] = _raise,
+        beside: Scenery | None = None,
     ) -> None:
         self._client, self._photographs, self._drop = client, photographs, drop
         self._scene_frame, self._wake = scene_frame, wake
         self._lock = threading.Lock()
-        self._painter = Painter(scene_frame)
+        self._painter = Painter(scene_frame, beside)
         self.pacing = FramePacing()
         self._view_pose: ViewPose | None = None
         self._last_pose: ViewPose | None = None  # of the view that was asked for last, left or not

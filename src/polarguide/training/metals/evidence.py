@@ -18,6 +18,7 @@ error e, give the log likelihood ratio ``n log((e^2 + E_dielectric) / (e^2 + E_m
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -171,4 +172,4 @@ def _tint_cost(color: Tensor, weight: Tensor, rules: MetalRules) -> Tensor:
     mean = (color * weight[:, None]).sum(dim=0) / weight.sum().clamp(min=1e-6)
     tints = (color / mean.clamp(min=1e-6)).clamp(min=1e-3)
     tint = (tints.amin(dim=1) / tints.amax(dim=1)).log()
-    return 0.5 * ((torch.log(tint.new_tensor(GOLD)) - tint).clamp(min=0) / rules.like_color) ** 2
+    return 0.5 * ((math.log(GOLD) - tint).clamp(min=0) / rules.like_color) ** 2
