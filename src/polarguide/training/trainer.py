@@ -101,7 +101,7 @@ class Trainer:
     def looks(self, step: int) -> tuple[bool, bool, bool]:
         """Whether a step looks for metals, for the outer sides of normals, and for faint Gaussians."""
         stage, actions = (position := self.schedule.at(step)).stage, position.actions
-        metals = "refresh_priors" in actions and self._metals.is_due(step / self.settings.steps)
+        metals = "refresh_priors" in actions and self._metals.is_due(step)
         return metals, "orient_normals" in actions, stage.densify and not self._densifies(step + 1)
 
     def set_exposures(self, exposures: Mapping[str, tuple[Exposure, ...]]) -> None:
