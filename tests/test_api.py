@@ -269,7 +269,7 @@ def test_a_run_with_a_setting_that_is_not_known_is_refused(copy: Path, place: st
 @pytest.mark.parametrize("version", ["0.1.0", "0.1.7", "9.0.0"])
 def test_a_run_of_another_version_is_refused_with_what_to_do(copy: Path, version: str) -> None:
     edit(copy, version=version, unknown_then=3)
-    Fault("", "", f"one of version {version}", "new folder").raised_by(polarguide.open_run, copy)
+    Fault("", "", f"a run of version {version}", "new folder").raised_by(polarguide.open_run, copy)
 
 
 def test_a_film_and_pictures_from_python(trained: Path, tmp_path: Path) -> None:

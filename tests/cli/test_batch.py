@@ -9,8 +9,7 @@ from faults import Fault
 from polarguide.cli import batch as verb
 from polarguide.cli.app import run
 from polarguide.experiments import batch as batches
-from polarguide.experiments.batch import Capture
-from polarguide.experiments.batch_page import Row
+from polarguide.experiments.batch import Capture, Row
 from polarguide.experiments.options import BatchOptions
 
 OPTIONS = BatchOptions(jobs=1, device="cpu")

@@ -252,7 +252,7 @@ def _words(text: str, where: str) -> list[str]:
 
 
 def _parsed(kind: Callable[..., Parsed], words: Sequence[str], *, unknown: bool) -> tuple[Any, list[str]]:
-    """What a function makes of words, and those that it has no option for."""
+    """The result of a function called with words of a command line, and the words that are not its options."""
     function = tyro.conf.configure(tyro.conf.OmitArgPrefixes)(kind)
     with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
         if unknown:

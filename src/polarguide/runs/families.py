@@ -29,11 +29,11 @@ from polarguide.runs.painted import FOLDER
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers, predicts_filters
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.distributed import Ranks
+from polarguide.training.feed import ViewStore
 from polarguide.training.metals.search import looks
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.trainer import warn_of_unused_materials
-from polarguide.training.view_store import ViewStore
 
 ANY = 90.0
 """Degrees: as far as two angles can be apart."""
@@ -153,7 +153,7 @@ class Family(ABC):
             raise PolarguideError(
                 out / CHECKPOINT,
                 expected=f"the state of a training of {settings.steps} steps",
-                found=f"one after step {state.step}",
+                found=f"the state after step {state.step}",
                 remedy="Train again into a new folder.",
             )
 
@@ -229,7 +229,7 @@ class GaussianFamily(Family):
             raise PolarguideError(
                 out / CHECKPOINT,
                 expected=f"the state of a training with {settings.views_per_step} views a step",
-                found=f"one with {views}",
+                found=f"a training with {views}",
                 remedy="Train again into a new folder.",
             )
 

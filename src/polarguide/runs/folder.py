@@ -86,7 +86,7 @@ class RunConfiguration:
         device: torch.device,
         painted: str | None = None,
     ) -> RunConfiguration:
-        """What is recorded of a training."""
+        """The record of a training."""
         return cls(
             scene=str(scene.root if scene.root == IN_MEMORY else scene.root.resolve()),
             scene_digest=scene.digest,
@@ -126,7 +126,7 @@ class RunConfiguration:
             raise PolarguideError(
                 run,
                 expected=f"a run of polarguide {_series(__version__)}",
-                found=f"one of version {written}",
+                found=f"a run of version {written}",
                 remedy=f"Train again into a new folder, or open it with polarguide {_series(written)}.",
             )
         configuration = decode(data, cls, path, remedy=remedy)
@@ -145,7 +145,7 @@ def _refuse_unknown(data: dict[str, Any], record: RunConfiguration, path: Path, 
 
 @dataclass(frozen=True)
 class _Written:
-    """What is read of a run of any version."""
+    """The fields of ``run.json`` that are read of every version."""
 
     version: str
 
@@ -218,7 +218,7 @@ def load_checkpoint(run: Path, recipe: Method, device: torch.device | str = "cpu
 
 
 def trained_steps(run: Path) -> int | None:
-    """After how many steps a run's checkpoint was written; None where there is none that says so."""
+    """Number of steps of a run's checkpoint; None if no checkpoint states it."""
     try:
         with safe_open(run / CHECKPOINT, framework="pt") as file:
             record = (file.metadata() or {}).get("polarguide", "")
@@ -277,7 +277,7 @@ class RunLog:
             write_text(self._path, "".join(f"{line}\n" for line in lines))
 
     def rows(self) -> list[dict[str, Any]]:
-        """The lines that are whole, none where there is no log; a kill can cut one short.
+        """The complete lines of the log; none without a log. A line can be incomplete where a process was killed.
 
         Raises:
             PolarguideError: it cannot be read.

@@ -42,10 +42,10 @@ from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.runs.painted import read_painted
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.distributed import Ranks, backend_of, process_group
+from polarguide.training.feed import ViewStore
 from polarguide.training.losses import refuse_diverged
 from polarguide.training.recipe import Method
 from polarguide.training.settings import ResolvedSettings, StepReport, TrainSettings
-from polarguide.training.view_store import ViewStore
 
 LOG_EVERY = 10
 Ends = Callable[[], bool]
@@ -394,7 +394,7 @@ def _check_scene(scene: Scene) -> None:
         raise PolarguideError(
             scene.root,
             expected="training views from at least two places",
-            found=f"{len(centers)} from one",
+            found=f"{len(centers)} from one place",
             remedy="Add views, or correct the poses.",
         )
     cameras = [view.camera for view in scene.train_views]

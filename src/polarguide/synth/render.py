@@ -29,12 +29,20 @@ from polarguide.synth.colmap import (
     view_names,
     write_model,
 )
-from polarguide.synth.film import LobeRadiance, render_lobes
 from polarguide.synth.folder import scene_record, verify_scene, write_manifest
 from polarguide.synth.ground_truth import ground_truth_maps, write_sheet
 from polarguide.synth.mesh import Array
 from polarguide.synth.schema import SceneSpec, require_unicode
-from polarguide.synth.sensor import FilterShot, Sensor, filter_jpeg, mosaic, noisy, plan_shot
+from polarguide.synth.sensor import (
+    FilterShot,
+    LobeRadiance,
+    Sensor,
+    filter_jpeg,
+    mosaic,
+    noisy,
+    plan_shot,
+    render_lobes,
+)
 from polarguide.synth.settings import LONG_SECONDS, Overrides, SynthSettings, choose_variant, rough_time
 from polarguide.synth.transport import PathLimits
 

@@ -49,14 +49,12 @@ class Variant:
         name: Mitsuba's name.
         color: "rgb" renders three channels one after the other, each with exact values; "spectral" follows four
             wavelengths a path and converts.
-        fast: whether paths are vectorized (LLVM) instead of scalar.
         paths_per_second: a rough figure for this machine.
         note: the reason for a slow variant; else empty.
     """
 
     name: str
     color: Color
-    fast: bool
     paths_per_second: float
     note: str = ""
 
@@ -84,14 +82,14 @@ def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
         if threads:
             dr.set_thread_count(threads)
         speed = FAST_PATHS_PER_SECOND * (threads or os.cpu_count() or 1)
-        return Variant(mi.variant(), color, True, speed)
+        return Variant(mi.variant(), color, speed)
     with _silent_stderr():
         mi.set_variant("scalar_spectral_polarized")
     note = (
         f"Mitsuba's fast variants need LLVM {OLDEST_LLVM} or newer as a shared library ({missing}); on Debian "
         "'apt-get install libllvm19', elsewhere set DRJIT_LIBLLVM_PATH. The slow scalar variant is used."
     )
-    return Variant(mi.variant(), "spectral", False, SLOW_PATHS_PER_SECOND, note)
+    return Variant(mi.variant(), "spectral", SLOW_PATHS_PER_SECOND, note)
 
 
 @contextlib.contextmanager

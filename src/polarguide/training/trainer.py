@@ -24,7 +24,7 @@ from polarguide.shading.model import PLAIN
 from polarguide.shading.result import COLOR_CHANNELS, RenderResult
 from polarguide.training.actions import DensityControl, outward_directions, propagate_normals, reset_opacity
 from polarguide.training.distributed import ALONE, Ranks
-from polarguide.training.feed import Feed
+from polarguide.training.feed import Feed, ViewStore
 from polarguide.training.flat import Flat
 from polarguide.training.losses import step_loss
 from polarguide.training.metals.observations import index_offsets, numbers_in
@@ -33,7 +33,6 @@ from polarguide.training.recipe import Action, Recipe, Schedule, Stage
 from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.state import TrainingState, first_state, seeded
 from polarguide.training.targets import Step, StepTargets
-from polarguide.training.view_store import ViewStore
 
 
 class Trainer:

@@ -89,7 +89,7 @@ def depth_picture(depth: Tensor, depths: Depths) -> Picture:
 
 
 def layer_scale(name: str, depths: Depths | None = None) -> Picture | None:
-    """What the colors of a layer mean, 256 pixels wide; None of radiance, and of depth without a range."""
+    """The color scale of a layer, 256 pixels wide; None for radiance, and for depth without a range."""
     name = name.partition(",")[0]
     if name in _SHARES:
         return figures.scale_bar(0.0, 1.0, "viridis")
@@ -138,7 +138,7 @@ def true_name(name: str) -> str:
 def reference_pictures(
     view: View, color: Tensor | None = None, depths: Depths | None = None
 ) -> dict[str, Picture]:
-    """What a view knows of layers, as 8-bit pictures: the ``photograph``, the ground truth of others as ``NAME, true``,
+    """Reference pictures of a view's layers, 8-bit: the ``photograph``, the ground truth of others as ``NAME, true``,
     and the polarization that its pictures measure as ``NAME, measured``.
 
     Args:

@@ -174,10 +174,12 @@ class Levels:
             dark: dark frame in stored values, in the same shape; it takes the place of the black level pixel by pixel.
         """
         floor = np.float32(self.black) if dark is None else dark
-        shown = ((values.astype(np.float32) - floor) / np.float32(self.white - self.black)).astype(np.float32)
+        scaled = ((values.astype(np.float32) - floor) / np.float32(self.white - self.black)).astype(
+            np.float32
+        )
         if self.gamma == 1.0:
-            return shown
-        return np.asarray(np.copysign(np.abs(shown) ** np.float32(1 / self.gamma), shown))
+            return scaled
+        return np.asarray(np.copysign(np.abs(scaled) ** np.float32(1 / self.gamma), scaled))
 
 
 def estimate_levels(
@@ -258,7 +260,7 @@ def clipping_bits(counts: NDArray[np.int64]) -> int | None:
 
 
 def level_notes(levels: Levels, counts: NDArray[np.int64], container: int, bits: int | None) -> list[str]:
-    """What was assumed of the levels of 16-bit files, for the user; ``bits``: as given, or None."""
+    """Notes for the user on the assumed levels of 16-bit files; ``bits``: as specified, or None."""
     if container != 16:
         return []
     notes = []
