@@ -19,7 +19,7 @@ from polarguide.runs.folder import load_checkpoint, resolve, save_checkpoint
 from polarguide.shading.metal import any_nonzero
 from polarguide.training.metals.cut import INFINITE, Graph, decide, minimum_cut, surfaces, unary
 from polarguide.training.metals.evidence import GOLD, Evidence, _tint_cost, errors, evidence
-from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights
+from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights, shares
 from polarguide.training.metals.search import looks
 from polarguide.training.rules import MetalRules, MetalViews
 from polarguide.training.settings import TrainSettings
@@ -299,3 +299,21 @@ def test_the_prior_grows_from_look_to_look(tiny_scene: Scene, monkeypatch: pytes
     trainer.run(lambda _: None)
     expected = [RULES.prior * (k + 1) / len(steps) for k in range(len(steps))]
     assert priors == pytest.approx(expected)
+
+
+def test_what_is_beside_a_label_has_none() -> None:
+    """At the outline of a label its pixels show other Gaussians, too, in every view a little."""
+    views = []
+    for view in views_of("gold"):
+        there = ~view.invalid
+        labels = there.to(torch.uint8) * 2
+        labels[:, labels.shape[1] // 2 :] = 0  # nothing is said of the right half
+        views.append(dataclasses.replace(view, materials=labels))
+    ball = gaussians_of_the_ball()
+    one = [label_weights(ball, [view], rasterize_cpu) for view in views]
+    for view, labels in zip(views, one, strict=True):
+        everything = shares(ball, view.camera, torch.ones(*view.invalid.shape, 1), rasterize_cpu)[:, 0]
+        labeled = labels[:, 1] > 0
+        assert bool(labeled.any())
+        assert bool((labels[labeled, 1] >= 0.5 * everything[labeled]).all())
+    torch.testing.assert_close(label_weights(ball, views, rasterize_cpu), torch.stack(one).sum(dim=0))

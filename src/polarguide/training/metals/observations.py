@@ -150,8 +150,20 @@ def contradicted(
 def _labels_in(gaussians: Parameters, view: View, rasterize: Rasterize) -> Tensor:
     assert view.materials is not None
     kinds = view.materials.to(gaussians["means"].device)
-    target = torch.stack(((kinds == 1) | (kinds > 2), kinds == 2), dim=-1).float()
-    return shares(gaussians, view.camera, target, rasterize)
+    return _labeled(gaussians, view, [(kinds == 1) | (kinds > 2), kinds == 2], rasterize)
+
+
+def _labeled(gaussians: Parameters, view: View, kinds: Sequence[Tensor], rasterize: Rasterize) -> Tensor:
+    """Pixels [N, K] of kinds [H, W] bool in a view, where labels cover at least half of what it shows of a Gaussian.
+
+    At the outline of what is labeled, what lies behind and beside it is in the same pixels.
+    """
+    assert view.materials is not None
+    named = view.materials.to(gaussians["means"].device) > 0
+    target = torch.stack((named, torch.ones_like(named), *kinds), dim=-1).float()
+    parts = [part.contiguous() for part in target.split(MAX_CHANNELS, dim=-1)]
+    sums = torch.cat([shares(gaussians, view.camera, part, rasterize) for part in parts], dim=1)
+    return sums[:, 2:] * (sums[:, 0] >= 0.5 * sums[:, 1])[:, None]
 
 
 # Pixels of a Gaussian in all views from which on what they say counts.
@@ -183,10 +195,9 @@ def index_offsets(
         assert view.materials is not None
         kinds = view.materials.to(means.device)
         here = [number for number in numbers if number in labels[view.name]]
-        target = torch.stack(((kinds == 1) | (kinds == 2), *(kinds == k for k in here)), dim=-1).float()
         columns = [0, *(1 + numbers.index(number) for number in here)]
-        for some, part in zip(_batched(columns), target.split(MAX_CHANNELS, dim=-1), strict=True):
-            weights[:, some] += shares(gaussians, view.camera, part.contiguous(), rasterize)
+        masks = [(kinds == 1) | (kinds == 2), *(kinds == number for number in here)]
+        weights[:, columns] += _labeled(gaussians, view, masks, rasterize)
     offsets = means.new_tensor([0.0, *(indices[number] - refractive_index for number in numbers)])
     most, chosen = weights.max(dim=1)
     specified = torch.where(most > LEAST_SEEN, offsets[chosen], torch.zeros_like(most))
@@ -197,11 +208,6 @@ def index_offsets(
 def numbers_in(view: View) -> set[int]:
     """Numbers of the dielectrics with indices of their own that a view says it shows."""
     return set() if view.materials is None else set(view.materials.unique().tolist()) - {0, 1, 2}
-
-
-def _batched(columns: list[int]) -> list[list[int]]:
-    """So many at a time as a rasterizer takes channels."""
-    return [columns[k : k + MAX_CHANNELS] for k in range(0, len(columns), MAX_CHANNELS)]
 
 
 @torch.no_grad()
