@@ -1,9 +1,10 @@
 """Pictures of the front page: a held-out view by three recipes beside the truth, and a film that wipes over layers.
 
+    polarguide synth benchmarks/front/tea.json --size 192x144 --samples 12 --out SCENE
     for recipe in 3dgs 3dgs-dr polarguide-stokes; do
-      polarguide train SCENE --downscale 2 --steps 2500 --recipe $recipe --out RUNS/$recipe
+      polarguide train SCENE --steps 2000 --recipe $recipe --out RUNS/$recipe
     done
-    python benchmarks/front/front_pictures.py SCENE RUNS --view v040
+    python benchmarks/front/front_pictures.py SCENE RUNS --view v016
 
 Writes ``docs/images/front.jpg`` and ``docs/images/front.webp``; with ``--control RUN``, a training without
 polarization, only the pairs that the gallery wipes, into ``docs/extra/scenes``. Pictures have the size of the scene's

@@ -211,3 +211,23 @@ def test_every_field_of_the_table_of_measure_is_explained():
     assert f"format {FORMAT} " in section
     rows = [line for line in section.splitlines() if line.startswith("| `")]
     assert [key for row in rows for key in re.findall(r"`(\w+)`", row.split("|")[1])] == list(KEYS)
+
+
+def words(text):
+    """The words of a page: what has a letter or a digit, without formulas."""
+    plain = re.sub(r"\$\$.*?\$\$|\$[^$]*\$", "", text, flags=re.DOTALL)
+    return sum(any(c.isalnum() for c in word) for word in plain.split())
+
+
+def test_pages_are_short():
+    counts = {page: words(text_of(page)) for page in PAGES if DOCS / "reference" not in page.parents}
+    limits = {DOCS / "explanation" / "method.md": 2500}
+    assert {page: count for page, count in counts.items() if count > limits.get(page, 1800)} == {}
+    assert sum(counts.values()) <= 50_000
+
+
+@pytest.mark.parametrize(
+    "path", sorted({*(DOCS / "how-to").glob("*.md")} - {DOCS / "how-to" / "index.md"}), ids=lambda p: p.stem
+)
+def test_a_guide_begins_with_what_to_type(path):
+    assert text_of(path).split("\n\n")[1].startswith("```")
