@@ -249,7 +249,12 @@ def test_a_changed_recipe_is_warned_of_on_opening(copy: Path) -> None:
 
 def test_a_run_whose_version_recorded_fewer_constants_opens_in_silence(copy: Path) -> None:
     data = json.loads((copy / CONFIGURATION).read_text())["recipe_data"]
-    del data["metal_rules"], data["priors"]["flat_rules"], data["stages"][1]["weights"]["coverage"]
+    del (
+        data["metal_rules"],
+        data["metal_views"],
+        data["priors"]["flat_rules"],
+        data["stages"][1]["weights"]["coverage"],
+    )
     edit(copy, recipe_data=data)
     assert "Gaussians" in repr(polarguide.open_run(copy))
 
@@ -264,7 +269,7 @@ def test_a_run_with_a_setting_that_is_not_known_is_refused(copy: Path, place: st
 @pytest.mark.parametrize("version", ["0.1.0", "0.1.7", "9.0.0"])
 def test_a_run_of_another_version_is_refused_with_what_to_do(copy: Path, version: str) -> None:
     edit(copy, version=version, unknown_then=3)
-    Fault("", "", f"one of version {version}", "new folder").raised_by(polarguide.open_run, copy)
+    Fault("", "", f"a run of version {version}", "new folder").raised_by(polarguide.open_run, copy)
 
 
 def test_a_film_and_pictures_from_python(trained: Path, tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
-"""Base color of exported models against the true one: PSNR of sRGB values, of dielectrics, on held-out views.
+"""Base color of exported models against the true one, and roughness: PSNR of sRGB values, of dielectrics, on held-out
+views; the median of glTF's roughness beside the true one.
 
     python benchmarks/accuracy/base_color.py RUN MODEL.glb [MODEL.glb ...]
 
@@ -27,23 +28,27 @@ OUTLINE = 5
 
 
 def looked_up(mesh: trimesh.Trimesh, camera: Camera, axes: np.ndarray) -> np.ndarray:
-    """Linear base color [H, W, 3] of a model from a camera of the scene, NaN where there is no surface."""
+    """Linear base color and roughness [H, W, 4] of a lit model from a camera of the scene, NaN without a surface."""
     rays = camera.world_rays(dtype=torch.float64).reshape(-1, 3).numpy() @ axes
     starts = np.broadcast_to(camera.center.numpy() @ axes, rays.shape)
     places, ray, face = mesh.ray.intersects_location(starts, rays, multiple_hits=False)
     shares = trimesh.triangles.points_to_barycentric(mesh.triangles[face], places)
     uv = (mesh.visual.uv[mesh.faces[face]] * shares[..., None]).sum(axis=1)
-    image = srgb_decode_array(np.array(mesh.visual.material.baseColorTexture)[..., :3] / 255)
+    material = mesh.visual.material
+    color, surface = (
+        np.array(t) / 255 for t in (material.baseColorTexture, material.metallicRoughnessTexture)
+    )
+    image = np.concatenate([srgb_decode_array(color[..., :3]), surface[..., 1:2]], axis=-1)
     size = image.shape[0]
     places_in_texture = (
         np.stack([(1 - uv[:, 1]) * size, uv[:, 0] * size]) - 0.5
     )  # trimesh counts v from below
-    colors = np.full((len(rays), 3), np.nan)
-    for channel in range(3):
+    colors = np.full((len(rays), 4), np.nan)
+    for channel in range(4):
         colors[ray, channel] = map_coordinates(
             image[..., channel], places_in_texture, order=1, mode="nearest"
         )
-    return colors.reshape(camera.height, camera.width, 3)
+    return colors.reshape(camera.height, camera.width, 4)
 
 
 def psnr(first: np.ndarray, second: np.ndarray) -> float:
@@ -64,23 +69,32 @@ def main() -> None:
     print(f"{'model':32} {'as it is':>9} {'1 factor':>9} {'factor':>7}  objects with that factor")
     for path in arguments.models:
         mesh = trimesh.load(path, process=False).to_geometry()
-        model, true, which = [], [], []
+        model, true, which, rough = [], [], [], []
         for view in run.scene.test_views:
             with np.load(run.scene.root / "gt" / f"{view.name}.npz") as truth:
-                albedo, objects, metal = (truth[name] for name in ("albedo", "objid", "metalness"))
+                albedo, objects, metal, alpha = (
+                    truth[name] for name in ("albedo", "objid", "metalness", "roughness")
+                )
             assert objects.shape == (view.camera.height, view.camera.width), "train without --downscale"
             inner = (minimum_filter(objects, OUTLINE) == objects) & (
                 maximum_filter(objects, OUTLINE) == objects
             )
             color = looked_up(mesh, view.camera, axes)
             counts = inner & (metal == 0) & np.isin(objects, [*names]) & np.isfinite(color).all(axis=-1)
-            model.append(color[counts])
+            model.append(color[counts, :3])
+            rough.append(np.stack([color[counts, 3], np.sqrt(alpha[counts])], axis=1))
             true.append(albedo[counts].astype(float))
             which.append(objects[counts])
-        colors, expected, objects = (np.concatenate(parts) for parts in (model, true, which))
+        colors, expected, objects, roughness = (
+            np.concatenate(parts) for parts in (model, true, which, rough)
+        )
         factor = float((colors * expected).sum() / (colors * colors).sum())
         each = [
-            f"{names[number]} {psnr(factor * colors[here], expected[here]):.1f}"
+            "{} {:.1f} (roughness {:.2f}, true {:.2f})".format(
+                names[number],
+                psnr(factor * colors[here], expected[here]),
+                *np.median(roughness[here], axis=0),
+            )
             for number in np.unique(objects)
             if (here := objects == number).sum() >= 20
         ]

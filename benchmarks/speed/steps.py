@@ -36,7 +36,7 @@ DEMO = Path(__file__).resolve().parents[2] / "src/polarguide/data/demo"
 PARTS = {
     "rasterizer forward": ("Rasterizer.forward",),
     "rasterizer backward": ("Rasterizer.backward",),
-    "what is splatted": ("Splatting.forward", "Splatting.backward"),
+    "harmonics, axes": ("Splatting.forward", "Splatting.backward"),
     "reflection": (
         *("turn", "reflect_forward"),
         *("reflect_backward_layers", "cubemap_backward", "mips_backward", "reflect_backward_directions"),

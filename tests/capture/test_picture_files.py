@@ -20,7 +20,7 @@ from PIL import Image
 from tiny_capture import TinyCapture, encode_srgb, ideal_intensities, write_picture
 
 from polarguide.capture import load_scene
-from polarguide.capture.filter.camera_files import orientation, taken
+from polarguide.capture.filter.camera_files import exif_data, orientation
 from polarguide.capture.formats import pictures
 from polarguide.capture.formats.integrity import declared_size, find_damage
 from polarguide.capture.formats.pictures import decode_picture, linear_codes
@@ -247,7 +247,7 @@ PICTURES: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
     "a cut TIFF": (cut(-3, ".tif"), Fault("v002_090.tif", found="file cut short")),
     "another kind": (
         lambda capture: capture.picture("v001", 0).write_bytes(b"GIF89a and so on"),
-        Fault("v001_000.png", found="a file that is none of these"),
+        Fault("v001_000.png", found="a file of another kind"),
     ),
     "a folder": (folder_of_a_picture, Fault("v001_000.png", "a readable file", "Is a directory")),
     "another size": (
@@ -372,7 +372,11 @@ def test_heic_is_read_as_stored_with_its_turn_and_its_exposure(tmp_path: Path, b
     full = np.iinfo(found.dtype).max
     assert found.max() == full  # of 10 bits, too
     np.testing.assert_allclose(found / full, light, atol=1.01 / ((1 << bits) - 1))
-    assert (orientation(data), declared_size(data), taken(data).light) == (turn, (64, 48), pytest.approx(2.0))
+    assert (orientation(data), declared_size(data), exif_data(data).light) == (
+        turn,
+        (64, 48),
+        pytest.approx(2.0),
+    )
 
 
 def test_heic_that_is_not_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,9 @@ from faults import Fault
 
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, DemosaicedPicture, demosaic
 from polarguide.capture.sensor.pattern import (
+    SENSORS,
     SIDE,
+    MosaicOptions,
     color_filters,
     estimate_levels,
     sensor_pattern,
@@ -22,6 +24,9 @@ from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, packed_size,
 from polarguide.preparation.mosaic_source import sample_blocks
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
+from polarguide.shots.calibration.settings import CalibrateSettings
+from polarguide.shots.options import ShotOptions
+from polarguide.synth.settings import SynthSettings
 
 
 @pytest.mark.parametrize("packing", PACKINGS)
@@ -70,6 +75,20 @@ def test_patterns_and_their_offsets(sensor: str, rows: tuple[str, ...]) -> None:
                 for column in range(period):
                     assert moved[row][column] == first[(row + y) % period][(column + x) % period]
             assert pattern.shifted(x, y).cell_corner() == ((x % 2, y % 2) if period == 4 else (0, 0))
+
+
+@pytest.mark.parametrize("settings", [PrepareSettings, ShotOptions, CalibrateSettings])
+def test_a_sensor_is_named_in_any_case(settings: type[MosaicOptions]) -> None:
+    for name in SENSORS:
+        assert settings(sensor=name.lower()).checked().sensor == name  # type: ignore[arg-type, attr-defined]
+    Fault("--sensor", found='"imx"').raised_by(settings(sensor="imx").checked)  # type: ignore[arg-type, attr-defined]
+
+
+def test_simulated_sensors_are_named_and_recorded_alike() -> None:
+    for name in SENSORS:
+        settings = SynthSettings(sensor=name.lower())  # type: ignore[arg-type]
+        settings.check()
+        assert (settings.sensor, settings.data()["sensor"]) == (name, name.lower())
 
 
 @pytest.mark.parametrize(

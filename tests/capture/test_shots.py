@@ -24,10 +24,10 @@ from polarguide.capture.calibration import Calibration
 from polarguide.capture.exposures import Angle, angle_labels, split_name, turned
 from polarguide.capture.filter.camera_files import (
     apply_orientation,
+    exif_data,
     orientation_calibration,
     read_camera_raw,
-    read_taken,
-    taken,
+    read_exposure_data,
 )
 from polarguide.capture.filter.ring_scale import BAND, place, ring_scale
 from polarguide.geometry.polarizer import malus
@@ -293,21 +293,21 @@ def test_what_files_say_about_exposure(tmp_path: Path) -> None:
     for shot in (FilterShot(0, 1.0), FilterShot(0, -0.5, 6)):
         path = tmp_path / f"{shot.orientation}.jpg"
         path.write_bytes(filter_jpeg(stokes, rays, shot, 0, np.random.default_rng(0), Sensor()))
-        assert read_taken(path).light == pytest.approx(2**shot.stops / 60 * 100 / 64, rel=1e-4)
+        assert read_exposure_data(path).light == pytest.approx(2**shot.stops / 60 * 100 / 64, rel=1e-4)
         assert cv2.imread(str(path)).shape[:2] == (16, 24)  # OpenCV turns it upright
     plain = FilterShot(0, 0.3, noted=False)
-    assert taken(filter_jpeg(stokes, rays, plain, 0, np.random.default_rng(0), Sensor())).light is None
+    assert exif_data(filter_jpeg(stokes, rays, plain, 0, np.random.default_rng(0), Sensor())).light is None
 
 
 def test_damaged_exif_says_nothing() -> None:
     whole = b"\xff\xd8\xff\xe1" + struct.pack(">H", 8 + len(exif_tags(1, Fraction(1, 50)))) + b"Exif\0\0"
     tags = exif_tags(1, Fraction(1, 50))
-    assert taken(whole + tags + b"\xff\xda").light == pytest.approx(0.02 * 100 / 64)
+    assert exif_data(whole + tags + b"\xff\xda").light == pytest.approx(0.02 * 100 / 64)
     for length in range(len(tags)):
-        light = taken(whole + tags[:length].ljust(len(tags), b"\xff") + b"\xff\xda").light
+        light = exif_data(whole + tags[:length].ljust(len(tags), b"\xff") + b"\xff\xda").light
         assert light is None or light > 0
     for tiff in (b"", b"II*\0", b"MM\0*" + b"\xff" * 40, b"MM\0*\0\0\0\x08" + b"\xff" * 400):
-        assert taken(tiff).light is None
+        assert exif_data(tiff).light is None
 
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -9,8 +9,7 @@ from faults import Fault
 from polarguide.cli import batch as verb
 from polarguide.cli.app import run
 from polarguide.experiments import batch as batches
-from polarguide.experiments.batch import Capture
-from polarguide.experiments.batch_page import Row
+from polarguide.experiments.batch import Capture, Row
 from polarguide.experiments.options import BatchOptions
 
 OPTIONS = BatchOptions(jobs=1, device="cpu")
@@ -28,11 +27,11 @@ HEAD = "name,path,sensor,options\n"
         (HEAD + "../cup,a,,\n", Fault("line 2", "name")),
         (HEAD + "cup,,,\n", Fault("line 2", "path")),
         (HEAD + "cup,a,,\n\nCup,b,,\n", Fault("line 4", "names of their own", "line 2")),
-        (HEAD + "cup,a,IMX,\n", Fault("line 2", "prepare and train", "IMX")),
+        (HEAD + "cup,a,IMX,\n", Fault("line 2), --sensor", "IMX250MYR", "IMX")),
         (HEAD + "cup,a,,--stepz 3\n", Fault("line 2", "prepare and train", "--stepz")),
         (HEAD + 'cup,a,,"--steps ""3"\n', Fault("line 2", "command line")),
-        (HEAD + "cup,a,,--steps 0\n", Fault("steps", "1 or more", "0")),
-        (HEAD + "cup,a,,--white-balance red\n", Fault("--white-balance", found="red")),
+        (HEAD + "cup,a,,--steps 0\n", Fault("line 2), steps", "1 or more", "0")),
+        (HEAD + "cup,a,,--white-balance red\n", Fault("line 2), --white-balance", found="red")),
     ],
 )
 def test_a_wrong_table_is_refused_before_anything_is_written(tmp_path: Path, text: str, fault: Fault) -> None:
@@ -54,7 +53,7 @@ def test_tables_and_folders_name_captures(
     monkeypatch.setattr(batches, "run_batch", instead)
     (tmp_path / "list.csv").write_text(
         "\ufeffName; path; sensor; options\n"
-        "cup; shots/cup; IMX250MYR; --poses none --steps 40 --zero 12\n"
+        "cup; shots/cup; imx250myr; --poses none --steps 40 --zero 12\n"
         f"demo; {demo_scene}; ; --recipe 3dgs --downscale 2\n",
         encoding="utf-8",
     )

@@ -16,7 +16,7 @@ from polarguide import __version__
 from polarguide.cli import console
 from polarguide.cli.app import VERBS, function_of, options_of, run
 from polarguide.cli.console import ConsoleReporter, JobReporter, Lines, bars, say, size_text, warnings_printed
-from polarguide.cli.evaluate import _errors, print_scores
+from polarguide.cli.runs import _errors, print_scores
 from polarguide.core.errors import PolarguideWarning
 from polarguide.core.text import printable
 from polarguide.results.evaluation.table import METRICS, OBJECT_METRICS
@@ -228,7 +228,7 @@ def test_help_loads_nothing_heavy() -> None:
 
 def test_the_list_of_verbs_loads_none_of_them() -> None:
     """Nor NumPy: the list is what a shell's user waits for."""
-    verbs = tuple(f"polarguide.cli.{module}" for module in VERBS.values())
+    verbs = tuple(f"polarguide.cli.{module}" for module, _ in VERBS.values())
     command = [sys.executable, "-c", f"HEAVY = {(*HEAVY, 'numpy', *verbs)}{LOADED}", "--help"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "loaded by --help"

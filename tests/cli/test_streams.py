@@ -62,7 +62,7 @@ def test_an_error_that_nobody_can_be_told_is_one_still(tmp_path: Path) -> None:
 def test_a_current_folder_that_is_no_more_is_one_line(tmp_path: Path) -> None:
     done = shell(f"mkdir gone; cd gone; rmdir ../gone; {PROGRAM} eval ../run", tmp_path)
     assert done.returncode == 2
-    assert done.stderr.startswith("error: the current folder: expected one that exists")
+    assert done.stderr.startswith("error: the current folder: expected an existing folder")
 
 
 @pytest.mark.parametrize(

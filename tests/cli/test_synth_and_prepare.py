@@ -36,7 +36,7 @@ def polarguide(capsys: pytest.CaptureFixture[str]) -> Iterator[Callable[..., str
     choose_variant("rgb", threads=1)
 
 
-@pytest.mark.parametrize("sensor", ["imx250mzr", "imx250myr"])
+@pytest.mark.parametrize("sensor", ["imx250mzr", "IMX250MYR"])
 def test_mosaics_come_back_through_prepare(
     sensor: str, tmp_path: Path, polarguide: Callable[..., str]
 ) -> None:

@@ -16,7 +16,7 @@ from polarguide.capture import load_scene
 from polarguide.capture.presentation import Crop
 from polarguide.cli.app import run
 from polarguide.cli.compare import chosen_steps
-from polarguide.cli.render import render
+from polarguide.cli.runs import render
 from polarguide.core.options import ComputeOptions
 from polarguide.experiments.record import read_results
 from polarguide.geometry.scene_frame import scene_frame

@@ -230,7 +230,7 @@ def rewritten(run_folder: Path, place: str, value: object) -> object:
     "place",
     [
         "recipe_data.ssim_weight",
-        "recipe_data.metal_rules.begin",
+        "recipe_data.metal_rules.prior",
         "recipe_data.angle_rules.weak",
         "recipe_data.priors.flat_rules.least",
         "recipe_data.propagation.rest",

@@ -20,7 +20,7 @@ from polarguide.experiments import cluster as clusters
 from polarguide.experiments.cluster import workers
 from polarguide.experiments.compare import compare
 from polarguide.experiments.options import BatchOptions, ClusterOptions, CompareOptions
-from polarguide.experiments.resources import jobs_at_a_time
+from polarguide.experiments.plan import jobs_at_a_time
 from polarguide.runs.folder import CHECKPOINT, LOG, RunConfiguration
 from polarguide.training.settings import TrainSettings
 
@@ -136,7 +136,7 @@ def test_the_script_of_a_job_asks_for_what_a_run_takes(monkeypatch: pytest.Monke
 
 
 def test_how_many_work_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("polarguide.experiments.resources.free_memory", lambda: 10**9)
+    monkeypatch.setattr("polarguide.experiments.plan.free_memory", lambda: 10**9)
     monkeypatch.setattr("os.cpu_count", lambda: 8)
     rows = [
         (ClusterOptions(), 20, 0, (), 8),

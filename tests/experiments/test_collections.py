@@ -17,10 +17,10 @@ from polarguide.core.options import SceneOptions
 from polarguide.core.records import decode
 from polarguide.experiments import job_queue
 from polarguide.experiments.batch import Capture, _task, run_batch
+from polarguide.experiments.children import Message, encoded
 from polarguide.experiments.collection import STEPS, CaptureRecord, prepare_settings
 from polarguide.experiments.compare import locked
 from polarguide.experiments.options import BatchOptions
-from polarguide.experiments.tasks import Message, encoded
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.training.settings import TrainSettings
 

@@ -19,10 +19,10 @@ from polarguide.core.progress import Advance, Reporter
 from polarguide.core.records import decode
 from polarguide.core.system import interrupt
 from polarguide.experiments import children, worker
+from polarguide.experiments.children import COMMAND, Message, Scoring, Training, encoded, files_digest
 from polarguide.experiments.cluster import Workers, workers
 from polarguide.experiments.job_queue import MOST_LOSSES, Job, last_row, run_job, run_jobs
 from polarguide.experiments.options import ClusterOptions
-from polarguide.experiments.tasks import COMMAND, Message, Scoring, Training, encoded, files_digest
 from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide.training.settings import TrainSettings
 

@@ -20,7 +20,7 @@ from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan
 from polarguide.experiments.record import read_results
 from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
 from polarguide.results.evaluation.evaluate import evaluate
-from polarguide.results.evaluation.sources import code_digest
+from polarguide.results.evaluation.record import code_digest
 from polarguide.runs.opened import OpenedRun
 from polarguide.training.settings import TrainSettings
 

@@ -12,8 +12,7 @@ from polarguide.core.records import decode
 from polarguide.experiments.join import join_records, join_tables
 from polarguide.experiments.record import Record, read_results
 from polarguide.experiments.results import Results
-from polarguide.experiments.tables import scores_section
-from polarguide.experiments.writing import write_tables
+from polarguide.experiments.tables import scores_section, write_tables
 
 STORED = Path(__file__).parents[2] / "benchmarks" / "results"
 PART = {"material": None, "pixels": 3, "views": 1, "metrics": {}}

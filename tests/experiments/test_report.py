@@ -18,11 +18,10 @@ from comparison_records import part, results, run, unfinished
 
 from polarguide.capture import GroundTruth, Scene
 from polarguide.capture.ground_truth import Material, SceneObject
-from polarguide.experiments.charts import Curve
-from polarguide.experiments.report import _ground_truth_tile, report_html
+from polarguide.experiments.report import Curve, _ground_truth_tile, report_html
 from polarguide.experiments.results import Results
 from polarguide.experiments.tables import sections
-from polarguide.visualization.embedded import Tile, chosen_views, data_uri, embed
+from polarguide.visualization.pages import Tile, chosen_views, data_uri, embed
 
 FREE = ("r:unpolarized", "r:unpolarized-without-consistency")
 EVIL = "</script><img src=x onerror=alert(1)>&\"'"

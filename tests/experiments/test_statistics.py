@@ -13,9 +13,9 @@ import pytest
 from comparison_records import results, run, unfinished
 from scipy import stats
 
-from polarguide.experiments.results import Results
-from polarguide.experiments.statistics import (
+from polarguide.experiments.results import (
     KNOWN_SCATTER,
+    Results,
     controlled,
     estimate,
     is_noise,

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from comparison_records import part, results, run, unfinished
 
-from polarguide.experiments.charts import (
+from polarguide.experiments.report import (
     curves_svg,
     exposure_svg,
     read_curve,
@@ -25,12 +25,15 @@ from polarguide.experiments.tables import (
     Section,
     against_section,
     control_section,
+    csv_text,
+    latex_text,
     notes,
     part_section,
+    readable,
     scores_section,
     sections,
+    write_tables,
 )
-from polarguide.experiments.writing import csv_text, latex_text, readable, write_tables
 from polarguide.results.evaluation.table import COLUMNS
 
 FREE, LOOSE = "r:unpolarized", "r:unpolarized-without-consistency"

@@ -14,6 +14,7 @@ from heard import Heard
 from polarguide.capture import Scene
 from polarguide.core.options import ComputeOptions, SceneOptions
 from polarguide.experiments import compare as comparing
+from polarguide.experiments.children import Scoring, Training
 from polarguide.experiments.cluster import Workers
 from polarguide.experiments.compare import BESIDE_OTHERS, collect
 from polarguide.experiments.job_queue import Job
@@ -27,8 +28,7 @@ from polarguide.experiments.plan import (
     scene_entries,
 )
 from polarguide.experiments.record import PartScores
-from polarguide.experiments.tasks import Scoring, Training
-from polarguide.experiments.writing import write_tables
+from polarguide.experiments.tables import write_tables
 from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.evaluate import evaluate
 from polarguide.runs.opened import OpenedRun

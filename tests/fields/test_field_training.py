@@ -16,15 +16,14 @@ import polarguide
 from polarguide import optics
 from polarguide.capture import Scene
 from polarguide.capture.variants import select_exposures
-from polarguide.fields import losses
 from polarguide.fields.field import NetworkField
 from polarguide.fields.march import _strata
 from polarguide.fields.model import FieldModel
 from polarguide.fields.recipe import FieldShape, NeuralRecipe, Sampling
 from polarguide.fields.state import FieldState
-from polarguide.fields.trainer import FieldTrainer
+from polarguide.fields.trainer import FieldTrainer, aolp_loss, color_loss, eikonal_loss, guidance_loss
 from polarguide.geometry.vectors import dot, unit
-from polarguide.recipes.gnerp import ABLATIONS_GNERP, RECIPE_GNERP
+from polarguide.recipes.baselines import ABLATIONS_GNERP, RECIPE_GNERP
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint, trained_steps
 from polarguide.runs.train import train
 from polarguide.training.settings import TrainSettings
@@ -245,7 +244,7 @@ def test_the_color_counts_where_nothing_is_polarized() -> None:
     slow = sum(
         float((1 - dolp[n]) * (found[n, c] - wanted[n, c]).abs()) for n in range(COUNT) for c in range(3)
     )
-    assert float(losses.color_loss(found, wanted, dolp)) == pytest.approx(slow / (3 * COUNT))
+    assert float(color_loss(found, wanted, dolp)) == pytest.approx(slow / (3 * COUNT))
 
 
 @pytest.mark.parametrize("circular", [False, True])
@@ -255,7 +254,7 @@ def test_angles_against_a_loop(circular: bool) -> None:
     for n in range(COUNT):
         difference = predicted(normal[n], RAYS[n]) - float(aolp[n])
         slow += float(dolp[n]) * (0.5 - 0.5 * math.cos(2 * difference) if circular else abs(difference))
-    found = losses.aolp_loss(normal, RAYS, aolp, dolp, circular=circular)
+    found = aolp_loss(normal, RAYS, aolp, dolp, circular=circular)
     assert float(found) == pytest.approx(slow / COUNT, rel=1e-6)
 
 
@@ -265,23 +264,23 @@ def test_the_published_difference_jumps_and_the_circular_one_does_not() -> None:
     normal = optics.normal_from_angles(one, torch.deg2rad(one * 89), ray)  # specular light of it: 179 degrees
     assert predicted(normal[0], ray[0]) == pytest.approx(math.radians(179))
     aolp = torch.deg2rad(one)
-    published = losses.aolp_loss(normal, ray, aolp, one, circular=False)
+    published = aolp_loss(normal, ray, aolp, one, circular=False)
     assert float(published) == pytest.approx(math.radians(178))
-    circular = losses.aolp_loss(normal, ray, aolp, one, circular=True)
+    circular = aolp_loss(normal, ray, aolp, one, circular=True)
     assert float(circular) == pytest.approx(math.sin(math.radians(2)) ** 2)
 
 
 @pytest.mark.parametrize("circular", [False, True])
 def test_normals_toward_the_camera_keep_gradients_finite(circular: bool) -> None:
     normal = (-RAYS).clone().requires_grad_()
-    loss = losses.aolp_loss(normal, RAYS, uniform(COUNT), uniform(COUNT), circular=circular)
+    loss = aolp_loss(normal, RAYS, uniform(COUNT), uniform(COUNT), circular=circular)
     loss.backward()
     assert bool(normal.grad.isfinite().all())
 
 
 def test_slopes_of_length_one_cost_nothing() -> None:
-    assert float(losses.eikonal_loss(normals(COUNT))) < 1e-10
-    assert float(losses.eikonal_loss(3 * normals(COUNT, 2))) == pytest.approx(4.0)
+    assert float(eikonal_loss(normals(COUNT))) < 1e-10
+    assert float(eikonal_loss(3 * normals(COUNT, 2))) == pytest.approx(4.0)
 
 
 def doubled(vector: torch.Tensor) -> torch.Tensor:
@@ -310,7 +309,7 @@ def test_guidance_against_a_loop(circular: bool) -> None:
         field = [turn(torch.tensor([math.sin(a), -math.cos(a)]).double()) for a in (aolp[n], *beside[n])]
         wanted = sum(torch.outer(f - field[0], f - field[0]) for f in field[1:]) / 3
         slow += float(dolp[n] * (cov - float(blended @ blended) * wanted).abs().sum()) / 4
-    found = losses.guidance_loss(own, around, weights, RAYS, aolp, beside, dolp, circular=circular)
+    found = guidance_loss(own, around, weights, RAYS, aolp, beside, dolp, circular=circular)
     assert float(found) == pytest.approx(slow / COUNT, rel=1e-6)
 
 
@@ -320,7 +319,7 @@ def test_the_published_covariance_jumps_at_180_degrees() -> None:
     flat, weight = torch.tensor([[[1.0, 0, 0]]]).double(), torch.ones(1, 1).double()
     ray, around = torch.tensor([[0.0, 0, 1]]).double(), flat[:, :, None].expand(1, 1, 6, 3)
     angles = torch.deg2rad(one * 179), torch.deg2rad(one).expand(1, 4)
-    jump = losses.guidance_loss(flat, around, weight, ray, *angles, one, circular=False)
-    smooth = losses.guidance_loss(flat, around, weight, ray, *angles, one, circular=True)
+    jump = guidance_loss(flat, around, weight, ray, *angles, one, circular=False)
+    smooth = guidance_loss(flat, around, weight, ray, *angles, one, circular=True)
     assert float(jump) > 1.0
     assert float(smooth) < 0.01

@@ -79,12 +79,12 @@ def bomb(path: Path) -> None:
 EVERYWHERE: dict[str, tuple[Callable[[Path], None], str]] = {
     "truncated": (truncated, r"cut short|complete|bytes for|cannot be developed"),
     "zero bytes": (empty, r"an empty file|bytes for .* found 0"),
-    "garbage": (garbage, r"none of these|(are|is) none|something else|bytes for|cannot be (developed|unpacked)"),
+    "garbage": (garbage, r"of another kind|(are|is) none|something else|bytes for|cannot be (developed|unpacked)"),
     "a folder": (folder, r"Is a directory|found (nothing|none)"),
     "a pipe": (pipe, r"a pipe or device|found (nothing|none)"),
     "a symlink loop": (loop, r"symbolic links|found nothing|found none"),
     "a dangling link": (dangling, r"No such file|found nothing|found none"),
-    "picture bomb": (bomb, r"more than any camera takes|bytes that are none|damaged|cut short"),
+    "picture bomb": (bomb, r"more than any camera takes|bytes of another kind|damaged|cut short"),
 }  # fmt: skip
 """What can happen to any file, and what is said of it."""
 

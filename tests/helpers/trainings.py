@@ -9,11 +9,11 @@ from torch import Tensor
 from polarguide.capture import Scene
 from polarguide.raster import Backend, choose_backend
 from polarguide.runs.folder import resolve
+from polarguide.training.feed import ViewStore
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import Trainer
-from polarguide.training.view_store import ViewStore
 
 CPU = choose_backend("cpu")
 

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
+from browsers import chromium
 from faults import Fault
 from reduced_demo import VIEWS
 from single_shots import single_shots
@@ -132,6 +133,19 @@ def test_a_folder_of_single_shots(demo_scene: Path, tmp_path: Path) -> None:
     assert len(record["angles"]["pictures"]) == len(record["views"]) == len(VIEWS)
     assert record["views"][0]["dolp"] is None
     assert "looks like" in (tmp_path / "out" / "inspection.html").read_text()
+
+
+def test_the_checks_fit_a_phone(demo_scene: Path, tmp_path: Path) -> None:
+    """What was found has the width of the window."""
+    polarguide.inspect(demo_scene, tmp_path / "out", settings=InspectSettings(normals="points"))
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": 390, "height": 844})
+        page.goto((tmp_path / "out" / "inspection.html").as_uri())
+        long = [cell for cell in page.locator(".checks td").all() if len(cell.inner_text()) > 40]
+        assert len(long) > 5
+        assert all(300 < cell.bounding_box()["width"] <= 390 for cell in long)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        page.close()
 
 
 def test_a_calibration_needs_four_pictures(demo_scene: Path, tmp_path: Path) -> None:

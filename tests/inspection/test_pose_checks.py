@@ -10,9 +10,9 @@ import torch
 from captures import write_scene
 from glossy_ball import camera_at
 
-from polarguide.inspection import pose_checks
+from polarguide.inspection import inspect
 from polarguide.inspection.capture import Capture, read_capture
-from polarguide.inspection.pose_checks import PairError, _fundamental, epipolar_errors, view_errors
+from polarguide.inspection.inspect import PairError, _fundamental, epipolar_errors, view_errors
 
 
 def test_projections_of_one_point_lie_on_each_others_epipolar_lines() -> None:
@@ -59,47 +59,47 @@ def posed(tmp_path) -> Capture:
 
 
 def test_the_bad_view_is_named(posed, monkeypatch) -> None:
-    monkeypatch.setattr(pose_checks, "epipolar_errors", lambda capture: ring(bad=4))
-    check = pose_checks.pose_check(posed)
+    monkeypatch.setattr(inspect, "epipolar_errors", lambda capture: ring(bad=4))
+    check = inspect.pose_check(posed)
     assert check.verdict == "warning"
     assert check.views == ("v04",)
     assert "v04 (6.0 px)" in check.finding
-    monkeypatch.setattr(pose_checks, "epipolar_errors", lambda capture: ring(bad=-1))
-    assert pose_checks.pose_check(posed).verdict == "ok"
+    monkeypatch.setattr(inspect, "epipolar_errors", lambda capture: ring(bad=-1))
+    assert inspect.pose_check(posed).verdict == "ok"
     everywhere = [dataclasses.replace(pair, error=5.0) for pair in ring(bad=-1)]
-    monkeypatch.setattr(pose_checks, "epipolar_errors", lambda capture: everywhere)
-    assert pose_checks.pose_check(posed).verdict == "wrong"
+    monkeypatch.setattr(inspect, "epipolar_errors", lambda capture: everywhere)
+    assert inspect.pose_check(posed).verdict == "wrong"
 
 
 def test_views_without_a_pose_are_named(posed, monkeypatch) -> None:
-    monkeypatch.setattr(pose_checks, "epipolar_errors", lambda capture: ring(bad=-1))
+    monkeypatch.setattr(inspect, "epipolar_errors", lambda capture: ring(bad=-1))
     views = (dataclasses.replace(posed.views[0], camera=None), *posed.views[1:])
-    check = pose_checks.pose_check(dataclasses.replace(posed, views=views))
+    check = inspect.pose_check(dataclasses.replace(posed, views=views))
     assert check.verdict == "warning"
     assert check.views == ("v00",)
 
 
 def test_pictures_that_share_nothing_are_not_judged(posed) -> None:
-    assert pose_checks.pose_check(posed).verdict == "n/a"
+    assert inspect.pose_check(posed).verdict == "n/a"
 
 
 def test_without_a_model_there_is_nothing_to_judge(tmp_path) -> None:
     capture = read_capture(write_scene(tmp_path / "s"))
-    assert pose_checks.pose_check(capture).verdict == "n/a"
-    assert pose_checks.coverage_check(capture).verdict == "n/a"
+    assert inspect.pose_check(capture).verdict == "n/a"
+    assert inspect.coverage_check(capture).verdict == "n/a"
 
 
 def test_gaps_and_few_views_are_named(posed, monkeypatch) -> None:
-    check = pose_checks.coverage_check(posed)
+    check = inspect.coverage_check(posed)
     assert check.verdict == "warning"  # thirty degrees apart
     assert len(check.views) == 12
     near = tuple(
         dataclasses.replace(view, camera=camera_at(0.2 * k, 0.3, 0)) for k, view in enumerate(posed.views)
     )
-    monkeypatch.setattr(pose_checks, "FEW_VIEWS", 5)
-    assert pose_checks.coverage_check(dataclasses.replace(posed, views=near)).verdict == "ok"
+    monkeypatch.setattr(inspect, "FEW_VIEWS", 5)
+    assert inspect.coverage_check(dataclasses.replace(posed, views=near)).verdict == "ok"
     far = (*near[:-1], dataclasses.replace(near[-1], camera=camera_at(3.6, 0.3, 0)))
-    check = pose_checks.coverage_check(dataclasses.replace(posed, views=far))
+    check = inspect.coverage_check(dataclasses.replace(posed, views=far))
     assert (check.verdict, check.views) == ("warning", ("v11",))
 
 

@@ -315,8 +315,10 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path: Path) -> 
     path = tmp_path / "camera.safetensors"
     wanted = replace(settings, analyzers=path)
     cases = {
-        "a calibration of the sensor IMX250MYR, found one of IMX250MZR": replace(wanted, sensor="IMX250MYR"),
-        "from column 2, row 0 on, or more, found one of 96x64": replace(wanted, offset_x=2),
+        "a calibration of the sensor IMX250MYR, found the calibration of IMX250MZR": replace(
+            wanted, sensor="IMX250MYR"
+        ),
+        "from column 2, row 0 on, found the calibration of 96x64": replace(wanted, offset_x=2),
         "hold the gains of every pixel": replace(wanted, calibration=Calibration(gains=(1, 1, 1, 1.01))),
     }
     for expected, asked in cases.items():

@@ -62,7 +62,7 @@ MOSAICS: dict[str, tuple[Callable[[Path], object], PrepareSettings, Fault]] = {
     "duplicate names": (
         lambda d: picture(d / "v000.tif", np.ones((48, 64), np.uint16)), MOSAIC, Fault(found="v000.png and v000.tif")
     ),
-    "not a picture": (lambda d: (d / "v000.png").write_text("hello"), MOSAIC, Fault("v000.png", found="none of these")),
+    "not a picture": (lambda d: (d / "v000.png").write_text("hello"), MOSAIC, Fault("v000.png", found="another kind")),
     "tiny": (
         lambda d: [picture(d / f"v00{i}.png", np.ones((8, 8), np.uint16)) for i in range(3)],
         MOSAIC, Fault(expected="at least 16x16"),

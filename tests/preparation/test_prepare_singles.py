@@ -356,11 +356,11 @@ TABLES = {
     "no picture": ("file,angle\nangles.csv,0\na.png,0\nb.png,0\n", Fault(expected="pictures")),
     "name of a view": (
         "file,angle,view\na.png,0,a/b\nb.png,0,c\n",
-        Fault(expected="names of views that files may have"),
+        Fault(expected="a view name that can be a file name"),
     ),
     "control characters": (
         'file,angle,view\na.png,0,"a\nb"\nb.png,0,c\n',
-        Fault(expected="names of views that files may have"),
+        Fault(expected="a view name that can be a file name"),
     ),
     "gain": ("file,angle,gain\na.png,0,0\nb.png,0,1\n", Fault(expected="a gain from")),
 }
@@ -385,8 +385,12 @@ def refused(root: Path, settings: PrepareSettings, fault: Fault) -> None:
 @pytest.mark.parametrize(
     ("names", "changes", "fault"),
     [
-        (("a_a30.jpg", "IMG_0012.jpg"), {}, Fault(found="1 of 2 without one (IMG_0012.jpg)")),
-        (("img_001.jpg", "img_002.jpg"), {"format": "singles"}, Fault(found="2 of 2 without one")),
+        (
+            ("a_a30.jpg", "IMG_0012.jpg"),
+            {},
+            Fault(found="1 of 2 without an angle in their names (IMG_0012.jpg)"),
+        ),
+        (("img_001.jpg", "img_002.jpg"), {"format": "singles"}, Fault(found="2 of 2 without an angle")),
         (("img_001.jpg", "img_002.jpg"), {}, Fault(remedy="--angles unknown, or angles.csv")),
         (("img_001.jpg", "img_002.jpg"), {}, Fault(remedy="in --out in-scene --angles none")),
         (("a_a30.jpg", "a-30.png"), {}, Fault(expected="one photograph of a at 30 degrees")),

@@ -11,7 +11,8 @@ import torch
 from faults import Fault
 from raster_scenes import differences, in_view, outcome, posed
 
-from polarguide.raster import ScreenStatistic, Splats, backends, choose_backend, cuda, rasterize_reference
+from polarguide import raster
+from polarguide.raster import ScreenStatistic, Splats, choose_backend, cuda, rasterize_reference
 from polarguide.raster.cuda import load_gsplat, rasterize_cuda
 
 TOLERANCE = 2e-5
@@ -143,9 +144,9 @@ def pretend(monkeypatch: pytest.MonkeyPatch, *, gpus: int, gsplat: bool) -> None
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpus > 0)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
     monkeypatch.setattr(torch.cuda, "set_device", lambda device: None)
-    for module in (backends, cuda):
+    for module in (raster, cuda):
         monkeypatch.setattr(module, "has_gsplat", lambda: gsplat)
-    monkeypatch.setattr(backends, "load_gsplat", lambda say: load_gsplat(say) if not gsplat else None)
+    monkeypatch.setattr(raster, "load_gsplat", lambda say: load_gsplat(say) if not gsplat else None)
 
 
 def test_auto_takes_the_gpu_that_can_be_used(monkeypatch: pytest.MonkeyPatch) -> None:

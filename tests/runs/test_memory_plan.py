@@ -14,15 +14,17 @@ from torch import Tensor
 
 from polarguide.capture import Scene
 from polarguide.core.options import Exposures, SceneOptions, gibibytes
+from polarguide.core.progress import SILENT
 from polarguide.fields.recipe import NeuralRecipe
 from polarguide.fields.state import FieldState
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.runs import forecast as forecasts
 from polarguide.runs import train as training
-from polarguide.runs.folder import MOST_GAUSSIANS, resolve
+from polarguide.runs.folder import MOST_GAUSSIANS, RunLog, resolve
 from polarguide.runs.forecast import GIBIBYTE, MemoryPlan, plan_field_memory, plan_memory
 from polarguide.training.flat import Flat
+from polarguide.training.recipe import Recipe
 from polarguide.training.settings import STEPS, ResolvedSettings, TrainSettings
 
 STOKES = RECIPES["polarguide-stokes"]
@@ -132,40 +134,51 @@ def test_a_forecast_leaves_no_trace_and_a_short_training_has_none(tiny_scene: Sc
     ]
 
 
-def test_the_time_left_follows_the_stages_the_priors_and_the_gaussians() -> None:
-    """A machine that is half as fast as forecast, where an event of a minute comes at the tenth part."""
-    steps, first, most = 1000, 1000, 9000
+def test_the_time_left_follows_stages_priors_growth_and_looks() -> None:
+    """A machine half as fast as forecast, where an event of a minute comes at the tenth part. The Gaussians grow
+    faster at first, reach the limit at four tenths, and three in ten go at the half; looks take seconds."""
+    steps, first, most, limit = 5000, 1000, 9000, 10_000
+    assert isinstance(STOKES, Recipe)
     priors = np.zeros(steps, bool)
-    priors[100:160] = priors[500:560] = True
-    least = np.where(np.arange(steps) < 100, 0.01, 0.02) + 0.05 * priors
-    expected = forecasts.Forecast(0, 0, first, most, 0, np.stack([least, 2 * least]), priors)
-    grown = np.minimum(first + 1000 * (np.arange(steps) // 100), 5000)  # density control ends at the half
-    true = 2 * (least * (1 + (grown - first) / (most - first)))
+    priors[500:560] = priors[2500:2560] = True
+    least = np.where(np.arange(steps) < 500, 0.01, 0.02) + 0.05 * priors
+    looks = np.isin(np.arange(steps), (2000, 3000, 3500))
+    costs = np.stack([least + looks, 2 * least + 9 * looks])
+    expected = forecasts.Forecast(0, 0, first, most, limit, 0, costs, priors)
+    added = np.cumsum(120 * np.minimum(np.arange(1, 26), 5))
+    grown = np.minimum(first + np.append(0, added)[np.arange(steps) // 100 % 26], limit)
+    grown[2500:] = 0.7 * grown[2499]
+    true = 2 * (costs[0] + (costs[1] - costs[0]) * (grown - first) / (most - first))
     left = forecasts.TimeLeft(expected, STOKES)
     for done in range(10, steps, 10):
-        event = 60.0 if done == 110 else 0.0
+        event = 60.0 if done == 510 else 0.0
         found = left.take(done, int(grown[done - 1]), float(true[done - 10 : done].sum()) + event)
-        if done > 100:
-            assert found == pytest.approx(true[done:].sum(), rel=0.2), done
+        if done > 100:  # one round of the density control was seen
+            assert found == pytest.approx(true[done:].sum(), rel=0.1), done
 
 
-def test_what_is_found_once_of_all_views_is_not_forecast_for_each(
-    tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch
+def test_what_is_found_once_of_all_views_is_found_once(
+    tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock = 0.0
+    """The forecast finds it, the training takes it over and counts its seconds."""
+    clock, calls = 0.0, 0
 
     def slow(views: object, index: float, rules: object) -> dict[str, Flat]:
-        nonlocal clock
+        nonlocal clock, calls
         clock += 1000.0
+        calls += 1
         return {}
 
     monkeypatch.setattr("polarguide.training.feed.flat_surfaces", slow)
-    monkeypatch.setattr(forecasts, "time", SimpleNamespace(perf_counter=lambda: clock))
-    found = forecasts.forecast(
-        tiny_scene, STOKES, resolve(TrainSettings(600), tiny_scene, STOKES), choose_backend("cpu"), 10**9
-    )
-    assert clock >= 1000.0
-    assert found.seconds == 0.0
+    ticking = SimpleNamespace(perf_counter=lambda: clock, process_time=lambda: clock)
+    monkeypatch.setattr(forecasts, "time", ticking)
+    monkeypatch.setattr(forecasts, "LEAST_STEPS", 30)
+    lines: list[str] = []
+    reporter = SimpleNamespace(say=lines.append, warn=lines.append, track=SILENT.track)
+    training.train(tiny_scene, tmp_path / "run", recipe=STOKES, settings=TrainSettings(40), reporter=reporter)  # type: ignore[arg-type]
+    assert calls == 1
+    assert [line for line in lines if line.startswith("took 17 min")]
+    assert RunLog(tmp_path / "run").elapsed()[0] == 1000.0
 
 
 def test_options_take_a_limit() -> None:

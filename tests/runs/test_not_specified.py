@@ -15,7 +15,7 @@ DECIDES = {"options.py", "runs/folder.py", "training/settings.py"}
 EXCEPT = {
     ("optics", "default of refractive_index"): "formulas, which know no scene",
     ("shading/model.py", "default of refractive_index"): "of a recipe; ``bind`` gives it the run's",
-    ("cli/demo.py", "default of steps"): "the demo's own number",
+    ("cli/runs.py", "default of steps"): "the demo's own number",
     ("inspection/settings.py", "default of steps"): "of the short training that inspects",
     ("fields/recipe.py", "default of steps"): "the recipe's own number, which ``resolve`` takes",
     ("fields/recipe.py", "default of background"): "samples of a ray",

@@ -9,7 +9,7 @@ from toy_shading import TOY, SkyShading
 
 import polarguide
 from polarguide.experiments.compare import ablated
-from polarguide.results.evaluation.sources import model_digest
+from polarguide.results.evaluation.record import model_digest
 from polarguide.shading.deferred import DeferredShading
 
 

@@ -30,7 +30,7 @@ MOSAIC_ONLY: list[dict[str, Any]] = [
 def test_options_of_mosaics_are_refused_for_four_shots(tmp_path: Path, given: dict[str, Any]) -> None:
     paths = write_four(tmp_path, CUP)
     option = "--" + next(iter(given)).replace("_", "-")
-    fault = Fault(option, "raw mosaics, which it is for", "cup, a shot through a filter")
+    fault = Fault(option, "raw mosaics: the option is for these", "cup, a shot through a filter")
     fault.raised_by(find_shots, paths, ShotOptions(**given))
     fault.raised_by(read_shot, find_shots(paths)[0], ShotOptions(**given))
 
@@ -61,7 +61,7 @@ def test_options_of_filters_are_refused_for_mosaics(tmp_path: Path, given: dict[
 
 
 def test_read_noise_needs_a_full_well() -> None:
-    Fault("--read-noise", expected="a full well beside it").raised_by(ShotOptions(read_noise=5.0).checked)
+    Fault("--read-noise", expected="--full-well with it").raised_by(ShotOptions(read_noise=5.0).checked)
     ShotOptions(read_noise=5.0, full_well=5000.0).checked()
 
 

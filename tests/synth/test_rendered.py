@@ -23,10 +23,9 @@ from polarguide.geometry.camera import Camera, look_at
 from polarguide.geometry.vectors import unit_array as unit
 from polarguide.synth.build import BuiltScene, _mesh, _user_mesh, build_scene
 from polarguide.synth.colmap import place_cameras
-from polarguide.synth.film import LobeRadiance, render_lobes
 from polarguide.synth.ground_truth import base_colors, ground_truth_maps, intersect
 from polarguide.synth.schema import parse_scene
-from polarguide.synth.sensor import Sensor, mosaic, noisy
+from polarguide.synth.sensor import LobeRadiance, Sensor, mosaic, noisy, render_lobes
 from polarguide.synth.settings import PRESETS, Variant, find_scene
 from polarguide.synth.transport import PathLimits
 

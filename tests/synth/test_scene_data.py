@@ -10,7 +10,7 @@ import plyfile
 import pytest
 from faults import Fault
 
-from polarguide.synth.build import area_light_dict
+from polarguide.synth.build import area_light_dict, make_mesh
 from polarguide.synth.colmap import place_cameras
 from polarguide.synth.mesh import Mesh, write_ply
 from polarguide.synth.render import parse_sweep
@@ -25,7 +25,6 @@ from polarguide.synth.schema import (
     with_current_keys,
 )
 from polarguide.synth.settings import PRESETS, Overrides, find_scene
-from polarguide.synth.shapes import make_mesh
 from polarguide.synth.textures import ENVIRONMENTS, TEXTURES, directions, make_environment, make_texture
 
 SMALL = {

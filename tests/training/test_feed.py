@@ -13,22 +13,23 @@ from polarguide.capture import Scene
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.forecast import _priors_made
-from polarguide.training import view_store
-from polarguide.training.feed import Feed, coarse_steps
-from polarguide.training.priors import view_priors
-from polarguide.training.recipe import Coarse, Recipe, Weights
-from polarguide.training.settings import ResolvedSettings
-from polarguide.training.targets import StepTargets
-from polarguide.training.view_store import (
+from polarguide.training import feed
+from polarguide.training.feed import (
     Entry,
+    Feed,
     Packed,
     ViewStore,
+    coarse_steps,
     holds,
     pack_priors,
     packed,
     unpack_priors,
     unpacked,
 )
+from polarguide.training.priors import view_priors
+from polarguide.training.recipe import Coarse, Recipe, Weights
+from polarguide.training.settings import ResolvedSettings
+from polarguide.training.targets import StepTargets
 
 STEPS, STOP = 24, 13
 
@@ -108,7 +109,7 @@ def test_a_disk_without_room_is_said_once_and_costs_only_time(
     def full(**_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(view_store.tempfile, "TemporaryFile", full)
+    monkeypatch.setattr(feed.tempfile, "TemporaryFile", full)
     said: list[str] = []
     store = ViewStore(0, tmp_path, said.append)
     for seed in (0, 1, 0):

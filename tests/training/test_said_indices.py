@@ -20,10 +20,9 @@ from polarguide.raster.cpu import rasterize_cpu
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import CHECKPOINT
 from polarguide.runs.train import TrainingStopped
-from polarguide.training.feed import Feed
+from polarguide.training.feed import Feed, ViewStore
 from polarguide.training.metals.observations import index_offsets, index_picture
 from polarguide.training.settings import TrainSettings
-from polarguide.training.view_store import ViewStore
 
 READING = SceneOptions(downscale=4)
 TABLE = {"3": {"refractive_index": 1.33, "name": "water"}, "4": {"refractive_index": 1.8}}

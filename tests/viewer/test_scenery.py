@@ -3,11 +3,13 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from random_runs import KINDS, ring
+from faults import Fault
+from random_runs import KINDS, random_state, ring
 from small_fields import small
 from textured_ball import textured_ball
 from viewer_scenes import frame_of_scene, photograph, shown
@@ -32,6 +34,7 @@ from polarguide.viewer.scenery import (
     run_scenery,
     training_scenery,
 )
+from polarguide.viewer.server import view_run
 from polarguide.visualization import figures
 from polarguide.visualization.layers import polarization_picture
 
@@ -173,6 +176,33 @@ def test_a_wipe_shows_what_was_measured_from_the_left():
     free, depth = Appearance(wipe=0.5), Appearance(layer="depth", wipe=0.5)
     assert np.array_equal(paint(seen, free), paint(seen))
     assert np.array_equal(paint(seen, depth, view), paint(seen, replace(depth, wipe=0.0), view))
+
+
+@pytest.mark.parametrize("layer", ["final", "normal", "dolp"])
+def test_a_wipe_between_two_runs_shows_the_other_from_the_left(layer: str) -> None:
+    seen = shown()
+    other = replace(seen, gaussians=random_state("polarguide-stokes", 200)[0].gaussians)
+    painter, plain = Painter(frame_of_scene(), other), Appearance(layer=layer)
+    middle = CAMERA.width // 2
+    for view in (None, photograph("v1", CAMERA, seen).view):
+        wiped = painter.paint(seen, CAMERA, replace(plain, wipe=0.5), view)
+        left, right = (paint(each, plain, view) for each in (other, seen))
+        assert not np.array_equal(left, right)
+        assert np.array_equal(wiped[:, : middle - 1], left[:, : middle - 1])
+        assert np.array_equal(wiped[:, middle + 1 :], right[:, middle + 1 :])
+    without = shown("3dgs")
+    assert np.array_equal(
+        Painter(frame_of_scene(), without).paint(seen, CAMERA, Appearance(layer="dolp", wipe=0.5)),
+        paint(seen, Appearance(layer="dolp")),
+    )
+
+
+def test_a_run_of_another_scene_is_not_put_beside() -> None:
+    one, other = (
+        SimpleNamespace(folder=Path(name), configuration=SimpleNamespace(scene=name, scene_digest=name))
+        for name in ("cup", "car")
+    )
+    Fault("car", "a run of cup", "one of car").raised_by(view_run, one, beside=other)
 
 
 def test_colors_of_depths_stay_while_the_camera_moves():

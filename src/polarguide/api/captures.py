@@ -1,4 +1,4 @@
-"""What the Python interface makes of captures and shots: no training needs it, which begins sooner without."""
+"""Functions of the Python interface on captures and shots. A training does not import them and begins sooner."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the Python interface makes of runs. The command line is a client of it.
+"""Functions of the Python interface on runs. The command line is a client of it.
 
 Nothing here prints or installs signal handlers: progress and messages go to a ``Reporter``.
 """

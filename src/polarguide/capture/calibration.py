@@ -1,4 +1,4 @@
-"""What a polarization camera or filter does that an ideal one would not: gains, order, sense and zero of its angles."""
+"""Deviations of a polarization camera or filter from an ideal one: gains, and order, sense and zero of its angles."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def combined(first: Calibration, second: Calibration) -> Calibration | None:
 
 
 def _count(sign: int, zero: int) -> tuple[int, ...]:
-    """What 0, 45, 90 and 135 mean where angles count one way from a zero."""
+    """The angles named 0, 45, 90 and 135 where angles count one way from a zero."""
     return tuple((sign * angle + zero) % 180 for angle in ANGLES)
 
 

@@ -57,7 +57,7 @@ class Measures:
 
 
 def sampled(codes: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """What ``measure`` looks at of the codes of a view [K, H, W, 3], for whoever does not keep them."""
+    """The sample of a view's codes [K, H, W, 3] that ``measure`` takes, for a caller that does not keep the codes."""
     step = _step(codes.shape[1] * codes.shape[2])
     return codes[:, ::step, ::step].copy()
 
@@ -129,8 +129,8 @@ def exposure_warnings(
 
     Args:
         names: view names.
-        measures: their measures.
-        blown: their shares of pixels with an angle at full scale.
+        measures: figures of each view.
+        blown: of each view, the share of pixels of which a picture is at full scale.
         largest: the largest value stored in any picture.
         full: the largest possible one.
     """
@@ -249,7 +249,7 @@ class MeasuredGains:
         """
         if self.pairing != 0:
             return {}
-        off = [mine - said for mine, said in zip(self.logs, stated, strict=True)]
+        off = [log - shift for log, shift in zip(self.logs, stated, strict=True)]
         found = {}
         for place, angle in enumerate(ANGLES):
             apart = off[place] - float(np.median(off[:place] + off[place + 1 :]))

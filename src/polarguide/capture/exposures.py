@@ -20,8 +20,7 @@ from polarguide.capture.calibration import Calibration
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
 from polarguide.core.records import shortened
-from polarguide.core.spreadsheet import csv_lines
-from polarguide.core.text import number_or_nan
+from polarguide.core.text import csv_lines, number_or_nan
 from polarguide.geometry.polarizer import ANGLES
 from polarguide.optics import Mount
 
@@ -55,7 +54,7 @@ def angle_text(angle: Angle) -> str:
 
 
 def angle_labels(angles: Sequence[Angle]) -> list[str]:
-    """What tells the pictures of a view apart in their names: 045, 012.5, unknown, none, unknown-2, ..."""
+    """Parts of file names that identify the pictures of a view: 045, 012.5, unknown, none, unknown-2, ..."""
     found: list[str] = []
     for angle in angles:
         label = angle if isinstance(angle, str) else _angle_digits(angle)
@@ -306,8 +305,17 @@ def table_text(lines: Iterable[tuple[str, str, Exposure, float | None, str]]) ->
     rows: list[list[object]] = [[*_COLUMNS]]
     for file, view, exposure, modulation, note in lines:
         known = "unknown" if exposure.angle is None else f"{exposure.angle:.2f}"
-        shown = None if modulation is None else f"{modulation:.2f}"
-        rows.append([file, view, known if exposure.filtered else "none", f"{exposure.gain:.4f}", shown, note])
+        modulation_text = None if modulation is None else f"{modulation:.2f}"
+        rows.append(
+            [
+                file,
+                view,
+                known if exposure.filtered else "none",
+                f"{exposure.gain:.4f}",
+                modulation_text,
+                note,
+            ]
+        )
     return csv_lines(rows)
 
 

@@ -71,7 +71,7 @@ def codes_of_floats(values: NDArray[Any], where: str) -> NDArray[np.uint16]:
             where,
             expected="floats from 0 to 1, linear, 1 at full scale",
             found=f"{low:g} to {high:g}",
-            remedy="Divide by the value at full scale, and clip what noise makes of black.",
+            remedy="Divide by the value at full scale, and clip negative noise to 0.",
         )
     return np.rint(values.astype(np.float64) * FULL_CODE).astype(np.uint16)
 
@@ -119,18 +119,18 @@ def in_order(
 
 
 def by_name(
-    given: Mapping[str, Any] | Sequence[Any] | Array, what: str, names: Sequence[str] = ()
+    values: Mapping[str, Any] | Sequence[Any] | Array, what: str, names: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Values by view: of a mapping, or in the order of ``names``; without those, views are called v000, v001, ...
 
     Raises:
         PolarguideError: there are others than of ``names``, or none.
     """
-    if isinstance(given, Mapping):
-        found = {str(name): value for name, value in given.items()}
+    if isinstance(values, Mapping):
+        found = {str(name): value for name, value in values.items()}
     else:
-        labels = names if names and len(names) == len(given) else [f"v{k:03d}" for k in range(len(given))]
-        found = dict(zip(labels, given, strict=True))
+        labels = names if names and len(names) == len(values) else [f"v{k:03d}" for k in range(len(values))]
+        found = dict(zip(labels, values, strict=True))
     if not found or (names and sorted(found) != sorted(names)):
         others = len(found) == len(names) > 0
         raise PolarguideError(

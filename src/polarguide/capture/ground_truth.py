@@ -71,7 +71,7 @@ class SceneObject(msgspec.Struct, frozen=True):
 
 
 class _Scene(msgspec.Struct):
-    """What is read of ``scene.json``."""
+    """The fields of ``scene.json`` that are read."""
 
     objects: list[SceneObject] | None = None
 

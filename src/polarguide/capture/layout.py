@@ -106,8 +106,8 @@ def find_layout(root: Path) -> Layout:
     without = sorted(names - sides["masks"].keys())
     if sides["masks"] and without:
         warnings.append(f"masks/ has no file for {len(without)} of {len(names)} views ({listed(without)}).")
-    given = sides["masks"], sides["invalid"], sides["gt"]
-    return Layout(root, pictures, *given, tuple(warnings), others, table, sides["materials"])
+    by_view = sides["masks"], sides["invalid"], sides["gt"]
+    return Layout(root, pictures, *by_view, tuple(warnings), others, table, sides["materials"])
 
 
 def refuse_scene(out: Path) -> None:
@@ -199,8 +199,8 @@ def _read_flat(
             )
     pictures: dict[str, dict[int, Path]] = {}
     strangers = []
-    told = {item.file for item in lines}
-    for stem, path in index_files(folder, SUFFIXES, told).items():
+    listed_files = {item.file for item in lines}
+    for stem, path in index_files(folder, SUFFIXES, listed_files).items():
         match = _PICTURE_STEM.fullmatch(stem)
         if match is None:
             strangers.append(path.name)
@@ -280,7 +280,7 @@ def _alike_but_for_the_angle(folders: Sequence[Path]) -> dict[int, Path]:
 
 
 def angle_of_folder(path: Path) -> int | None:
-    """The polarizer angle that a folder is named after; None if it is none."""
+    """The polarizer angle that a folder is named after; None for other names."""
     match = _ANGLE_FOLDER.fullmatch(path.name)
     return int(match["angle"]) if match is not None and int(match["angle"]) in ANGLES else None
 
@@ -324,7 +324,7 @@ def ambiguous(folder: Path, expected: str, first: Path, second: Path) -> Polargu
 
 
 def describe_contents(root: Path) -> str:
-    """What a folder holds, for messages."""
+    """A description of a folder's contents, for messages."""
     names = sorted(path.name for path in root.iterdir())
     return f"a folder with {listed(names)}" if names else "an empty folder"
 

@@ -48,7 +48,7 @@ class _Materials(msgspec.Struct):
 
 
 class _Scene(msgspec.Struct):
-    """What is read of ``scene.json``; what else it says is passed over."""
+    """The fields of ``scene.json`` that are read; others are ignored."""
 
     refractive_index: Index | None = None
     objects: list[_Object] = []
@@ -75,7 +75,7 @@ class _Angles(msgspec.Struct):
 
 
 class _Prepared(msgspec.Struct):
-    """What ``prepare`` and ``inspect --fix`` did to the angles."""
+    """Changes that ``prepare`` and ``inspect --fix`` have made to the angles."""
 
     calibration: _Angles | None = None
     corrections: list[_Angles] = []

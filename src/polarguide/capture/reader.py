@@ -211,7 +211,7 @@ def read_views(
 
 
 def _without_pictures(data: ViewData) -> ViewData:
-    """What ``read_views`` keeps of a view whose pictures stay in their files."""
+    """The part of a view that ``read_views`` keeps if its pictures stay in their files."""
     truth = data.ground_truth
     told_apart = truth is not None and truth.object_ids is not None
     stub = GroundTruth(object_ids=torch.empty(0)) if told_apart else None

@@ -246,10 +246,10 @@ class Scene:
         check_choice("transfer", transfer, TRANSFERS)
         check_choice("split", split, get_args(Split))
         check_choice("mount", mount, get_args(Mount))
-        given = by_name(pictures, "pictures")
-        names = list(given)
+        values = by_name(pictures, "pictures")
+        names = list(values)
         posed = by_name(cameras, "cameras", names)
-        told = (
+        stated = (
             by_name(angles, "angles", names)
             if isinstance(angles, Mapping)
             else dict.fromkeys(names, tuple(angles))
@@ -259,7 +259,7 @@ class Scene:
             for what, arrays in (("masks", masks), ("invalid", invalid))
         }
         data = [
-            _view_of(each, given[each], posed[each], told[each], beside, transfer, downscale)
+            _view_of(each, values[each], posed[each], stated[each], beside, transfer, downscale)
             for each in sorted(names)
         ]
         ready = {each: posed[each] if downscale == 1 else posed[each].downscaled(downscale) for each in names}
@@ -267,7 +267,7 @@ class Scene:
         places, shades = _points_of(points, point_colors)
         tests = chosen_views(posed, split) if test_views is None else tuple(sorted(test_views))
         for each in tests:
-            if each not in given:
+            if each not in values:
                 raise unknown_view("test_views", each, names)
         return Scene(
             root=IN_MEMORY,
@@ -361,10 +361,10 @@ def _view_of(
     )
 
 
-def _mask(given: Array | None, where: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
-    if given is None:
+def _mask(values: Array | None, where: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
+    if values is None:
         return None
-    mask = as_numpy(given)
+    mask = as_numpy(values)
     if mask.shape != size or mask.dtype != bool:
         raise _unlike(where, f"bool of shape {list(size)}", kind_of(mask))
     return np.ascontiguousarray(mask)
@@ -382,9 +382,9 @@ def _points_of(
     return places, shades
 
 
-def _rows(given: Any, where: str, kind: type[np.generic]) -> NDArray[Any]:
+def _rows(values: Any, where: str, kind: type[np.generic]) -> NDArray[Any]:
     """Rows of three finite numbers."""
-    array = as_numpy(given)
+    array = as_numpy(values)
     if array.ndim != 2 or array.shape[1] != 3 or not len(array) or not np.isfinite(array).all():
         raise _unlike(where, "finite numbers of shape [M, 3], at least one row", kind_of(array))
     if kind is np.uint8 and array.dtype != np.uint8:

@@ -187,7 +187,7 @@ def _lens_of(where: str, frame: _Lens, record: _Lens) -> dict[str, Any]:
     Focal lengths and coefficients are statements as a whole: a frame that makes one takes nothing of the file's.
 
     Raises:
-        PolarguideError: the matrix is none of a camera, or stands beside other numbers.
+        PolarguideError: the matrix is no camera matrix, or stands beside other numbers.
     """
     lens = {name: getattr(frame, name) for name in _Lens.__struct_fields__}
     whole = (_FOCAL, (*_COEFFICIENTS, "distortion_params"))
@@ -210,12 +210,12 @@ def _lens_of(where: str, frame: _Lens, record: _Lens) -> dict[str, Any]:
 
 def _pose_of(where: str, frame: _Frame) -> Any:
     """The matrix from the camera to the world, [4, 4], with the axes of the file."""
-    given = [
+    matrices = [
         matrix
         for matrix in (frame.transform_matrix, frame.transform_matrix_start, frame.transform_matrix_end)
         if matrix is not None
     ]
-    numbers = [finite_numbers(where, matrix, _SQUARE)[:3] for matrix in given or [[]]]
+    numbers = [finite_numbers(where, matrix, _SQUARE)[:3] for matrix in matrices or [[]]]
     if any(not np.allclose(numbers[0], other) for other in numbers[1:]):
         found = "transform_matrix_start and transform_matrix_end that differ"
         raise wrong_camera(where, "a camera that stands still", found)
@@ -268,16 +268,16 @@ def _distortion(where: str, lens: Mapping[str, Any], fisheye: bool) -> list[floa
     Raises:
         PolarguideError: there are others, or two statements differ.
     """
-    given = [lens[name] for name in _COEFFICIENTS]
-    value = [float(number or 0.0) for number in given]
+    coefficients = [lens[name] for name in _COEFFICIENTS]
+    value = [float(number or 0.0) for number in coefficients]
     params = lens["distortion_params"]
     if params is not None:
         if len(params) != len(_COEFFICIENTS):
             raise wrong_camera(
                 where, "six distortion_params: k1, k2, k3, k4, p1, p2", f"{len(params)} numbers"
             )
-        if any(own is not None and own != other for own, other in zip(given, params, strict=True)):
-            found = f"{params} beside {dict(zip(_COEFFICIENTS, given, strict=True))}"
+        if any(own is not None and own != other for own, other in zip(coefficients, params, strict=True)):
+            found = f"{params} beside {dict(zip(_COEFFICIENTS, coefficients, strict=True))}"
             raise wrong_camera(where, "distortion_params that agree with k1 to p2", found)
         value = [float(number) for number in params]
     k1, k2, k3, k4, p1, p2 = value
@@ -312,7 +312,7 @@ def _focal_lengths(
     """Focal lengths in x and y: in pixels, by an angle of view in radians, or in degrees.
 
     Raises:
-        PolarguideError: there is none that is positive, or two statements differ.
+        PolarguideError: no value is positive, or two values differ.
     """
     found: list[float | None] = []
     for axis, side in zip("xy", size, strict=True):
@@ -356,7 +356,7 @@ def camera_to_world(
         to_world: [4, 4], with axes right, down, forward; a scale is taken out.
 
     Raises:
-        PolarguideError: the pose is none.
+        PolarguideError: the matrix is not a pose.
     """
     scale = abs(np.linalg.det(to_world[:3, :3])) ** (1 / 3)
     if not 1e-6 < scale < 1e6:

@@ -100,14 +100,14 @@ def mask_background(scene: Scene) -> Scene:
 
 def _in_masks(points: Tensor, views: Sequence[View]) -> Tensor:
     """Which points [M, 3] lie in the grown masks of most of the pictures that they fall into, [M] bool."""
-    seen, inside = torch.zeros(len(points)), torch.zeros(len(points))
+    counts, inside = torch.zeros(len(points)), torch.zeros(len(points))
     for view in views:
         assert view.mask is not None
         mask = torch.from_numpy(_grown(view.mask.cpu().numpy(), GROWN))
         pixel, _, within = seen_at(points.double() - view.camera.center, view.camera)
-        seen += within
+        counts += within
         inside += within & mask[pixel]
-    return (seen > 0) & (inside >= INSIDE * seen)
+    return (counts > 0) & (inside >= INSIDE * counts)
 
 
 def _black(view: View) -> NDArray[np.bool_]:
@@ -155,7 +155,7 @@ def select_exposures(scene: Scene, exposures: Exposures) -> Scene:
         raise PolarguideError(
             scene.root,
             expected=f"pictures at 0, 45, 90 and 135 degrees of every view for --exposures {exposures}",
-            found=f"others in {len(others)} views, {others[0]} first",
+            found=f"other pictures in {len(others)} views, {others[0]} first",
             remedy="Give a scene with four pictures of each view.",
         )
     places = {view.name: place for place, view in enumerate(scene.train_views)}

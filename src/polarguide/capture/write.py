@@ -27,7 +27,7 @@ EXACT: Rounding = ((0, 1),)
 
 
 def rounding_of(values: NDArray[np.floating[Any]]) -> list[tuple[int, int]]:
-    """What codes are rounded to: the power of two nearest to a quarter of the camera's step there, at least 1.
+    """Rounding of codes: the power of two nearest to a quarter of the camera's step there, at least 1.
 
     Rounding changes a value by less than a fifth of the step, the camera's own rounding by half of it. Files shrink,
     because their last bits then hold nothing.

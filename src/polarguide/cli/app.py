@@ -6,6 +6,7 @@ import ast
 import contextlib
 import dataclasses
 import difflib
+import functools
 import importlib
 import importlib.util
 import io
@@ -25,29 +26,29 @@ from polarguide.core.options import gibibytes
 from polarguide.core.system import check_variables, interrupts
 
 VERBS = {
-    "demo": "demo",
-    "calibrate": "calibrate",
-    "scale": "scale",
-    "prepare": "prepare",
-    "inspect": "inspect",
-    "train": "train",
-    "eval": "evaluate",
-    "render": "render",
-    "view": "view",
-    "present": "present",
-    "share": "share",
-    "export": "export",
-    "priors": "priors",
-    "measure": "measure",
-    "compare": "compare",
-    "ablate": "ablate",
-    "batch": "batch",
-    "synth": "synth",
-    "bench": "bench",
-    "tables": "tables",
-    "doctor": "doctor",
+    "demo": ("runs", "demo"),
+    "calibrate": ("shots", "calibrate"),
+    "scale": ("shots", "scale"),
+    "prepare": ("captures", "prepare"),
+    "inspect": ("captures", "inspect"),
+    "train": ("runs", "train"),
+    "eval": ("runs", "evaluate"),
+    "render": ("runs", "render"),
+    "view": ("runs", "view"),
+    "present": ("captures", "present"),
+    "share": ("runs", "share"),
+    "export": ("runs", "export"),
+    "priors": ("shots", "priors"),
+    "measure": ("shots", "measure"),
+    "compare": ("compare", "compare"),
+    "ablate": ("compare", "ablate"),
+    "batch": ("batch", "batch"),
+    "synth": ("captures", "synth"),
+    "bench": ("compare", "bench"),
+    "tables": ("compare", "tables"),
+    "doctor": ("doctor", "doctor"),
 }
-"""The module of each verb, whose function has the module's name. None of them imports torch before it is called."""
+"""The module and the function of each verb. No module imports torch before a verb is called."""
 DESCRIPTION = (
     "Photographs through a linear polarizer to a 3D Gaussian splatting scene with separated reflections, surface "
     "normals and diffuse color."
@@ -56,8 +57,8 @@ DESCRIPTION = (
 
 def function_of(verb: str) -> Callable[..., Any]:
     """The function behind a verb; its signature and docstring are the verb's options and help."""
-    module = importlib.import_module(f"polarguide.cli.{VERBS[verb]}")
-    function: Callable[..., Any] = getattr(module, VERBS[verb])
+    module, name = VERBS[verb]
+    function: Callable[..., Any] = getattr(importlib.import_module(f"polarguide.cli.{module}"), name)
     # Options that several verbs share are the fields of dataclasses, and are called as these are.
     return tyro.conf.configure(tyro.conf.OmitArgPrefixes)(function)
 
@@ -67,18 +68,21 @@ def summary_of(verb: str) -> Callable[[], None]:
 
     The list of all verbs shows nothing else: their modules are read, and not loaded.
     """
-    spec = importlib.util.find_spec(f"polarguide.cli.{VERBS[verb]}")
-    source = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
-    documented = [
-        node
-        for node in ast.parse(source).body
-        if isinstance(node, ast.FunctionDef) and node.name == VERBS[verb]
-    ]
+    module, name = VERBS[verb]
 
     def listed() -> None: ...
 
-    listed.__doc__ = (ast.get_docstring(documented[0]) or "").partition("\n\n")[0]
+    listed.__doc__ = _summaries(module)[name]
     return listed
+
+
+@functools.cache
+def _summaries(module: str) -> dict[str, str]:
+    """First paragraphs of docstrings by function, of a module of verbs."""
+    spec = importlib.util.find_spec(f"polarguide.cli.{module}")
+    source = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
+    functions = [node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)]
+    return {node.name: (ast.get_docstring(node) or "").partition("\n\n")[0] for node in functions}
 
 
 def options_of(function: Callable[..., Any]) -> dict[str, Any]:
@@ -208,7 +212,7 @@ def _require_place() -> None:
     except FileNotFoundError:
         raise PolarguideError(
             "the current folder",
-            expected="one that exists",
+            expected="an existing folder",
             found="that it was removed or renamed",
             remedy="Change to another folder (cd), and repeat the command.",
         ) from None

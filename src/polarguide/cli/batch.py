@@ -230,6 +230,11 @@ def _capture(kind: type[Capture], line: _Line, scene: bool, common: str) -> Capt
             found=shlex.join(words),
             remedy="polarguide train --help and polarguide prepare --help list them.",
         ) from None
+    except PolarguideError as error:
+        where = f"{line.where}, {error.where}"
+        raise PolarguideError(
+            where, expected=error.expected, found=error.found, remedy=error.remedy
+        ) from None
     capture = kind(line.name, line.path, recipe=recipe, settings=settings, reading=reading)
     return capture if own is None else replace(capture, prepare=own)
 
@@ -247,7 +252,7 @@ def _words(text: str, where: str) -> list[str]:
 
 
 def _parsed(kind: Callable[..., Parsed], words: Sequence[str], *, unknown: bool) -> tuple[Any, list[str]]:
-    """What a function makes of words, and those that it has no option for."""
+    """The result of a function called with words of a command line, and the words that are not its options."""
     function = tyro.conf.configure(tyro.conf.OmitArgPrefixes)(kind)
     with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
         if unknown:

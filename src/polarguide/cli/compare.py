@@ -1,7 +1,8 @@
-"""``polarguide compare``."""
+"""Verbs that compare recipes: compare, ablate, bench, tables."""
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,7 +12,7 @@ import tyro
 import polarguide
 from polarguide.cli.console import JobReporter, say, use_threads
 from polarguide.core.errors import PolarguideError
-from polarguide.experiments.options import CompareOptions
+from polarguide.experiments.options import BenchOptions, CompareOptions
 from polarguide.training.settings import Background, Materials, TrainSettings
 
 if TYPE_CHECKING:
@@ -109,3 +110,81 @@ def print_results(results: Results, out: Path) -> None:
             found=f"that {len(failed)} failed ({errors})",
             remedy="What there is has been written. Remove the cause and give the same command again.",
         )
+
+
+def ablate(
+    scenes: Scenes,
+    /,
+    *,
+    out: Path,
+    steps: int | None = None,
+    settings: Settings,
+    options: Options,
+    base: str = "polarguide-stokes",
+    only: tuple[str, ...] = (),
+    reference: tuple[str, ...] = (),
+) -> None:
+    """Compare a recipe with its ablations: the same with one thing changed, each.
+
+    It is compare with the recipe and its ablations as rows, and shares runs with a comparison in the same --out.
+
+    Args:
+        scenes: Scene folders, as for train.
+        out: Folder to write, as for compare.
+        steps: Optimizer steps of every run, without it 5,000.
+        base: The recipe whose ablations to train.
+        only: Names of the ablations to take, such as without-normals; all if none is given.
+        reference: Recipes to add as first rows, such as 3dgs-dr.
+    """
+    use_threads(options.threads)
+    results = polarguide.ablate(
+        scenes,
+        base,
+        out,
+        only=only,
+        reference=reference,
+        settings=replace(settings, steps=steps),
+        options=options,
+        reporter=JobReporter(),
+    )
+    print_results(results, out)
+
+
+def bench(
+    *,
+    out: Path,
+    options: Annotated[BenchOptions, tyro.conf.arg(name="")],
+) -> None:
+    """Run the bench of generality: render its scenes where they are missing, and compare all methods on them.
+
+    Scenes go to scenes/ of the folder given by --out, tables and report to development/ or held-back/. What is finished
+    is checked and not repeated; after Ctrl-C the same command goes on. Rendering needs Mitsuba, as ``synth`` does.
+
+    Args:
+        out: Folder to write.
+    """
+    use_threads(options.threads)
+    run_bench = importlib.import_module("polarguide.experiments.bench").run_bench
+    results = run_bench(out, options, reporter=JobReporter())
+    if results is None:
+        say(f"scenes: {out / 'scenes'}")
+    else:
+        print_results(results, out / options.half)
+
+
+Records = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RESULTS ...")]
+
+
+def tables(records: Records, /, *, out: Path, against: str | None = None) -> None:
+    """Join the records of comparisons that were run apart, and set their tables anew.
+
+    For comparisons and benches that are spread over machines or days: scenes, seeds and recipes may be shared out in
+    any way. Writes results.json, .md, .csv, .tex and report.html (without pictures) to the folder given by --out.
+
+    Args:
+        records: Records of compare, ablate or bench (results.json), or folders with one.
+        out: Folder to write.
+        against: One of the recipes: tables have the difference of every other one to it.
+    """
+    join_tables = importlib.import_module("polarguide.experiments.join").join_tables
+    print_results(join_tables(records, out, against=against), out)

@@ -86,7 +86,7 @@ SPEED_SECONDS = 180.0
 """The speed of so long tells the time left: of a training whose pictures grow, the steps of the beginning are cheap."""
 
 
-class _Left(TimeRemainingColumn):
+class _RemainingTime(TimeRemainingColumn):
     """The time left as the work itself says, or by its speed."""
 
     def render(self, task: Task) -> Text:
@@ -112,7 +112,7 @@ def bars(memory_seconds: float = 30.0) -> Progress:
         TextColumn("{task.description}", markup=False, table_column=label),
         BarColumn(bar_width=10),
         MofNCompleteColumn(table_column=Column(no_wrap=True)),
-        _Left(table_column=Column(no_wrap=True)),
+        _RemainingTime(table_column=Column(no_wrap=True)),
         TextColumn("{task.fields[note]}", markup=False, table_column=note),
         console=console,
         transient=True,

@@ -120,7 +120,7 @@ def _line(error: Exception) -> str:
 
 
 def _extra(name: str, use: str) -> dict[str, Any]:
-    """What of an extra is installed, what is missing, and the command for it (None: nothing is missing)."""
+    """Installed and missing packages of an extra, and the command that installs the latter (None: none is missing)."""
     wanted = [each for each in requirements() if each.extra == name]
     missing = [each.name for each in wanted if _version(each.name) is None]
     return {
@@ -144,7 +144,7 @@ def _machine() -> dict[str, Any]:
 
 
 def _notes(torch: dict[str, Any], extras: dict[str, Any]) -> list[str]:
-    """What could be better, and stops nothing."""
+    """Shortcomings that do not stop anything."""
     if not extras:
         return ["polarguide is not installed here, so that its packages cannot be checked: pip install ."]
     if torch.get("gpus") and extras["cuda"]["missing"]:

@@ -117,7 +117,7 @@ class Requirement(NamedTuple):
 
 
 def requirements() -> list[Requirement]:
-    """What the installed metadata asks for; [] where polarguide runs without being installed."""
+    """Requirements in the installed metadata; [] where polarguide runs without being installed."""
     metadata = importlib.import_module("importlib.metadata")
     try:
         lines = metadata.requires("polarguide") or []

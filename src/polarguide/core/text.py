@@ -1,8 +1,11 @@
-"""Texts from people and from files: numbers in them, and what a terminal would obey."""
+"""Texts from people and from files: numbers in them, what a terminal would obey, and CSV cells that are no formulas."""
 
 from __future__ import annotations
 
+import csv
+import io
 import math
+from collections.abc import Iterable
 
 
 def decimal(text: str) -> float:
@@ -45,3 +48,20 @@ def printable(text: str, *, lines: bool = False) -> str:
         else sign.encode("unicode_escape", "backslashreplace").decode("ascii")
         for sign in text
     )
+
+
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+
+
+def csv_lines(rows: Iterable[Iterable[object]]) -> str:
+    """Rows of values as CSV; None is an empty cell, and texts that begin as formulas get an apostrophe in front."""
+    file = io.StringIO()
+    csv.writer(file, lineterminator="\n").writerows([plain(value) for value in row] for row in rows)
+    return file.getvalue()
+
+
+def plain(value: object) -> object:
+    """A value that spreadsheets do not take for a formula, nor terminals for a command: names come from files."""
+    if not isinstance(value, str):
+        return value
+    return printable(f"'{value}" if value.startswith(_FORMULA) else value, lines=True)

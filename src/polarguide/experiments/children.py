@@ -1,4 +1,4 @@
-"""What a worker of dask does: the tasks of a job, each in a child process that is watched.
+"""Tasks of a comparison or a batch, each in a child process that a worker of dask watches.
 
 A worker imports this module and none that imports torch. It computes nothing itself: it answers its scheduler at all
 times, and a child's memory, threads and signals are its own.
@@ -7,19 +7,103 @@ times, and a child's memory, threads and signals are its own.
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import os
 import signal
 import subprocess
+import sys
 import threading
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
+
+import msgspec
 
 from polarguide.core.files import make_folder
-from polarguide.experiments.tasks import COMMAND, Message, Outcome, encoded
+from polarguide.core.options import ComputeOptions, SceneOptions
+from polarguide.experiments.collection import Processing
+from polarguide.training.settings import TrainSettings
 
 if TYPE_CHECKING:
     from distributed import Worker
+
+
+PACKAGE = Path(__file__).parents[1]
+PROLOGUE = (
+    "import gc, sys; gc.disable(); "  # while names are imported, which stay: a fifth of the seconds
+    "sys.path[:] = [path for path in sys.path if path]; "  # what is empty is the current folder
+    "sys.path[:0] = [path for path in sys.argv[1:] if path not in sys.path]; "
+    "from polarguide.experiments.worker import main; gc.enable(); sys.exit(main())"
+)
+"""What a child runs: it imports this package from where it is here, and nothing from the current folder."""
+COMMAND = (sys.executable, "-c", PROLOGUE, str(PACKAGE.parent))
+
+
+@cache
+def files_digest() -> str:
+    """Sixteen hexadecimal digits that change with any byte of this package's code."""
+    digest = hashlib.sha256()
+    for path in sorted(
+        (*PACKAGE.rglob("*.py"), *PACKAGE.glob("_native.*.so"), *PACKAGE.glob("_native.*.pyd"))
+    ):
+        digest.update(f"{path.relative_to(PACKAGE).as_posix()} {path.stat().st_size}\n".encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="train"):
+    """Train a run, or go on with the one in its folder."""
+
+    scene: str
+    folder: str
+    recipe: str
+    settings: TrainSettings
+    reading: SceneOptions
+    compute: ComputeOptions
+
+
+class Scoring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="score"):
+    """Score a finished run; with ``speed`` also time its pictures."""
+
+    folder: str
+    speed: bool
+    compute: ComputeOptions
+
+
+Task = Training | Scoring | Processing
+
+
+class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The line that a child process reads: its task, and a digest of the code of the process that sends it.
+
+    Attributes:
+        files: its ``files_digest``. code: its ``code_digest``, which takes seconds, and counts where ``files`` differs.
+    """
+
+    task: Task
+    files: str
+    code: str
+
+
+class Outcome(msgspec.Struct, frozen=True):
+    """The outcome of a job on a worker.
+
+    Attributes:
+        state: "done"; "failed", with the last line of its ``stderr.txt``; "lost", when it was ended from outside, so
+            that it can go on elsewhere.
+        error: that line, or how it ended.
+    """
+
+    state: Literal["done", "failed", "lost"]
+    error: str = ""
+
+
+def encoded(message: Message) -> bytes:
+    """A line that a child reads; names of files that are no Unicode are escapes in it."""
+    return json.dumps(msgspec.to_builtins(message)).encode() + b"\n"
+
 
 POLL_SECONDS = 0.1
 STDERR = "stderr.txt"

@@ -27,7 +27,7 @@ NO_FILES = (0, 0, 0)
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a capture's results follow from.
+    """The inputs that determine a capture's results.
 
     Attributes:
         source: absolute path of its folder. stamp: number, size and newest time of its files.
@@ -77,7 +77,7 @@ class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @staticmethod
     def load(folder: Path) -> CaptureRecord | None:
-        """That of a folder; None where there is none yet.
+        """The record in a folder; None where there is none yet.
 
         Raises:
             PolarguideError: it is no such record.

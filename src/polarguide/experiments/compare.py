@@ -20,22 +20,28 @@ from polarguide.core.options import MOST, ComputeOptions, PathLike, check_choice
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import decode
 from polarguide.core.system import only_writer
-from polarguide.experiments.charts import exposure_svg, read_study, study_svg
-from polarguide.experiments.children import STDERR
+from polarguide.experiments.children import STDERR, Scoring, Task, Training
 from polarguide.experiments.cluster import workers
 from polarguide.experiments.job_queue import Job, run_job, run_jobs
 from polarguide.experiments.options import MOST_SEEDS, CompareOptions
-from polarguide.experiments.plan import Comparison, PlannedRun, SceneEntry, plan_runs, scene_entries
+from polarguide.experiments.plan import (
+    Comparison,
+    PlannedRun,
+    SceneEntry,
+    jobs_at_a_time,
+    most_memory,
+    own_gpus,
+    plan_runs,
+    scene_entries,
+)
 from polarguide.experiments.record import FORMAT, REMEDY, Record
-from polarguide.experiments.report import write_report
-from polarguide.experiments.resources import jobs_at_a_time, most_memory, own_gpus
+from polarguide.experiments.report import exposure_svg, read_study, study_svg, write_report
 from polarguide.experiments.results import Results
-from polarguide.experiments.tasks import Scoring, Task, Training
-from polarguide.experiments.writing import write_tables
+from polarguide.experiments.tables import write_tables
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.recipes.registry import ABLATIONS, ablations_of
-from polarguide.results.evaluation.sources import code_digest, commit
+from polarguide.results.evaluation.record import code_digest, commit
 from polarguide.results.evaluation.table import COLUMNS, PART_METRICS
 from polarguide.training.recipe import Method
 from polarguide.training.settings import TrainSettings
@@ -191,7 +197,7 @@ def _checked_recipes(recipes: Sequence[str | Method]) -> tuple[Method, ...]:
             raise PolarguideError(
                 "recipes",
                 expected=f"the registered recipe {own.name}",
-                found="one of this name with other values",
+                found="a recipe of this name with other values",
                 remedy="Give it a name of its own, and register it under the entry points polarguide.recipes.",
             )
     if not registered:

@@ -15,10 +15,18 @@ import msgspec
 
 from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import Advance, Reporter
-from polarguide.experiments.children import POLL_SECONDS, count_at_work, kill, perform
+from polarguide.experiments.children import (
+    POLL_SECONDS,
+    Message,
+    Outcome,
+    Task,
+    count_at_work,
+    files_digest,
+    kill,
+    perform,
+)
 from polarguide.experiments.cluster import Workers
-from polarguide.experiments.tasks import Message, Outcome, Task, files_digest
-from polarguide.results.evaluation.sources import code_digest
+from polarguide.results.evaluation.record import code_digest
 from polarguide.runs.folder import CHECKPOINT, LOG
 
 if TYPE_CHECKING:

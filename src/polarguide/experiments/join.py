@@ -24,7 +24,7 @@ from polarguide.experiments.record import (
 )
 from polarguide.experiments.report import REPORT, report_html
 from polarguide.experiments.results import Results
-from polarguide.experiments.writing import write_tables
+from polarguide.experiments.tables import write_tables
 
 RECORD = "results.json"
 _REMEDY = "Join records of one commit, with the same recipes and settings."

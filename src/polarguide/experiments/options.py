@@ -110,7 +110,7 @@ class CompareOptions(ClusterOptions, SceneOptions):
 
     @property
     def own_device(self) -> DeviceName:
-        """What this machine draws the report on, if others train."""
+        """The device on which this machine renders for the report, if others train."""
         return self.device if self.local else "auto"
 
 

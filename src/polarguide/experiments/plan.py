@@ -1,4 +1,4 @@
-"""Which runs a comparison consists of, where each lives, and what is still to be done for it.
+"""Which runs a comparison consists of, where each lives, what is still to be done for it, and how many run at a time.
 
 A run's folder carries a digest of everything that its result depends on: the same command finds finished runs again,
 and whatever changes gets a folder of its own.
@@ -8,26 +8,33 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
+
 from polarguide import __version__
 from polarguide.capture import View
+from polarguide.capture.layout import SHARE
 from polarguide.capture.variants import black_pixels, mask_background
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import Exposures, SceneOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.experiments.options import CompareOptions
+from polarguide.core.system import free_memory
+from polarguide.experiments.options import ClusterOptions, CompareOptions
+from polarguide.raster import Backend
 from polarguide.recipes.registry import ablations_of
-from polarguide.results.evaluation.record import read_metrics
-from polarguide.results.evaluation.sources import code_digest, model_digest
+from polarguide.results.evaluation.record import code_digest, model_digest, read_metrics
 from polarguide.results.evaluation.target import SceneFacts
 from polarguide.runs.families import family_of
 from polarguide.runs.folder import CONFIGURATION, RunConfiguration, compared_steps, trained_steps
+from polarguide.runs.forecast import pixels_of
 from polarguide.runs.opened import read_scene
+from polarguide.runs.train import expected_memory
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import TrainSettings
 
@@ -214,7 +221,7 @@ class PlannedRun:
 
 
 def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[SceneEntry]:
-    """Read every scene once: its digest and its test views; says what its scores will not mean.
+    """Read every scene once: its digest and its test views; warns where scores are not comparable.
 
     Raises:
         PolarguideError: a scene that cannot be read, has no test views, or is called like another.
@@ -299,3 +306,41 @@ def run_key(
     parts = [scene_digest, recipe, asdict(settings), asdict(reading), code]
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:KEY_DIGITS]
+
+
+def most_memory(runs: Sequence[PlannedRun]) -> int:
+    """Bytes that the process of any of the trainings takes at most, as far as headers tell.
+
+    Raises:
+        PolarguideError: a scene has gone, or its ``--memory`` is too small.
+    """
+    pixels = {run.scene.path: run.reading.downscale for run in runs}
+    counts = {path: pixels_of(path, downscale) for path, downscale in pixels.items()}
+    kinds = {(run.scene.path, run.row.name): run for run in runs}.values()  # seeds take the same
+    peaks = (expected_memory(counts[r.scene.path], r.recipe, r.settings, r.reading) for r in kinds)
+    return max(peaks, default=0)
+
+
+def own_gpus(backend: Backend) -> tuple[str, ...]:
+    """The GPUs of this machine, as CUDA_VISIBLE_DEVICES calls them; none where the CPU computes."""
+    if backend.device.type != "cuda":
+        return ()
+    visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name.strip()]
+    return tuple(visible or map(str, range(torch.cuda.device_count())))
+
+
+def jobs_at_a_time(options: ClusterOptions, count: int, memory: int, gpus: Sequence[str]) -> int:
+    """How many jobs work at a time: at least one, and no more than there are.
+
+    Args:
+        options: where, and how many if that was specified.
+        count: how many there are to do.
+        memory: bytes that each takes at most. gpus: of this machine, each for one job.
+    """
+    if options.jobs or not options.local:
+        return max(1, min(options.jobs or count, count))
+    room = len(gpus) or (os.cpu_count() or 1) // options.threads
+    free = free_memory()
+    if free is not None and memory:
+        room = min(room, int(SHARE * free) // memory)
+    return max(1, min(room, count))

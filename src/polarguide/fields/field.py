@@ -119,9 +119,9 @@ class Field(nn.Module):
 
     Attributes:
         region: where it lies. log_sharpness: ln(s) / 10 of the density's logistic function, which is learned.
-        first_log_sharpness: what it begins with.
-        direction_share: in [0, 1], how much the color may depend on the direction yet.
-        distances: map of the distances in the region's cube, which tells rays where to look; of an earlier step.
+        first_log_sharpness: its initial value.
+        direction_share: in [0, 1], the part of the directional encoding that the color depends on at this step.
+        distances: grid of the distances in the region's cube at an earlier step, by which rays skip empty space.
     """
 
     map_side = MAP_SIDE

@@ -68,10 +68,10 @@ class FieldState:
         Raises:
             ValueError: something is missing, not known, or has another shape, type or range; the message names it.
         """
-        step, region = _step(_given(tensors, "scalars")), _region(_given(tensors, "region"))
+        step, region = _step(_tensor_of(tensors, "scalars")), _region(_tensor_of(tensors, "region"))
         state = cls.around(step, recipe, region, 0, device)
         own = {f"field.{name}": values for name, values in state.field.state_dict().items()}
-        loaded = {name: _like(values, _given(tensors, name), name) for name, values in own.items()}
+        loaded = {name: _like(values, _tensor_of(tensors, name), name) for name, values in own.items()}
         state.field.load_state_dict({name.removeprefix("field."): t for name, t in loaded.items()})
         names_known = {"scalars", "region", *own}
         for name, values in state.field.named_parameters():
@@ -79,7 +79,7 @@ class FieldState:
             names_known |= set(names.values())
             if not tensors.keys().isdisjoint(names.values()):
                 state.optimizer.moments[name] = {
-                    key: _like(values if key != "step" else torch.zeros(()), _given(tensors, full), full)
+                    key: _like(values if key != "step" else torch.zeros(()), _tensor_of(tensors, full), full)
                     for key, full in names.items()
                 }
         strangers = sorted(tensors.keys() - names_known)
@@ -88,7 +88,7 @@ class FieldState:
         return state
 
 
-def _given(tensors: Mapping[str, Tensor], name: str) -> Tensor:
+def _tensor_of(tensors: Mapping[str, Tensor], name: str) -> Tensor:
     if name not in tensors:
         raise ValueError(f"no {name}")
     return tensors[name]

@@ -271,7 +271,7 @@ class AngleFindings:
     mosaic: bool = False
 
     def correction(self, offset: float) -> str:
-        """What to do about a decided order and an offset beside it: the whole calibration, not the difference."""
+        """Advice for a decided order and an offset: the whole calibration, not the difference."""
         if self.files is None:
             return ""
         if self.applied is None:
@@ -288,7 +288,7 @@ class AngleFindings:
         )
 
     def _mirrored(self, offset: float) -> str:
-        """What to do where the order is that of a sensor's mosaic that was mirrored, or cut at odd pixels."""
+        """Advice where the order is that of a sensor's mosaic that was mirrored, or cropped at odd pixels."""
         straight = self.applied is not None and self.applied.true_angles() == (ANGLES, 0.0)
         if not self.mosaic or not straight or self.order is None or abs(offset) > ZERO_OFF:
             return ""
@@ -383,8 +383,8 @@ def order_check(angles: AngleFindings) -> Check:
             _more_evidence(angles), figures=angles.record(),
         )  # fmt: skip
     if files == PAIRINGS[0]:
-        said = f"The file names are right with a probability of {probability:.1%}."
-        return Check(key, title, "ok", said, figures=angles.record())
+        finding = f"The file names are right with a probability of {probability:.1%}."
+        return Check(key, title, "ok", finding, figures=angles.record())
     return Check(
         key, title, "wrong", f"With a probability of {probability:.1%} {swaps(files)}.",
         angles.correction(angles.offset or 0.0), figures=angles.record(),
@@ -399,11 +399,11 @@ def handedness_check(angles: AngleFindings) -> Check:
     probability = angles.posterior.sense_probability
     figures = {"counter_clockwise": probability}
     if max(probability, 1 - probability) < DECIDED:
-        said = f"Not decided: counter-clockwise with a probability of {probability:.0%}."
-        return Check(key, title, "warning", said, _more_evidence(angles), figures=figures)
+        finding = f"Not decided: counter-clockwise with a probability of {probability:.0%}."
+        return Check(key, title, "warning", finding, _more_evidence(angles), figures=figures)
     if probability > 0.5:
-        said = f"Counter-clockwise as displayed, with a probability of {probability:.1%}."
-        return Check(key, title, "ok", said, figures=figures)
+        finding = f"Counter-clockwise as displayed, with a probability of {probability:.1%}."
+        return Check(key, title, "ok", finding, figures=figures)
     return Check(
         key, title, "wrong", f"Clockwise as displayed, with a probability of {1 - probability:.1%}: clockwise angles, "
         "a mirrored picture and two exchanged files look the same.",
@@ -419,23 +419,23 @@ def zero_check(angles: AngleFindings) -> Check:
     offset, error = angles.posterior.offset, angles.posterior.offset_error
     figures = {"offset_degrees": offset, "error_degrees": error}
     if not math.isfinite(error) or error > ZERO_UNSURE:
-        said = f"The standard error of the zero is {error:.1f}°: too large to decide."
-        return Check(key, title, "warning", said, _more_evidence(angles), figures=figures)
+        finding = f"The standard error of the zero is {error:.1f}°: too large to decide."
+        return Check(key, title, "warning", finding, _more_evidence(angles), figures=figures)
     about = "" if angles.order in (None, IDENTITY) else " (relative to the order found above)"
-    said = f"The zero of the instrument lies at {offset:+.1f}° ± {error:.1f}°{about}."
+    finding = f"The zero of the instrument lies at {offset:+.1f}° ± {error:.1f}°{about}."
     verdict: Verdict = "ok"
     remedy = ""
     if abs(offset) > max(ZERO_OFF / 2, 3 * error):
         verdict = "wrong" if angles.offset is not None else "warning"
         remedy = angles.correction(offset) or _more_evidence(angles)
-    return Check(key, title, verdict, said, remedy, figures=figures)
+    return Check(key, title, verdict, finding, remedy, figures=figures)
 
 
 def _no_evidence(angles: AngleFindings) -> str:
-    said = " ".join(evidence.note for evidence in angles.sources)
+    finding = " ".join(evidence.note for evidence in angles.sources)
     return (
-        f"Geometry does not decide it. {said}".strip()
-        if said
+        f"Geometry does not decide it. {finding}".strip()
+        if finding
         else "This check needs poses, which the scene does not have."
     )
 

@@ -140,25 +140,25 @@ def read_capture(
     names = select_views(layout, None)
     model = read_model(root) if (root / "sparse").exists() else None
     metadata = root / "scene.json"
-    said = read_file(metadata, largest=LARGEST_RECORD) if metadata.exists() else b"{}"
+    text = read_file(metadata, largest=LARGEST_RECORD) if metadata.exists() else b"{}"
     factor = downscale or _fitting_factor(layout, names[0])
     stored = read_views(layout, names, model, downscale=factor, transfer=transfer, reporter=reporter)
     lines = sorted(f"{p.relative_to(root)} {d}" for item in stored.data for p, d in item.digests.items())
-    indices_of(metadata, said)  # that it can be read
+    indices_of(metadata, text)  # that it can be read
     return Capture(
         root=root,
         name=root.resolve().name,
         layout=layout,
         views=tuple(_inspected(stored, number) for number in range(len(names))),
         model=model,
-        refractive_index=refractive_index_of(metadata, said),
-        applied=applied_calibration(metadata, said),
+        refractive_index=refractive_index_of(metadata, text),
+        applied=applied_calibration(metadata, text),
         factor=factor,
         transfer=transfer,
         bits=8 if stored.largest_value == 255 else 16,
         size=stored.data[0].size,
         digest=hashlib.sha256("\n".join(lines).encode()).hexdigest(),
-        origin=origin_of(metadata, said),
+        origin=origin_of(metadata, text),
     )
 
 

@@ -127,7 +127,7 @@ def _write(capture: Capture, change: Calibration, folder: Path, reporter: Report
 
 
 def _require_inside(root: Path, source: Path) -> None:
-    """Refuse links that leave the scene: what they point to is none of its files, and would be copied for others.
+    """Refuse links that leave the scene: their targets are not files of the scene, and would be copied.
 
     Raises:
         PolarguideError: there is one.
@@ -218,7 +218,7 @@ class _Simulated(msgspec.Struct):
 
 
 class _Scene(msgspec.Struct):
-    """What is read of ``scene.json``."""
+    """The fields of ``scene.json`` that are read."""
 
     sensor: str | _Simulated | None = None
     gains: tuple[_Gain, _Gain, _Gain, _Gain] | None = None
@@ -245,14 +245,14 @@ def corrected(capture: Capture, path: Path) -> Capture:
         raise PolarguideError(
             capture.root,
             expected="a scene that was prepared without --calibration",
-            found=f"one with that of {about.analyzers.sensor} (checksum {about.analyzers.sha256[:16]}...)",
+            found=f"the calibration of {about.analyzers.sensor} (checksum {about.analyzers.sha256[:16]}...)",
             remedy="Leave --calibration out.",
         )
     if isinstance(about.sensor, _Simulated) or (about.prepare is not None and about.sensor is None):
         raise PolarguideError(
             capture.root,
             expected="a scene of the mosaics of a sensor",
-            found="one of shots through a filter, of a dataset, or rendered",
+            found="a scene of shots through a filter, of a dataset, or rendered",
             remedy="Leave --calibration out.",
         )
     calibration.require_sensor(about.sensor, path)
@@ -267,12 +267,12 @@ def corrected(capture: Capture, path: Path) -> Capture:
     known: dict[Any, NDArray[np.float32]] = {}
     views = []
     for view in capture.views:
-        said = None if about.prepare is None else about.prepare.views.get(view.name)
-        key = None if said is None else msgspec.json.encode(said)
+        prepared = None if about.prepare is None else about.prepare.views.get(view.name)
+        key = None if prepared is None else msgspec.json.encode(prepared)
         if key not in known:
-            if said is not None:
-                _require_geometry(capture, view, said)
-            matrices = _matrices(calibration, about, said, capture.size)
+            if prepared is not None:
+                _require_geometry(capture, view, prepared)
+            matrices = _matrices(calibration, about, prepared, capture.size)
             known[key] = _averaged(_as_named(matrices, applied, about.gains), capture.factor)
             if known[key].shape[2:4] != view.codes.shape[1:3]:
                 raise _changed(capture, view.name, "a size that its pictures have not")
@@ -283,25 +283,25 @@ def corrected(capture: Capture, path: Path) -> Capture:
 def _changed(capture: Capture, view: str, found: str) -> PolarguideError:
     return PolarguideError(
         f"{capture.root / 'scene.json'} (prepare.views.{view})",
-        expected="what prepare wrote",
+        expected="the record that prepare wrote",
         found=found,
         remedy="Prepare the scene again.",
     )
 
 
-def _require_geometry(capture: Capture, view: InspectedView, said: _View) -> None:
+def _require_geometry(capture: Capture, view: InspectedView, prepared: _View) -> None:
     """Refuse a geometry or a camera that ``prepare`` cannot have written."""
-    if said.geometry.step not in STEPS:
-        raise _changed(capture, view.name, f"a step of {said.geometry.step}")
-    if said.warp is not None:
-        model, parameters = said.warp.model, said.warp.parameters
+    if prepared.geometry.step not in STEPS:
+        raise _changed(capture, view.name, f"a step of {prepared.geometry.step}")
+    if prepared.warp is not None:
+        model, parameters = prepared.warp.model, prepared.warp.parameters
         if model not in MODELS or len(parameters) != MODELS[model][1]:
             found = f"a camera {shortened(model)} with {len(parameters)} parameters"
             raise _changed(capture, view.name, found)
 
 
 def analyzer_check(capture: Capture, path: Path | None) -> Check | None:
-    """What is known of the sensor's analyzers; None where nothing was calibrated."""
+    """The calibration of the sensor's analyzers; None where nothing was calibrated."""
     key, title = "analyzers", "Analyzers of the sensor"
     if path is not None:
         found = read_analyzers(path)
@@ -309,13 +309,13 @@ def analyzer_check(capture: Capture, path: Path | None) -> Check | None:
         remedy = "The scene itself is as it was: prepare its mosaics with --calibration."
         record = found.record()
     else:
-        said = _about(capture).analyzers
-        if said is None:
+        analyzers = _about(capture).analyzers
+        if analyzers is None:
             return None
         text, remedy, record = (
-            f"Prepared with the calibration of {said.sensor}",
+            f"Prepared with the calibration of {analyzers.sensor}",
             "",
-            msgspec.to_builtins(said),
+            msgspec.to_builtins(analyzers),
         )
     lens = f" and {record['lens']}" if record["lens"] else ""
     return Check(key, title, "ok", f"{text}{lens} ({record['sha256'][:16]}).", remedy, figures=record)
@@ -329,19 +329,21 @@ def _about(capture: Capture) -> _Scene:
 
 
 def _matrices(
-    calibration: AnalyzerCalibration, about: _Scene, said: _View | None, size: tuple[int, int]
+    calibration: AnalyzerCalibration, about: _Scene, prepared: _View | None, size: tuple[int, int]
 ) -> NDArray[np.float32]:
     """Matrices [4, 4, h, w] or [4, 4, h, w, 3] at the pixels of a view's pictures."""
-    if said is None or about.prepare is None:
+    if prepared is None or about.prepare is None:
         return calibration.of_pictures(size[::-1])
-    settings, geometry = about.prepare.request.settings, said.geometry
+    settings, geometry = about.prepare.request.settings, prepared.geometry
     matrices = calibration.of_pictures(
         geometry.size[::-1], offset=(settings.offset_x, settings.offset_y), scale=geometry.step
     )
-    if said.warp is None:
+    if prepared.warp is None:
         return matrices
     width, height = geometry.size
-    camera = pycolmap.Camera(model=said.warp.model, width=width, height=height, params=said.warp.parameters)
+    camera = pycolmap.Camera(
+        model=prepared.warp.model, width=width, height=height, params=prepared.warp.parameters
+    )
     planes = matrices.reshape(16, *matrices.shape[2:])
     moved, _ = undistortion(camera).apply(planes, np.zeros((height, width), bool))
     return moved.reshape(4, 4, *moved.shape[1:])

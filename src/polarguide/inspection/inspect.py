@@ -1,4 +1,7 @@
-"""``inspect_scene``: reads a capture, runs every check it can carry, and puts the findings together."""
+"""``inspect_scene``: reads a capture, runs every check it can carry, and puts the findings together.
+
+The checks of poses are here: epipolar errors, and gaps in the coverage.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +10,22 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
 from polarguide.capture import Scene, load_scene
 from polarguide.capture.layout import refuse_scene
+from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import check_out, require_inside
 from polarguide.core.options import index_of
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import check_options
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.scene_frame import scene_frame
+from polarguide.geometry.vectors import unit_array
 from polarguide.inspection.angles import (
     AngleFindings,
     Evidence,
@@ -35,7 +47,6 @@ from polarguide.inspection.evidence import (
     surface_of,
 )
 from polarguide.inspection.picture_checks import dielectric_check, find_pairing, light_checks, picture_checks
-from polarguide.inspection.pose_checks import coverage_check, pose_check
 from polarguide.inspection.settings import Check, InspectSettings, Verdict, worst
 from polarguide.inspection.shots import (
     ShotFindings,
@@ -45,6 +56,177 @@ from polarguide.inspection.shots import (
     shot_checks,
 )
 from polarguide.raster import Backend
+
+NEIGHBORS = 4
+FEATURES = 3000
+FEWEST_MATCHES = 15
+RATIO = 0.75
+GATE_SHARE = 0.02
+"""Matches farther from their epipolar line than this share of the picture's diagonal count as mismatches."""
+
+
+@dataclass(frozen=True)
+class PairError:
+    """Median distance of matches from their epipolar lines between two views, in stored pixels."""
+
+    first: str
+    second: str
+    matches: int
+    error: float
+
+
+def epipolar_errors(capture: Capture) -> list[PairError]:
+    """Match every posed view with its nearest neighbors in position and viewing direction."""
+    views = capture.posed
+    features = [_features(view) for view in views]
+    pairs = _neighbor_pairs([view.camera for view in views if view.camera is not None])
+    found = []
+    for i, j in pairs:
+        error = _pair_error(views[i], views[j], features[i], features[j], capture.factor)
+        if error is not None:
+            found.append(error)
+    return found
+
+
+def view_errors(errors: Sequence[PairError]) -> dict[str, float]:
+    """Each view's error: the lower quartile over its pairs, so that one bad view does not affect its neighbors."""
+    by_view: dict[str, list[float]] = {}
+    for pair in errors:
+        for name in (pair.first, pair.second):
+            by_view.setdefault(name, []).append(pair.error)
+    return {name: float(np.quantile(values, 0.25)) for name, values in sorted(by_view.items())}
+
+
+def _features(view: InspectedView) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
+    gray = view.codes.numpy().astype(np.float64).mean(axis=(0, 3))
+    top = max(float(np.percentile(gray, 99.5)), 1.0)
+    shown = (255 * np.clip(gray / top, 0, 1) ** (1 / 2.2)).astype(np.uint8)
+    keypoints, descriptors = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.02).detectAndCompute(  # type: ignore[attr-defined]
+        shown, None
+    )
+    # OpenCV has its first pixel center at 0, COLMAP at 0.5.
+    places = np.array([point.pt for point in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
+    return places, None if descriptors is None else np.sqrt(
+        descriptors / (descriptors.sum(1, keepdims=True) + 1e-9)
+    )
+
+
+def _neighbor_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
+    centers = np.stack([camera.center.numpy() for camera in cameras])
+    axes = np.stack([camera.rotation[2].numpy() for camera in cameras])
+    apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    apart = apart / max(float(np.median(apart)), 1e-12) + 2 * (1 - axes @ axes.T)
+    np.fill_diagonal(apart, np.inf)
+    near = np.argsort(apart, axis=1)[:, : min(NEIGHBORS, len(cameras) - 1)]
+    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(near) for j in row})
+
+
+def _pair_error(
+    first: InspectedView,
+    second: InspectedView,
+    features1: tuple[NDArray[np.float64], NDArray[np.float32] | None],
+    features2: tuple[NDArray[np.float64], NDArray[np.float32] | None],
+    factor: int,
+) -> PairError | None:
+    (x1, d1), (x2, d2) = features1, features2
+    assert first.camera is not None
+    assert second.camera is not None
+    if d1 is None or d2 is None or min(len(d1), len(d2)) < 2:
+        return None
+    there = cv2.BFMatcher(cv2.NORM_L2).knnMatch(d1, d2, k=2)
+    back = {m.queryIdx: m.trainIdx for m in cv2.BFMatcher(cv2.NORM_L2).match(d2, d1)}
+    kept = [m for m, n in there if m.distance < RATIO * n.distance and back.get(m.trainIdx) == m.queryIdx]
+    if len(kept) < FEWEST_MATCHES:
+        return None
+    p1 = np.concatenate([x1[[m.queryIdx for m in kept]], np.ones((len(kept), 1))], axis=1)
+    p2 = np.concatenate([x2[[m.trainIdx for m in kept]], np.ones((len(kept), 1))], axis=1)
+    matrix = _fundamental(first.camera, second.camera)
+    along2, along1 = p1 @ matrix.T, p2 @ matrix
+    value = np.abs((p2 * along2).sum(axis=1))
+    distance = value / np.sqrt((along1[:, :2] ** 2).sum(1) + (along2[:, :2] ** 2).sum(1)) * np.sqrt(2)
+    near = distance < GATE_SHARE * float(np.hypot(first.camera.width, first.camera.height))
+    if near.sum() < FEWEST_MATCHES:
+        return None
+    return PairError(first.name, second.name, int(near.sum()), float(np.median(distance[near])) * factor)
+
+
+def _fundamental(first: Camera, second: Camera) -> NDArray[np.float64]:
+    """F with ``x2^T F x1 = 0`` for pixels of the two views (Hartley and Zisserman, Eq. 9.2)."""
+    rotation = (second.rotation @ first.rotation.T).numpy()
+    x, y, z = second.translation.numpy() - rotation @ first.translation.numpy()
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    inner1, inner2 = (np.linalg.inv(camera.intrinsics.numpy()) for camera in (first, second))
+    return np.asarray(inner2.T @ cross @ rotation @ inner1)
+
+
+TYPICAL_PX, VIEW_PX = 2.0, 2.0
+"""Median epipolar errors in stored pixels above which a capture, or one view of it, gets a warning."""
+STANDS_OUT = 2.5
+"""A view also has to be this many times worse than the median view."""
+GAP_DEG = 25.0
+FEW_VIEWS = 20
+
+
+def pose_check(capture: Capture) -> Check:
+    """Check whether feature matches agree with the poses."""
+    key, title = "poses", "Pose quality"
+    if capture.model is None:
+        remedy = "Run polarguide prepare with --poses sfm or --poses PATH."
+        return Check(key, title, "n/a", "There are no poses.", remedy)
+    missing = tuple(view.name for view in capture.views if view.camera is None)
+    errors = view_errors(epipolar_errors(capture))
+    if len(errors) < 3:
+        return Check(
+            key, title, "n/a" if not missing else "warning",
+            f"Too few features match between neighboring views to judge the poses. {len(missing)} views have none.",
+            "Structure from motion needs static texture." if missing else "", missing,
+            {"views": {}, "without_pose": len(missing)},
+        )  # fmt: skip
+    typical = float(np.median(list(errors.values())))
+    bad = tuple(name for name, e in errors.items() if e > max(VIEW_PX, STANDS_OUT * typical))
+    figures = {"median_px": typical, "views": errors, "without_pose": len(missing)}
+    finding = f"Matches lie {typical:.2f} px from their epipolar lines (median view of {len(errors)})."
+    verdict: Verdict = "ok"
+    remedies = []
+    if bad:
+        verdict = "warning"
+        finding += f" Far worse: {listed([f'{name} ({errors[name]:.1f} px)' for name in bad])}."
+        remedies.append("Leave these views out, or register them again.")
+    if missing:
+        verdict = "warning"
+        finding += f" Without a pose: {len(missing)} views ({listed(list(missing))})."
+        remedies.append("Remove the pictures of views without a pose, which train refuses, or register them.")
+    if typical > TYPICAL_PX:
+        verdict = "wrong" if typical > 2 * TYPICAL_PX else "warning"
+        remedies.append("Refine the model (bundle adjustment), and check that it belongs to these pictures.")
+    return Check(key, title, verdict, finding, " ".join(remedies), (*bad, *missing), figures)
+
+
+def coverage_check(capture: Capture) -> Check:
+    """Check whether neighboring views are close enough to each other."""
+    key, title = "coverage", "Coverage"
+    cameras = [view.camera for view in capture.posed if view.camera is not None]
+    if len(cameras) < 2:
+        return Check(key, title, "n/a", "Fewer than two views have a pose.")
+    focus = scene_frame(cameras).center
+    seen = unit_array(torch.stack([camera.center - focus for camera in cameras]).numpy())
+    angles = np.degrees(np.arccos(np.clip(seen @ seen.T, -1, 1))) + 360 * np.eye(len(seen))
+    nearest = angles.min(axis=1)
+    spread = float(np.degrees(np.arccos(np.clip(seen @ unit_array(seen.mean(axis=0)), -1, 1))).max())
+    figures = {"views": len(seen), "median_step_deg": float(np.median(nearest)),
+               "largest_step_deg": float(nearest.max()), "half_angle_deg": spread}  # fmt: skip
+    finding = (
+        f"{len(seen)} views, {np.median(nearest):.0f}° from the nearest view (median; at most {nearest.max():.0f}°), "
+        f"within {spread:.0f}° of their mean direction."
+    )
+    lonely = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > GAP_DEG)
+    if lonely or len(seen) < FEW_VIEWS:
+        return Check(
+            key, title, "warning", finding,
+            "Reconstruction is unreliable across gaps: add views at most 15 degrees apart.", lonely, figures,
+        )  # fmt: skip
+    return Check(key, title, "ok", finding, figures=figures)
+
 
 SURE = 0.98
 """Probability from which on ``auto`` is content with the points."""
@@ -114,7 +296,7 @@ def inspect_scene(
         raise PolarguideError(
             "--calibration",
             expected="a scene with four pictures of each view",
-            found="one with other pictures",
+            found="a scene with pictures at other angles",
             remedy="Leave --calibration out.",
         )
     if settings.calibration is not None:

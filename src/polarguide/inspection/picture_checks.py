@@ -95,7 +95,7 @@ def picture_checks(
 
 
 def light_checks(capture: Capture, measurements: Sequence[ViewMeasurements]) -> list[Check]:
-    """Those of them that pictures at any angle carry: saturation and brightness."""
+    """The checks that apply to pictures at any angles: saturation and brightness."""
     return [_saturation(capture, measurements), _brightness(measurements)]
 
 
@@ -119,8 +119,8 @@ def _pairs(capture: Capture, measurements: Sequence[ViewMeasurements], pairing: 
             "Check whether something moved or the light changed between the shots, or whether files were exchanged.",
             off, figures,
         )  # fmt: skip
-    said = f"I0 + I90 and I45 + I135 differ by {error:.1%} of S0 (median)."
-    return Check(key, title, "ok", said, figures=figures)
+    finding = f"I0 + I90 and I45 + I135 differ by {error:.1%} of S0 (median)."
+    return Check(key, title, "ok", finding, figures=figures)
 
 
 BENT, WRONG = 0.05, 0.18
@@ -138,11 +138,11 @@ def _encoding(capture: Capture, pairing: int | None) -> Check:
     figures = {"curvature": slope} if bend is None else {"curvature": bend[0], "curvature_error": bend[1]}
     slope = slope if bend is None else bend[0]
     sure = bend is not None and abs(slope) > _SURE_BEND * bend[1]
-    said = f"Curvature of the response {slope:+.2f}; linear files have 0, sRGB read as linear about -0.6."
+    finding = f"Curvature of the response {slope:+.2f}; linear files have 0, sRGB read as linear about -0.6."
     low, high = (abs(slope) > abs((checks.ENCODED if slope < 0 else checks.DECODED)[k]) for k in (0, 1))
     low, high = low or (sure and abs(slope) > BENT), high or (sure and abs(slope) > WRONG)
     if not low:
-        return Check(key, title, "ok", said, figures=figures)
+        return Check(key, title, "ok", finding, figures=figures)
     gamma = 1 / (1 - 2 * slope)
     remedy = (
         "The files seem display-encoded (gamma): export linear ones, or read them with --transfer srgb; mosaics of a "
@@ -150,7 +150,7 @@ def _encoding(capture: Capture, pairing: int | None) -> Check:
         if slope < 0
         else "The files seem linear but are decoded (or have another tone curve): try --transfer linear."
     )
-    return Check(key, title, "wrong" if high else "warning", said, remedy, figures=figures)
+    return Check(key, title, "wrong" if high else "warning", finding, remedy, figures=figures)
 
 
 _SURE_BEND = 4.0
@@ -198,12 +198,12 @@ def _exposure(
     ratio = float(np.median([r.pair_ratio for r in known]))
     off = tuple(r.view for r in known if abs((r.pair_ratio or ratio) - ratio) > UNSTEADY)
     figures: dict[str, Any] = {"pair_ratio": ratio, "unsteady_views": len(off)}
-    said = f"(I0 + I90) / (I45 + I135) is {ratio:.3f} (median); ideal analyzers have 1."
+    finding = f"(I0 + I90) / (I45 + I135) is {ratio:.3f} (median); ideal analyzers have 1."
     verdict: Verdict = "ok"
     remedy = ""
     if abs(ratio - 1) > UNEQUAL:
         verdict = "wrong" if abs(ratio - 1) > VERY_UNEQUAL else "warning"
-        said += f" If only one picture deviates, it does by {2 * abs(ratio - 1):.0%}."
+        finding += f" If only one picture deviates, it does by {2 * abs(ratio - 1):.0%}."
         remedy = (
             "Let prepare estimate the gains (it does by default), or measure them on unpolarized light and give "
             "--calibration. The pair sums do not show which of the four deviates."
@@ -216,16 +216,16 @@ def _exposure(
         each = ", ".join(
             f"{angle}°: {value:.2f}" for angle, value in zip(ANGLES, np.exp(exposed.logs), strict=True)
         )
-        said += f" Pixel by pixel, they agree if the angles were exposed by {each}."
+        finding += f" Pixel by pixel, they agree if the angles were exposed by {each}."
         remedy = (
             "Prepare the original files, whose EXIF says the exposure, with --gains auto; or give gains with "
             "--calibration. An angle that is off by several degrees looks alike."
         )
     if off:
         verdict = "warning" if verdict == "ok" else verdict
-        said += f" It differs by more than {UNSTEADY:.0%} in {len(off)} views ({listed(list(off))})."
+        finding += f" It differs by more than {UNSTEADY:.0%} in {len(off)} views ({listed(list(off))})."
         remedy = remedy or "Look for automatic exposure, flicker, or motion between the shots."
-    return Check(key, title, verdict, said, remedy, off, figures)
+    return Check(key, title, verdict, finding, remedy, off, figures)
 
 
 def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> Check:
@@ -245,15 +245,15 @@ def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> C
             "The data were not scaled to 16 bits: multiply the values, or run prepare with --bits.", figures=figures,
         )  # fmt: skip
     off = tuple(r.view for r, share in zip(measurements, lost, strict=True) if share > SATURATED)
-    said = (
+    finding = (
         f"{np.mean(shares):.1%} of the pixels are at full scale, at most {max(shares):.1%} in a view; "
         f"{figures['invalid']:.1%} are marked invalid, {figures['dark']:.1%} are too dark to be used."
     )
     if not off:
-        return Check(key, title, "ok", said, figures=figures)
+        return Check(key, title, "ok", finding, figures=figures)
     verdict: Verdict = "wrong" if float(np.mean(lost)) > BLOWN else "warning"
     return Check(
-        key, title, verdict, f"{said} Over {SATURATED:.0%} are lost in {len(off)} views ({listed(list(off))}).",
+        key, title, verdict, f"{finding} Over {SATURATED:.0%} are lost in {len(off)} views ({listed(list(off))}).",
         "These pixels carry no polarization and are excluded. Invalid ones may have clipped in the camera: expose "
         "shorter, keep lamps out of the picture.", off, figures,
     )  # fmt: skip
@@ -265,17 +265,17 @@ def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
         float(np.median([getattr(r, k) for r in measurements])) for k in ("noise_share", "bright")
     )
     off = tuple(r.view for r in measurements if r.noise_share > NOISY or r.bright < UNDEREXPOSED)
-    said = (
+    finding = (
         f"Noise of one intensity is {share:.2%} of the photograph (median, after averaging down), so that a DoLP "
         f"of {3 * 2**0.5 * share / 2:.3f} is three times its noise; "
         f"the 99th percentile of the values is {bright:.0%} of full scale."
     )
     figures = {"noise_share": share, "bright": bright}
     if not off:
-        return Check(key, title, "ok", said, figures=figures)
+        return Check(key, title, "ok", finding, figures=figures)
     verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) and bright < UNDEREXPOSED else "warning"
     return Check(
-        key, title, verdict, f"{said} Dark or noisy: {len(off)} views ({listed(list(off))}).",
+        key, title, verdict, f"{finding} Dark or noisy: {len(off)} views ({listed(list(off))}).",
         "Use a longer exposure at the lowest gain, or average several shots.", off, figures,
     )  # fmt: skip
 
@@ -283,13 +283,13 @@ def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
 def _brightness(measurements: Sequence[ViewMeasurements]) -> Check:
     key, title = "brightness", "Brightness"
     bright = float(np.median([r.bright for r in measurements]))
-    said = f"The 99th percentile of the values is {bright:.0%} of full scale (median view)."
+    finding = f"The 99th percentile of the values is {bright:.0%} of full scale (median view)."
     off = tuple(r.view for r in measurements if r.bright < UNDEREXPOSED)
     if not off:
-        return Check(key, title, "ok", said, figures={"bright": bright})
+        return Check(key, title, "ok", finding, figures={"bright": bright})
     return Check(
         key, title, "wrong" if 2 * len(off) > len(measurements) else "warning",
-        f"{said} Dark: {len(off)} views ({listed(list(off))}).", "Use a longer exposure.", off, {"bright": bright},
+        f"{finding} Dark: {len(off)} views ({listed(list(off))}).", "Use a longer exposure.", off, {"bright": bright},
     )  # fmt: skip
 
 
@@ -297,13 +297,13 @@ def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
     key, title = "low_dolp", "Strength of polarization"
     share = float(np.median([r.polarized for r in measurements]))
     median = float(np.median([r.dolp[0] for r in measurements]))
-    said = f"{share:.0%} of the pixels have a DoLP above {POLARIZED:g} and above three times its noise; "
-    said += f"the median DoLP is {median:.3f}."
+    finding = f"{share:.0%} of the pixels have a DoLP above {POLARIZED:g} and above three times its noise; "
+    finding += f"the median DoLP is {median:.3f}."
     strongest = float(np.median([r.dolp[1] for r in measurements]))
     noise = 3 * math.sqrt(2) / 2 * float(np.median([r.noise_share for r in measurements]))
     figures = {"polarized": share, "median_dolp": median, "p99_dolp": strongest}
     if share >= LITTLE:
-        return Check(key, title, "ok", said, figures=figures)
+        return Check(key, title, "ok", finding, figures=figures)
     if (strongest < POLARIZED or share < ALMOST_NONE) and noise < POLARIZED:
         return Check(
             key, title, "wrong",
@@ -315,7 +315,7 @@ def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
             figures=figures,
         )  # fmt: skip
     return Check(
-        key, title, "wrong" if share < ALMOST_NONE else "warning", said,
+        key, title, "wrong" if share < ALMOST_NONE else "warning", finding,
         "Polarization carries little information here. Photograph surfaces obliquely (50 to 65 degrees), from lower "
         "views; check that the filter is a linear polarizer, the right way round, and that the exposure was fixed.",
         figures=figures,
@@ -333,7 +333,7 @@ def dielectric_check(
     key, title = "dielectric", "Polarization that a dielectric can have"
     above = float(torch.tensor([r.above_limit for r in measurements]).median())
     limit = float(optics.diffuse_dolp_limit(index))
-    said = f"{above:.0%} of the pixels (median view) have a DoLP above the diffuse limit ({limit:.2f})."
+    finding = f"{above:.0%} of the pixels (median view) have a DoLP above the diffuse limit ({limit:.2f})."
     figures: dict[str, Any] = {"above_diffuse_limit": above}
     remedy = (
         "Bare metal, sky or its reflection, or a screen? The model assumes dielectrics under unpolarized light: "
@@ -341,16 +341,18 @@ def dielectric_check(
     )
     if pixels is None or len(pixels.aolp) == 0:
         verdict: Verdict = "warning" if above > NOT_DIELECTRIC else "ok"
-        said += (
+        finding += (
             " Without normals, reflections of a smooth dielectric cannot be distinguished from metal or sky."
         )
-        return Check(key, title, verdict, said, remedy if verdict == "warning" else "", figures=figures)
+        return Check(key, title, verdict, finding, remedy if verdict == "warning" else "", figures=figures)
     strange = float(exceeds_dielectric(pixels, index).float().mean())
     figures["unexplained"] = strange
-    said += f" Of the pixels with a normal, {strange:.0%} have a DoLP above the maximum of both lobes at their zenith."
+    finding += (
+        f" {strange:.0%} of pixels with a normal have a DoLP above the maximum of both lobes at their zenith."
+    )
     if strange <= NOT_DIELECTRIC:
-        return Check(key, title, "ok", said, figures=figures)
-    return Check(key, title, "warning", said, remedy, figures=figures)
+        return Check(key, title, "ok", finding, figures=figures)
+    return Check(key, title, "warning", finding, remedy, figures=figures)
 
 
 def exceeds_dielectric(pixels: SurfaceSamples, index: float) -> torch.Tensor:

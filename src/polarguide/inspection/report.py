@@ -20,10 +20,9 @@ from polarguide.inspection.inspect import Inspection
 from polarguide.inspection.settings import plain
 from polarguide.inspection.shots import ShotFindings
 from polarguide.visualization import figures
-from polarguide.visualization.embedded import data_uri
 from polarguide.visualization.figures import Picture
 from polarguide.visualization.layers import AOLP_FULL_DOLP, DOLP_HIGH
-from polarguide.visualization.pages import page
+from polarguide.visualization.pages import data_uri, page
 
 SIDE = 240
 """Longest side of the pictures in pixels."""
@@ -82,7 +81,7 @@ def layer_uris(view: InspectedView, layers: Sequence[Layer]) -> dict[str, str]:
 
 
 def _of_four(view: InspectedView) -> dict[str, Picture]:
-    """What only pictures at four angles show."""
+    """Charts that need pictures at four angles."""
     gray = view.intensities().mean(dim=-1)
     stokes = optics.stokes(gray)
     s0, degree = stokes[0].clamp(min=1e-6), optics.dolp(stokes)
@@ -188,11 +187,11 @@ def _notes(angles: AngleFindings) -> list[str]:
 def _shots(found: ShotFindings) -> list[tuple[str, ...]]:
     """Rows of the table of angles: what is specified of each picture, and what was found."""
     rows: list[tuple[str, ...]] = []
-    for judgment, said in zip(found.judgments, found.said, strict=True):
+    for judgment, exposure in zip(found.judgments, found.stated, strict=True):
         angle = "without a filter, as it looks" if judgment.unfiltered else f"{judgment.angle:.0f}°"
         angle = "too little polarization to tell" if judgment.vague else angle
         numbers = (f"{judgment.spread:.1f}°", f"{judgment.modulation:.2f}", f"{judgment.gain:.2f}")
-        rows.append((judgment.view, said.words, angle, *numbers))
+        rows.append((judgment.view, exposure.words, angle, *numbers))
     return [] if found.why else rows
 
 

@@ -1,4 +1,4 @@
-"""What ``inspect`` may be asked for, and the result of a check. Nothing here imports torch."""
+"""Settings of ``inspect``, and the result of a check. Nothing here imports torch."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Captures of single shots: what their pictures are, and whether they agree with the angles that the capture states.
 
-A short training that is told no angle finds the angle of every picture in closed form (``training.angles.polarizers``),
-and each is compared with the stated one.
+A short training without the stated angles estimates each picture's angle in closed form
+(``training.angles.polarizers``), and the two are compared.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from polarguide.training.trainer import StepReport
 
 RECIPE = "polarguide-stokes"
 CERTAIN = 0.6
-"""Modulation (``FittedAngle``), over the median of all pictures, from which one may be said to contradict its angle. At
+"""Modulation (``FittedAngle``), over the median of all pictures, from which one may contradict its stated angle. At
 0.7 a wrong line of the demo (0.67) went unnamed. Nor may one that the scene explains poorly: on four test scenes with
-right angles (two seeds each, 504 pictures) nine would be said to be wrong, five of them are certain enough, and none of
+right angles (two seeds each, 504 pictures) nine would count as wrong, five of them are certain enough, and none of
 these is explained as well as the others.
 """
 CONTRADICTS = 30.0
-"""Degrees from the angle that is said from which on a picture contradicts it, if that is also four times its spread and
+"""Degrees from the stated angle from which on a picture contradicts it, if that is also four times its spread and
 four standard deviations of all differences. The short training is 3 to 7 degrees off (median) on four scenes."""
 ALIKE = 0.8
 """Length of the mean of (cos 2d, sin 2d), d being differences of angles, from which on they agree with each other."""
 FEWEST = 4
-"""Pictures that tell their angle from which on something is said of all."""
+"""Number of pictures that determine their angle from which on all are judged."""
 SENSE_NEEDS = 0.95
 """Said angles whose doubled directions have a mean longer than this are too much alike to tell a sense."""
 ZERO_OFF, ZERO_WRONG = 4.0, 8.0
@@ -54,24 +54,24 @@ FEW_ANGLES = 3
 
 @dataclass(frozen=True)
 class ShotFindings:
-    """What the short training found of the pictures' polarizers.
+    """The polarizers of the pictures as the short training estimates them.
 
     Attributes:
-        judgments: of each picture through a filter, as if nothing were known of it; empty without a training.
-        said: what the capture says of each of them.
+        judgments: of each picture through a filter, without use of its stated angle; empty without a training.
+        stated: the exposures as the capture states them, one each.
         why: why there was no training.
         unfiltered: whether that is because no picture was taken through a filter.
     """
 
     judgments: tuple[Judgment, ...] = ()
-    said: tuple[Exposure, ...] = ()
+    stated: tuple[Exposure, ...] = ()
     why: str = ""
     unfiltered: bool = False
 
     @property
     def telling(self) -> list[tuple[Judgment, float]]:
-        """Pictures that tell their angle, with the one that is said."""
-        rows = zip(self.judgments, self.said, strict=True)
+        """Pictures that determine their angle, with the stated angle of each."""
+        rows = zip(self.judgments, self.stated, strict=True)
         return [(j, s.angle) for j, s in rows if s.angle is not None and not (j.vague or j.unfiltered)]
 
     def record(self) -> dict[str, Any]:
@@ -80,7 +80,7 @@ class ShotFindings:
             {
                 "view": judgment.view,
                 "picture": judgment.number,
-                "said_degrees": said.angle,
+                "said_degrees": exposure.angle,
                 "found_degrees": judgment.angle,
                 "spread_degrees": judgment.spread,
                 "gain": judgment.gain,
@@ -88,7 +88,7 @@ class ShotFindings:
                 "filtered": not judgment.unfiltered,
                 "tells": not (judgment.vague or judgment.unfiltered),
             }
-            for judgment, said in zip(self.judgments, self.said, strict=True)
+            for judgment, exposure in zip(self.judgments, self.stated, strict=True)
         ]
         return {"pictures": pictures, "why_not": self.why}
 
@@ -135,12 +135,12 @@ def find_shots(
         on_step=on_step,
     )
     judgments = Polarizers(blind, recipe, total, state.angles).judgments()
-    said = {view.name: view.exposures for view in scene.train_views}
-    return ShotFindings(tuple(judgments), tuple(said[j.view][j.number] for j in judgments))
+    exposures = {view.name: view.exposures for view in scene.train_views}
+    return ShotFindings(tuple(judgments), tuple(exposures[j.view][j.number] for j in judgments))
 
 
 def pictures_check(capture: Capture) -> Check:
-    """What pictures there are, and whether their angles differ enough."""
+    """Check of the number of pictures, and of the differences of their angles."""
     key, title = "pictures", "Pictures"
     exposures = [exposure for view in capture.views for exposure in view.exposures]
     angles = sorted({exposure.angle for exposure in exposures if exposure.angle is not None})
@@ -157,21 +157,21 @@ def pictures_check(capture: Capture) -> Check:
         parts.append(f"{unknown} at unknown angles")
     if plain:
         parts.append(f"{plain} without a filter")
-    said = f"{len(exposures)} pictures of {len(capture.views)} views: {', '.join(parts)}; gains "
-    said += f"{min(gains):.2f} to {max(gains):.2f}."
+    finding = f"{len(exposures)} pictures of {len(capture.views)} views: {', '.join(parts)}; gains "
+    finding += f"{min(gains):.2f} to {max(gains):.2f}."
     if plain == len(exposures):
         return Check(
-            key, title, "warning", f"{said} Ordinary photographs train, without measured polarization.",
+            key, title, "warning", f"{finding} Ordinary photographs train, without measured polarization.",
             "If a filter was used, note its angles (or --angles unknown) and repeat prepare. If not, nothing is wrong; "
             "some views through a filter would improve layers and normals.", figures=figures,
         )  # fmt: skip
     if not unknown and len(angles) < FEW_ANGLES:
         return Check(
-            key, title, "warning", said,
+            key, title, "warning", finding,
             "Turn the filter between shots: with at least three angles, spread over half a turn, no direction of "
             "the polarization stays unseen.", figures=figures,
         )  # fmt: skip
-    return Check(key, title, "ok", said, figures=figures)
+    return Check(key, title, "ok", finding, figures=figures)
 
 
 def agreement_checks(capture: Capture) -> list[Check]:
@@ -213,19 +213,19 @@ def agreement_checks(capture: Capture) -> list[Check]:
     ]  # fmt: skip
 
 
-def shot_checks(found: ShotFindings) -> list[Check]:
-    """Whether the pictures agree with what is said of them: filter, sense, zero, and each by itself."""
-    if found.why:
-        said = [("modulation", "Filter"), ("handedness", "Sense of the angles"),
+def shot_checks(findings: ShotFindings) -> list[Check]:
+    """Checks of the pictures: filter, sense and zero of the angles, and each angle."""
+    if findings.why:
+        checks = [("modulation", "Filter"), ("handedness", "Sense of the angles"),
                 ("zero_offset", "Zero of the angles"), ("angles", "Angles of the pictures")]  # fmt: skip
-        verdict: Verdict = "n/a" if found.unfiltered else "not verified"
-        return [Check(key, title, verdict, found.why) for key, title in said]
-    sense, offset, error = _common(found.telling)
+        verdict: Verdict = "n/a" if findings.unfiltered else "not verified"
+        return [Check(key, title, verdict, findings.why) for key, title in checks]
+    sense, offset, error = _common(findings.telling)
     return [
-        _modulation(found),
-        _sense(found, sense),
-        _zero(found, sense, offset, error),
-        _each(found, sense, offset),
+        _modulation(findings),
+        _sense(findings, sense),
+        _zero(findings, sense, offset, error),
+        _each(findings, sense, offset),
     ]
 
 
@@ -248,14 +248,14 @@ def _common(telling: Sequence[tuple[Judgment, float]]) -> tuple[int | None, floa
     return sense, offset, float(1.4826 * np.median(np.abs(apart)) / math.sqrt(len(near)) * 1.25)
 
 
-def _modulation(found: ShotFindings) -> Check:
+def _modulation(findings: ShotFindings) -> Check:
     key, title = "modulation", "Filter"
-    count = len(found.judgments)
-    plain = tuple(dict.fromkeys(j.view for j in found.judgments if j.unfiltered))
-    vague = sum(j.vague for j in found.judgments)
-    modulation = float(np.median([j.modulation for j in found.judgments]))
+    count = len(findings.judgments)
+    plain = tuple(dict.fromkeys(j.view for j in findings.judgments if j.unfiltered))
+    vague = sum(j.vague for j in findings.judgments)
+    modulation = float(np.median([j.modulation for j in findings.judgments]))
     figures = {"pictures": count, "unfiltered": len(plain), "vague": vague, "modulation": modulation}
-    said = f"{count - len(plain) - vague} of {count} pictures tell the angle of their filter."
+    finding = f"{count - len(plain) - vague} of {count} pictures tell the angle of their filter."
     if 2 * len(plain) > count:
         return Check(
             key, title, "wrong",
@@ -267,30 +267,30 @@ def _modulation(found: ShotFindings) -> Check:
         )  # fmt: skip
     if plain:
         return Check(
-            key, title, "warning", f"{said} Taken without a filter, as it looks: {listed(list(plain))}.",
+            key, title, "warning", f"{finding} Taken without a filter, as it looks: {listed(list(plain))}.",
             "If so, write none for them in angles.csv.", plain, figures,
         )  # fmt: skip
     if 2 * vague > count:
         return Check(
-            key, title, "warning", f"{said} The others show too little polarization for that.",
+            key, title, "warning", f"{finding} The others show too little polarization for that.",
             "Photograph glossy surfaces obliquely (50 to 65 degrees); or train longer with --steps.",
             figures=figures,
         )  # fmt: skip
-    return Check(key, title, "ok", said, figures=figures)
+    return Check(key, title, "ok", finding, figures=figures)
 
 
-def _sense(found: ShotFindings, sense: int | None) -> Check:
+def _sense(findings: ShotFindings, sense: int | None) -> Check:
     key, title = "handedness", "Sense of the angles"
-    telling = found.telling
+    telling = findings.telling
     if len(telling) < FEWEST:
-        return Check(key, title, "n/a" if _all_unknown(found) else "not verified", _too_few(found))
-    said = np.radians([angle for _, angle in telling])
-    if abs(np.exp(2j * said).mean()) > SENSE_NEEDS or abs(np.exp(4j * said).mean()) > SENSE_NEEDS:
+        return Check(key, title, "n/a" if _all_unknown(findings) else "not verified", _too_few(findings))
+    stated = np.radians([angle for _, angle in telling])
+    if abs(np.exp(2j * stated).mean()) > SENSE_NEEDS or abs(np.exp(4j * stated).mean()) > SENSE_NEEDS:
         return Check(
             key,
             title,
             "not verified",
-            "The angles that are said, modulo 90 degrees, differ too little to tell.",
+            "The stated angles, modulo 90 degrees, differ too little to tell.",
         )
     if sense is None:
         return Check(key, title, "warning", "The pictures agree with neither sense.", _remedy_of_chaos())
@@ -302,70 +302,72 @@ def _sense(found: ShotFindings, sense: int | None) -> Check:
     return Check(key, title, "ok", "Counter-clockwise as displayed.", figures={"counter_clockwise": 1.0})
 
 
-def _zero(found: ShotFindings, sense: int | None, offset: float, error: float) -> Check:
+def _zero(findings: ShotFindings, sense: int | None, offset: float, error: float) -> Check:
     key, title = "zero_offset", "Zero of the angles"
     if sense is None:
-        return Check(key, title, "n/a" if _all_unknown(found) else "not verified", _too_few(found))
+        return Check(key, title, "n/a" if _all_unknown(findings) else "not verified", _too_few(findings))
     figures = {"offset_degrees": offset, "error_degrees": error}
-    said = f"The zero of the filter lies at {offset:+.1f}° ± {error:.1f}° from where it is said to lie."
+    finding = f"The zero of the filter lies at {offset:+.1f}° ± {error:.1f}° from where it is stated to lie."
     if abs(offset) <= max(ZERO_OFF, 4 * error):
-        return Check(key, title, "ok", said, figures=figures)
+        return Check(key, title, "ok", finding, figures=figures)
     verdict: Verdict = "wrong" if abs(offset) > max(ZERO_WRONG, 4 * error) else "warning"
     return Check(
-        key, title, verdict, said,
+        key, title, verdict, finding,
         f"Repeat prepare with --zero changed by {offset:+.0f} degrees and a new --out; this training itself is good "
         "to a few degrees.", figures=figures,
     )  # fmt: skip
 
 
-def _each(found: ShotFindings, sense: int | None, offset: float) -> Check:
+def _each(findings: ShotFindings, sense: int | None, offset: float) -> Check:
     key, title = "angles", "Angles of the pictures"
-    unknown = sum(not said.known for said in found.said)
+    unknown = sum(not exposure.known for exposure in findings.stated)
     if sense is None:
-        chaos = len(found.telling) >= FEWEST
-        if _all_unknown(found) and (doubtful := sum(j.doubtful for j in found.judgments)) * 2 > unknown:
-            said = f"No angle is specified, and {doubtful} of the {unknown} that were found are doubtful."
+        chaos = len(findings.telling) >= FEWEST
+        if _all_unknown(findings) and (doubtful := sum(j.doubtful for j in findings.judgments)) * 2 > unknown:
+            finding = f"No angle is specified, and {doubtful} of the {unknown} that were found are doubtful."
             return Check(
-                key, title, "warning", said, REMEDY, figures={"doubtful": doubtful, "unknown": unknown}
+                key, title, "warning", finding, REMEDY, figures={"doubtful": doubtful, "unknown": unknown}
             )
-        verdict: Verdict = "wrong" if chaos else "ok" if _all_unknown(found) else "not verified"
-        said = "The pictures contradict the angles that are said." if chaos else _too_few(found)
-        return Check(key, title, verdict, said, _remedy_of_chaos() if chaos else "")
+        verdict: Verdict = "wrong" if chaos else "ok" if _all_unknown(findings) else "not verified"
+        finding = "The pictures contradict the stated angles." if chaos else _too_few(findings)
+        return Check(key, title, verdict, finding, _remedy_of_chaos() if chaos else "")
     # Differences are angles modulo 180 degrees, in [-90, 90).
-    rows = [(j, (j.angle - sense * said - offset + 90.0) % 180.0 - 90.0, said) for j, said in found.telling]
+    rows = [
+        (j, (j.angle - sense * angle - offset + 90.0) % 180.0 - 90.0, angle) for j, angle in findings.telling
+    ]
     typical = float(np.median([abs(apart) for _, apart, _ in rows]))
-    certain = CERTAIN * float(np.median([j.modulation for j in found.judgments]))
+    certain = CERTAIN * float(np.median([j.modulation for j in findings.judgments]))
     off = [
-        (j, said)
-        for j, apart, said in rows
+        (j, angle)
+        for j, apart, angle in rows
         if abs(apart) > max(CONTRADICTS, 4 * j.spread, 4 * 1.4826 * typical)
         and j.modulation > certain
         and not j.poorly_explained
     ]
     figures = {"median_degrees": typical, "compared": len(rows), "unknown": unknown}
-    said = f"{len(rows)} pictures lie {typical:.1f}° from the angles that are said (median)."
+    finding = f"{len(rows)} pictures lie {typical:.1f}° from the stated angles (median)."
     if not off:
-        return Check(key, title, "ok", said, figures=figures)
+        return Check(key, title, "ok", finding, figures=figures)
     names = [
         f"{j.view} ({angle:g}°, looks like {(sense * (j.angle - offset)) % 180:.0f}°)" for j, angle in off
     ]
     return Check(
         key, title, "wrong" if 5 * len(off) > len(rows) else "warning",
-        f"{said} Contradicting: {listed(names)}.",
+        f"{finding} Contradicting: {listed(names)}.",
         "Compare them with your notes; correct their lines of angles.csv, or write unknown.",
         tuple(dict.fromkeys(j.view for j, _ in off)), figures,
     )  # fmt: skip
 
 
-def _all_unknown(found: ShotFindings) -> bool:
-    return all(said.angle is None for said in found.said)
+def _all_unknown(findings: ShotFindings) -> bool:
+    return all(exposure.angle is None for exposure in findings.stated)
 
 
-def _too_few(found: ShotFindings) -> str:
-    if _all_unknown(found):
-        return "No angle is said: training finds them."
-    count = len(found.telling)
-    return f"Only {count} pictures tell their angle, and one is said: too few to compare."
+def _too_few(findings: ShotFindings) -> str:
+    if _all_unknown(findings):
+        return "No angle is stated: training estimates them."
+    count = len(findings.telling)
+    return f"Only {count} pictures with a stated angle determine it: too few to compare."
 
 
 def _remedy_of_chaos() -> str:

@@ -55,19 +55,19 @@ def exposures_of_points(values: Array) -> tuple[Array, NDArray[np.int64]]:
     """
     count = values.shape[1]
     logs = np.full(count, np.nan)
-    seen = np.isfinite(values)
-    long = np.argsort(-seen.sum(axis=1), kind="stable")[:_MOST_POINTS]
-    values, seen = values[long], seen[long]
-    shared = seen.sum(axis=1) >= min(_LEAST_TRACK, count)
-    values, seen = values[shared], seen[shared]
-    numbers = seen.sum(axis=0)
-    chosen = _connected(seen, numbers)
+    valid = np.isfinite(values)
+    long = np.argsort(-valid.sum(axis=1), kind="stable")[:_MOST_POINTS]
+    values, valid = values[long], valid[long]
+    shared = valid.sum(axis=1) >= min(_LEAST_TRACK, count)
+    values, valid = values[shared], valid[shared]
+    numbers = valid.sum(axis=0)
+    chosen = _connected(valid, numbers)
     if len(chosen) < 2:
         return logs, numbers
-    seen = seen[:, chosen]
-    kept = seen.sum(axis=1) >= 2
-    seen, log = seen[kept], np.log(np.where(seen, values[:, chosen], 1.0))[kept]
-    weights = seen.astype(np.float64)
+    valid = valid[:, chosen]
+    kept = valid.sum(axis=1) >= 2
+    valid, log = valid[kept], np.log(np.where(valid, values[:, chosen], 1.0))[kept]
+    weights = valid.astype(np.float64)
     for _ in range(_ROUNDS):
         total = weights.sum(axis=1)
         # The points' brightnesses are eliminated; adding 1 fixes the mean of the exposures at 0.
@@ -77,19 +77,19 @@ def exposures_of_points(values: Array) -> tuple[Array, NDArray[np.int64]]:
         found = np.linalg.solve(matrix + scale / len(matrix), right)
         found -= found.mean()
         bright = (weights * (log - found)).sum(axis=1) / total
-        residual = np.where(seen, log - found - bright[:, None], 0.0)
-        scatter = (residual**2).sum(axis=1) / np.maximum(seen.sum(axis=1) - 1, 1)
-        weights = seen / np.maximum(np.abs(residual), _SMALLEST) / np.maximum(scatter, _SMALLEST**2)[:, None]
+        residual = np.where(valid, log - found - bright[:, None], 0.0)
+        scatter = (residual**2).sum(axis=1) / np.maximum(valid.sum(axis=1) - 1, 1)
+        weights = valid / np.maximum(np.abs(residual), _SMALLEST) / np.maximum(scatter, _SMALLEST**2)[:, None]
     logs[chosen] = found
     return logs, numbers
 
 
-def _connected(seen: NDArray[np.bool_], numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+def _connected(valid: NDArray[np.bool_], numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     """The pictures of the largest set in which any two are linked by points in common."""
     enough = np.flatnonzero(numbers >= FEWEST)
     if len(enough) == 0:
         return enough
-    links = seen[:, enough].astype(np.float32)
+    links = valid[:, enough].astype(np.float32)
     _, group = connected_components(links.T @ links >= FEWEST / 4, directed=False)
     return enough[group == np.argmax(np.bincount(group))]
 
@@ -143,7 +143,7 @@ def reconciled(points: Array, files: Array, unfiltered: NDArray[np.bool_]) -> Ex
 _DARK = 0.004
 # Logarithm of a gain that is warned of where files do not state it: one and a half stops from the others.
 _FAR = math.log(2.0) * 1.5
-_LISTED = 40
+_LISTED = 12
 _PATCH = (3, 3)
 
 
@@ -301,11 +301,11 @@ def _at(
 
 def _apply_given(pictures: list[_Exposure]) -> None:
     """Take the gains that the user gave, and fit the others to them; without any, their geometric mean becomes 1."""
-    given = [math.nan if (gain := p.record["given_gain"]) is None else math.log(gain) for p in pictures]
-    known = np.isfinite(given)
+    stated = [math.nan if (gain := p.record["given_gain"]) is None else math.log(gain) for p in pictures]
+    known = np.isfinite(stated)
     logs = np.array([picture.log for picture in pictures])
-    shift = float(np.median((np.array(given) - logs)[known])) if known.any() else -float(logs.mean())
-    for picture, fixed, is_fixed in zip(pictures, given, known, strict=True):
+    shift = float(np.median((np.array(stated) - logs)[known])) if known.any() else -float(logs.mean())
+    for picture, fixed, is_fixed in zip(pictures, stated, known, strict=True):
         picture.log = fixed if is_fixed else picture.log + shift
 
 
@@ -320,8 +320,8 @@ def _say_how(
     """Where the gains come from."""
     by_points, by_files = int(np.isfinite(points).sum()), int(np.isfinite(files).sum())
     if scatter is not None:
-        said = f"Gains: exposures that the files state, and points in common ({by_points} of {len(views)} views); "
-        reporter.say(f"{said}the two differ by {scatter:.1%} (robust standard deviation).")
+        origin = f"Gains: exposures that the files state, and points in common ({by_points} of {len(views)} views); "
+        reporter.say(f"{origin}the two differ by {scatter:.1%} (robust standard deviation).")
     elif by_points:
         reporter.say(
             f"Gains: from points in common ({by_points} of {len(views)} views); the files do not state exposures. "
@@ -357,16 +357,18 @@ def _warn(
 
 def _tell(pictures: list[_Exposure], reporter: Reporter) -> None:
     """Print the table: all pictures, or the most unusual ones of many."""
-    shown = pictures
+    listing = pictures
     if len(pictures) > _LISTED:
-        shown = sorted(sorted(pictures, key=lambda p: -abs(p.log))[:_LISTED], key=lambda p: (p.view, p.file))
-    width = max(len("picture"), *(len(picture.file) for picture in shown))
+        listing = sorted(
+            sorted(pictures, key=lambda p: -abs(p.log))[:_LISTED], key=lambda p: (p.view, p.file)
+        )
+    width = max(len("picture"), *(len(picture.file) for picture in listing))
     rows = [f"{'picture':<{width}}   angle    gain  stops  points"]
-    for picture in shown:
+    for picture in listing:
         gain = picture.record["gain"]
         angle = angle_text(picture.record["angle"])
         stops = f"{math.log2(gain):+.2f}"
         rows.append(f"{picture.file:<{width}} {angle:>7} {gain:>7.3f} {stops:>6} {picture.points:>7}")
-    if len(shown) < len(pictures):
-        rows.append(f"... and {len(pictures) - len(shown)} nearer to the mean; {TABLE} has all.")
+    if len(listing) < len(pictures):
+        rows.append(f"... and {len(pictures) - len(listing)} nearer to the mean; {TABLE} has all.")
     reporter.say("\n".join(rows))

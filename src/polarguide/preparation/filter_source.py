@@ -30,7 +30,7 @@ from polarguide.capture.filter.camera_files import (
     is_camera_raw,
     orientation,
     orientation_calibration,
-    read_taken,
+    read_exposure_data,
     stored_frame,
 )
 from polarguide.capture.filter.develop import (
@@ -120,7 +120,7 @@ class ShotsSource(Source):
         require_memory_of_each(self._shots, pixel, what, remedy=remedy)
 
     def _rounding(self, transfer: str, smallest: float) -> Rounding:
-        """What codes are rounded to: by the steps of 8-bit values, which grow with sRGB's; none for 16 bits."""
+        """Rounding of codes: by the steps of 8-bit values, which grow with sRGB's; none for 16 bits."""
         first = self._shots[:1]
         if self._settings.precision == "full" or read_stack(first, self._white).pictures.dtype != np.uint8:
             return EXACT
@@ -367,7 +367,7 @@ class SinglesSource(ShotsSource):
         cameras: dict[str, Path] = {}
         for number, view in enumerate(self.views, 1):
             for path in self._of_view[view]:
-                taken = read_taken(path)
+                taken = read_exposure_data(path)
                 if taken.camera:
                     cameras.setdefault(taken.camera, path)
                 if taken.light is not None:

@@ -104,7 +104,7 @@ class _State(msgspec.Struct):
 
 
 class _Journal(msgspec.Struct):
-    """What is relied on of a journal; there is more in it."""
+    """The fields of a journal that are read; it has others."""
 
     prepare: _State
 
@@ -192,7 +192,7 @@ class SceneFolder:
         if missing:
             raise PolarguideError(
                 self.root / (JOURNAL if (self.root / JOURNAL).exists() else SCENE),
-                expected="what an earlier call has measured",
+                expected="the measurements of an earlier call",
                 found=f"no {listed(missing)}",
                 remedy="Remove the folder, and begin anew.",
             )

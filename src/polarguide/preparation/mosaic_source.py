@@ -75,7 +75,7 @@ class MosaicFiles:
         self.pattern = pattern.shifted(*self.crop)
 
     def read(self, path: Path) -> NDArray[Any]:
-        """The values of a whole mosaic as the sensor lies, [H, W]: as stored, but for mirroring by the camera.
+        """The stored values of a whole mosaic, [H, W], in the sensor's orientation: the camera's mirroring is undone.
 
         Raises:
             PolarguideError: the file cannot be read, is too small, or does not fit into memory when it is developed.
@@ -246,8 +246,8 @@ class MosaicSource(Source):
     def stored(self, view: str) -> Stored:
         """By the header of the mosaic, or as the settings say."""
         width, height = self._settings.width, self._settings.height
-        said = None if width is None or height is None else (width, height)
-        size = stated_size(self._files[view]) or said
+        stated = None if width is None or height is None else (width, height)
+        size = stated_size(self._files[view]) or stated
         step = DEMOSAIC_MODES[self._settings.demosaic]
         if size is None or step == 1:
             return Stored(size)
@@ -361,7 +361,7 @@ class MosaicSource(Source):
         )
 
     def _rounding(self, levels: Levels, factor: float) -> Rounding:
-        """What codes are rounded to, with the smallest factor that a sample is multiplied by."""
+        """Rounding of codes, by the smallest factor that a sample is multiplied by."""
         if self._settings.precision == "full" or levels.gamma != 1.0:
             return EXACT
         return rounding_of(np.array([0.0, FULL_CODE * factor / ((1 << levels.bits) - 1)]))
@@ -388,12 +388,12 @@ class MosaicSource(Source):
         if ratio is None:
             return UNIT_GAINS, ["The pictures are too dark to estimate the gains of the angles."]
         gains = balancing_gains(ratio)
-        said = f"I0 + I90 is {ratio - 1:+.2%} off I45 + I135"
+        deviation = f"I0 + I90 is {ratio - 1:+.2%} off I45 + I135"
         if gains is None:
             return UNIT_GAINS, [
-                f"{said}, too much for gains: not corrected. Check --sensor, --offset-x, --offset-y and --order."
+                f"{deviation}, too much for gains: not corrected. Check --sensor, --offset-x, --offset-y and --order."
             ]
-        return gains, [f"{said}; corrected. {UNIDENTIFIED}"]
+        return gains, [f"{deviation}; corrected. {UNIDENTIFIED}"]
 
     def _sample_gains(self, shape: tuple[int, ...], measured: dict[str, Any]) -> NDArray[np.float32]:
         """The factor of every sample, [H, W]."""

@@ -104,7 +104,7 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
 def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
     """Whether a folder holds photographs through a filter that are not four to a view, by what says their angles.
 
-    That is a table or an option, an angle that is none of the four, or one angle a view. Four angles of which some are
+    That is a table or an option, an angle other than the four, or one angle a view. Four angles of which some are
     missing may be a mistake: ``--format singles`` takes what there is.
     """
     if settings.sensor is not None:

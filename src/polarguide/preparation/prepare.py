@@ -44,7 +44,7 @@ _NOTES = 4
 
 @dataclass(frozen=True)
 class Prepared:
-    """What came of it.
+    """The outcome of a preparation.
 
     Attributes:
         folder: the scene.
@@ -176,7 +176,7 @@ def _write_scene(
 
 
 def _without_poses(root: Path, pictures: Source, settings: PrepareSettings) -> str:
-    """What can be done with views that have no poses, for a message."""
+    """A message's list of what views without poses can be used for."""
     out = f"--out {shlex.quote(root.resolve().name + '-priors')}"
     if pictures.kind == "singles":
         return "--poses none develops the photographs without poses."
@@ -209,7 +209,7 @@ def _without_poses(root: Path, pictures: Source, settings: PrepareSettings) -> s
 
 
 def _request(root: Path, pictures: Source, settings: PrepareSettings, poses: Poses | None) -> dict[str, Any]:
-    """What must not change between the calls that write one scene."""
+    """Settings that must not change between the calls that write one scene."""
 
     def fingerprint(path: Path) -> list[int]:
         found = path.stat()
@@ -333,7 +333,7 @@ def _write_model(folder: SceneFolder, poses: Poses) -> None:
 def _summary(
     folder: SceneFolder, pictures: Source, settings: PrepareSettings, points: dict[str, Any] | None
 ) -> dict[str, Any]:
-    """What ``scene.json`` says to people; everything else is under "prepare"."""
+    """The notes in ``scene.json`` for readers; everything else is under "prepare"."""
     measured = dict(folder.measured or {})
     for name in (PHOTOGRAPHS, "light"):
         measured.pop(name, None)

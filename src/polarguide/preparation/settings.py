@@ -1,4 +1,4 @@
-"""What ``prepare`` may be asked for. Nothing here imports torch, OpenCV or pycolmap."""
+"""Settings of ``prepare``. Nothing here imports torch, OpenCV or pycolmap."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _OPTIONS = {
 
 @dataclass(frozen=True)
 class PrepareSettings(MosaicOptions):
-    """What a scene folder is made from, and how.
+    """Source of a scene folder, and how it is prepared.
 
     Attributes:
         format: What the source is; auto looks for datasets, the four shots of a filter, and singles (photographs
@@ -231,7 +231,7 @@ def white_gains(text: str) -> tuple[float, float, float] | None:
     """Gains of R, G and B from a ``--white-balance``; None for "gray", which needs the pictures.
 
     Raises:
-        PolarguideError: it is none of the forms.
+        PolarguideError: it has another form.
     """
     if text in ("none", "gray", "grey"):
         return (1.0, 1.0, 1.0) if text == "none" else None

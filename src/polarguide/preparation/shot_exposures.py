@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import Gains
 from polarguide.capture.checks import measured_gains, pair_moments
-from polarguide.capture.filter.camera_files import is_camera_raw, read_taken
+from polarguide.capture.filter.camera_files import is_camera_raw, read_exposure_data
 from polarguide.capture.filter.shots import read_stack
 from polarguide.capture.formats.pictures import may_use_fewer_bits
 from polarguide.capture.sensor.pattern import FULL_16, Levels, estimate_levels, level_notes
@@ -44,7 +44,7 @@ def stated_exposures(
     """
     logs: dict[str, list[float]] = {}
     for number, (view, paths) in enumerate(views.items(), 1):
-        light = [read_taken(path).light for path in paths]
+        light = [read_exposure_data(path).light for path in paths]
         if all(value is not None for value in light):
             logs[view] = [math.log(value) for value in light if value is not None]
         if advance is not None:
@@ -62,7 +62,7 @@ def corrected_note(stated: Sequence[float]) -> str:
 
 
 def exposure_notes(stated: Mapping[str, Sequence[float]], views: int) -> list[str]:
-    """What the files state, for the user."""
+    """The exposures that the files state, in a sentence for the user."""
     if not stated:
         return []
     every = [value for of_view in stated.values() for value in of_view]

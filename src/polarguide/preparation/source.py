@@ -121,7 +121,7 @@ class Source(Protocol):
 
 
 def measured_source(pictures: Source, advance: Advance) -> dict[str, Any]:
-    """What ``Source.measure`` gives, with a note of views without a mask."""
+    """The result of ``Source.measure``, with a note on views without a mask."""
     measured = pictures.measure(advance)
     bare = [view for view in pictures.views if view not in pictures.masks]
     if pictures.masks and bare:
@@ -131,7 +131,7 @@ def measured_source(pictures: Source, advance: Advance) -> dict[str, Any]:
 
 
 def developed(pictures: Source, view: str, measured: dict[str, Any]) -> DevelopedView:
-    """What ``Source.develop`` gives, with the view's mask.
+    """The result of ``Source.develop``, with the view's mask.
 
     Raises:
         PolarguideError: the mask cannot be read, or is neither of the stored nor the developed size.
@@ -236,8 +236,8 @@ class StokesSource(Source):
             raise not_as_published(self.paths[0], "light in at least one view", found)
         white = min(largest, _HEADROOM * bright) if bright > 0 else largest
         share = negative / max(1, 12 * count)
-        sense, said = self._settle_sense([rim for rim in rims if rim is not None])
-        notes = [*self._dataset.notes, f"Four-angle sum check: {PAIR_SUMS}.", said]
+        sense, note = self._settle_sense([rim for rim in rims if rim is not None])
+        notes = [*self._dataset.notes, f"Four-angle sum check: {PAIR_SUMS}.", note]
         notes.append(
             f"One scale for all views: {white:.6g} of the dataset becomes full scale. {share:.3%} of the intensities "
             "are negative (more polarized than light can be: noise, or coarse files) and become 0."
@@ -278,25 +278,26 @@ class StokesSource(Source):
     def _settle_sense(self, rims: list[RimAgreement]) -> tuple[Sense, str]:
         """The sense of the angles and the line that says why; a warning where it may be the other one."""
         assumed = self._calibration.sense or "ccw"
-        told = sense_of_rims(rims)
+        light_sense = sense_of_rims(rims)
         sense: Sense = assumed
         known = self._dataset.sense_known
         reason = (
             "as --sense says" if self._given_sense else "as the release has them" if known else "as assumed"
         )
         other = "ccw" if assumed == "cw" else "cw"
-        if told is not None:
+        if light_sense is not None:
             ccw, cw = (float(np.mean([getattr(rim, way) for rim in rims])) for way in ("ccw", "cw"))
             figures = (
                 f"agreement with the outlines of the masks: {ccw:.2f} counter-clockwise, {cw:.2f} clockwise"
             )
-            if told == assumed:
+            if light_sense == assumed:
                 reason += f", and the light agrees ({figures})"
             elif self._given_sense is None and not known:
-                sense, reason = told, f"as the light at the outlines of the masks has them ({figures})"
+                sense, reason = light_sense, f"as the light at the outlines of the masks has them ({figures})"
             else:
                 warnings.warn(
-                    f"Angles are taken as {_WORDS[assumed]}, {reason}, but the light says {_WORDS[told]} ({figures}): "
+                    f"Angles are taken as {_WORDS[assumed]}, {reason}, but the light says "
+                    f"{_WORDS[light_sense]} ({figures}): "
                     f"check with polarguide inspect; --sense {other} takes them so.",
                     PolarguideWarning,
                     stacklevel=3,

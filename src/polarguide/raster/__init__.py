@@ -1,7 +1,20 @@
-"""Splatting of Gaussians with any channels: one interface, a reference implementation, and fast backends."""
+"""Splatting of Gaussians with any channels: one interface, a reference implementation, and fast backends.
 
+``choose_backend`` says where a training or a rendering computes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+
+from polarguide import _native
+from polarguide.core.errors import PolarguideError
 from polarguide.core.options import DeviceName
-from polarguide.raster.backends import Backend, choose_backend, use_threads
+from polarguide.raster.cpu import rasterize_cpu
+from polarguide.raster.cuda import has_gsplat, load_gsplat, rasterize_cuda
 from polarguide.raster.interface import Rasterize, Rasterized, ScreenStatistic, Splats
 from polarguide.raster.reference import rasterize_reference
 
@@ -16,3 +29,50 @@ __all__ = [
     "rasterize_reference",
     "use_threads",
 ]
+
+
+class Backend(NamedTuple):
+    """A device and the rasterizer that runs on it."""
+
+    device: torch.device
+    rasterize: Rasterize
+
+
+def choose_backend(
+    name: DeviceName, *, local_rank: int = 0, say: Callable[[str], None] = lambda _: None
+) -> Backend:
+    """The backend for ``--device``: ``auto`` takes the GPU where there is one and gsplat is installed.
+
+    Args:
+        name: as given.
+        local_rank: which of the machine's GPUs, for the processes of one training.
+        say: takes lines for the user, such as that kernels are being compiled.
+
+    Raises:
+        PolarguideError: CUDA was specified and there is no GPU, or gsplat or its kernels are not available.
+    """
+    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
+        return Backend(torch.device("cpu"), rasterize_cpu)
+    if name == "auto" and not has_gsplat():
+        say("there is a GPU, but the package gsplat is not installed: computing on the CPU")
+        return Backend(torch.device("cpu"), rasterize_cpu)
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if local_rank >= count:
+        built = torch.version.cuda or "none"
+        raise PolarguideError(
+            "--device cuda",
+            expected="a GPU for each process",
+            found=f"{count} that PyTorch {torch.__version__} can use (its CUDA: {built})",
+            remedy="Install a PyTorch with CUDA and a driver for it, start fewer processes, or use --device cpu.",
+        )
+    device = torch.device("cuda", local_rank)
+    torch.cuda.set_device(device)
+    load_gsplat(say)
+    return Backend(device, rasterize_cuda)
+
+
+def use_threads(threads: int) -> None:
+    """Use this many threads everywhere in this process; 0 leaves things as they are."""
+    if threads:
+        _native.set_thread_count(threads)
+        torch.set_num_threads(threads)

@@ -1,9 +1,15 @@
-"""The baselines: 3DGS (Kerbl et al. 2023) and 3DGS-DR (Ye et al. 2024)."""
+"""The baselines on our Gaussians, 3DGS (Kerbl et al. 2023), 3DGS-DR (Ye et al. 2024) and Ref-GS (Zhang et al. 2025),
+and GNeRP (Li et al. 2024), a field.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from polarguide.fields.recipe import FieldRates, FieldShape, NeuralRecipe, Sampling
 from polarguide.shading.deferred import DeferredShading
-from polarguide.training.recipe import Recipe, Repeat, Rounds, Stage
+from polarguide.shading.directional import DirectionalShading
+from polarguide.training.recipe import Recipe, Repeat, Rounds, Stage, Weights
 
 # Learning rates of the 3DGS release but for the geometry's, which belong to 30,000 steps: in some thousand, means and
 # scales have to learn twice as fast and rotations ten times. That of the means is times the scene's extent, and falls
@@ -63,4 +69,51 @@ RECIPE_3DGS_DR = Recipe(
     rates=RATES,
     sh_fractions=(10 / 61, 11 / 61, 12 / 61),
     shading=SHADING_3DGS_DR,
+)
+
+
+WEIGHTS = Weights(consistency=0.05, flatness=0.1)
+
+RECIPE_REF_GS = Recipe(
+    name="ref-gs",
+    about="Deferred shading with a learned directional grid and an MLP: RGB alone.",
+    stages=(
+        # No resets of the opacity: thousands of steps, not tens of thousands, do not make up for them here.
+        Stage("densify", 0.5, reflection=True, weights=WEIGHTS, densify=True),
+        Stage("refine", 0.5, reflection=True, weights=WEIGHTS),
+    ),
+    rates=RATES,
+    shading=DirectionalShading(
+        width=64,
+        mlp_rate=1.5e-3,
+        albedo_rate=3e-3,
+        feature_rate=6e-3,
+        environment_spread=0.5,
+        environment_rate=1e-2,
+        environment_resolution=32,
+    ),
+)
+
+
+RECIPE_GNERP = NeuralRecipe(
+    name="gnerp",
+    about="A signed-distance field (dense grids) with color and angle of polarization.",
+)
+
+ABLATIONS_GNERP = (
+    replace(
+        RECIPE_GNERP,
+        name="gnerp:circular",
+        about="gnerp with angles compared on the circle.",
+        weights=replace(RECIPE_GNERP.weights, circular=True),
+    ),
+    replace(
+        RECIPE_GNERP,
+        name="gnerp:published",
+        about="gnerp with the published networks, samples and steps: for a GPU.",
+        steps=100_000,
+        shape=FieldShape(kind="networks"),
+        sampling=Sampling(coarse=64, fine=128),
+        rates=FieldRates(networks=5e-4),
+    ),
 )

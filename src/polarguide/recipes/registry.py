@@ -1,5 +1,7 @@
 """Recipes by name: the built-in ones and their ablations, and those of installed plug-ins.
 
+An ablation is a recipe with one thing changed, each a piece of data.
+
 A plug-in is a package with entry points of the group ``polarguide.recipes``. Each names a ``Recipe``, a sequence of
 them, or a function without arguments that returns either. Plug-ins are loaded for a name that is not
 built in, never on import; a run's folder records the recipe's name, and never where its code lies.
@@ -7,22 +9,261 @@ built in, never on import; a run's folder records the recipe's name, and never w
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
+from typing import Any
 
 from polarguide.core.errors import PolarguideError
-from polarguide.recipes.ablations import (
-    ABLATIONS_3DGS,
-    ABLATIONS_3DGS_DR,
-    ABLATIONS_PAPER,
-    ABLATIONS_POLARGUIDE,
-    ABLATIONS_STOKES,
+from polarguide.recipes.baselines import (
+    ABLATIONS_GNERP,
+    RECIPE_3DGS,
+    RECIPE_3DGS_DR,
+    RECIPE_GNERP,
+    RECIPE_REF_GS,
 )
-from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
-from polarguide.recipes.gnerp import ABLATIONS_GNERP, RECIPE_GNERP
-from polarguide.recipes.polarguide import RECIPE_POLARGUIDE, RECIPE_POLARGUIDE_PAPER, RECIPE_POLARGUIDE_STOKES
-from polarguide.recipes.ref_gs import RECIPE_REF_GS
-from polarguide.training.recipe import Method
+from polarguide.recipes.polarguide import (
+    BEHIND,
+    RECIPE_POLARGUIDE,
+    RECIPE_POLARGUIDE_PAPER,
+    RECIPE_POLARGUIDE_PAPER_KIND,
+    RECIPE_POLARGUIDE_STOKES,
+)
+from polarguide.training.recipe import Action, Method, Recipe, Stage, Weights
+
+Change = Callable[[Recipe], Recipe]
+
+
+def varied(base: Recipe, *table: tuple[str, str, Change]) -> tuple[Recipe, ...]:
+    """The recipes ``base:name`` of a table: a name, what it is about, and how it differs from ``base``."""
+    return tuple(
+        replace(change(base), name=f"{base.name}:{name}", about=about) for name, about, change in table
+    )
+
+
+def staged(change: Callable[[Stage], Stage]) -> Change:
+    """Every stage changed."""
+    return lambda recipe: replace(recipe, stages=tuple(change(stage) for stage in recipe.stages))
+
+
+def weighing(change: Callable[[Weights], Weights]) -> Change:
+    """The new weights from the old ones, in every stage that has polarization terms."""
+    return staged(
+        lambda stage: replace(stage, weights=change(stage.weights)) if stage.weights.priors else stage
+    )
+
+
+def off(*names: str) -> Change:
+    """Without the loss terms of these names."""
+    return weighing(lambda old: replace(old, **dict.fromkeys(names, 0.0)))
+
+
+def priors(**values: Any) -> Change:
+    """New values of the recipe's ``Priors``."""
+    return lambda recipe: replace(recipe, priors=replace(recipe.priors, **values))
+
+
+def without(action: Action) -> Change:
+    """An action does not happen. (Priors are then computed once, when they are first needed.)"""
+
+    def change(stage: Stage) -> Stage:
+        repeats = tuple(repeat for repeat in stage.repeats if repeat.action != action)
+        return replace(stage, repeats=repeats, on_enter=tuple(a for a in stage.on_enter if a != action))
+
+    return staged(change)
+
+
+def shading(**values: Any) -> Change:
+    """New values of the shading model."""
+    return lambda recipe: replace(recipe, shading=replace(recipe.shading, **values))
+
+
+def both(first: Change, second: Change) -> Change:
+    """One change after the other."""
+    return lambda recipe: second(first(recipe))
+
+
+def without_propagation(base: Recipe) -> Recipe:
+    """Neither propagations nor resets of the opacities."""
+    bare = staged(lambda stage: replace(stage, rounds=None))
+    return both(bare, without("reset_opacity"))(base)
+
+
+def firm_to_the_end(base: Recipe) -> Recipe:
+    """The final stage keeps rates and weights (but those of the layers) of the guided one."""
+    *before, final = base.stages
+    weights = replace(before[-1].weights, specular=0.0, diffuse=0.0)
+    return replace(base, stages=(*before, replace(final, weights=weights, rate_factors={})))
+
+
+def release_rates(**others: float) -> Change:
+    """The geometry learns as slowly as in the release of 3DGS; ``others``: more rates of it."""
+    slow = {"means": 1.6e-4, "log_scales": 5e-3, **others}
+    return lambda recipe: replace(recipe, rates={**recipe.rates, **slow}, means_decay=0.01)
+
+
+_NORMAL_TERMS_OFF = off("normal", "azimuth", "chromatic", "consistency")
+_POLARIZED_TERMS = ("normal", "azimuth", "chromatic", "stokes", "specular", "diffuse")
+_UNPOLARIZED = (
+    "unpolarized",
+    "The same without any polarization: normals agree with the depth everywhere, where the recipe has them agree.",
+    both(off(*_POLARIZED_TERMS), without("refresh_priors")),
+)
+_UNPOLARIZED_INCONSISTENT = (
+    "unpolarized-without-consistency",
+    "The same without any polarization, and normals need not agree with the depth.",
+    both(off(*_POLARIZED_TERMS, "consistency"), without("refresh_priors")),
+)
+_COMMON = (
+    (
+        "without-colour",
+        "Nothing is read from the polarization of color differences.",
+        both(off("chromatic"), priors(chromatic=False)),
+    ),
+    (
+        "colour-unchecked",
+        "Normals of gray bodies' color differences count however far the Gaussians' normals are from them.",
+        priors(chromatic_within=None),
+    ),
+    (
+        "without-easing",
+        "Every term weighs as much in the final stage as before, and rotations learn as fast.",
+        firm_to_the_end,
+    ),
+    ("without-consistency", "Normals need not agree with the depth.", off("consistency")),
+    (
+        "consistency-by-dolp",
+        "Normals agree with the depth only where the light is polarized.",
+        priors(bright=0.0),
+    ),
+    (
+        "normals-move-all",
+        "Terms on normals also move Gaussians behind the subject.",
+        staged(lambda stage: replace(stage, behind=None)),
+    ),
+    (
+        "without-planes",
+        "Large flat surfaces are not looked for.",
+        priors(flat=False),
+    ),
+    (
+        "layers-turn-normals",
+        "Gradients of the layer terms reach the normals through the reflection from the beginning.",
+        staged(lambda stage: replace(stage, hold_normals=False)),
+    ),
+    (
+        "layers-hold-normals",
+        "The terms on the layers reach the normals through Fresnel's equations alone, to the end.",
+        staged(lambda stage: replace(stage, hold_normals=True)),
+    ),
+    (
+        "few-pixels-pull",
+        "The terms on directions are averaged over polarized pixels alone, however few.",
+        priors(azimuth_share=0.0, chromatic_share=0.0),
+    ),
+    (
+        "release-rates",
+        "Means and scales learn as slowly as in the release of 3DGS, which takes 30,000 steps.",
+        release_rates(),
+    ),
+    _UNPOLARIZED,
+    _UNPOLARIZED_INCONSISTENT,
+)
+
+ABLATIONS_3DGS = varied(
+    RECIPE_3DGS,
+    (
+        "release-rates",
+        "The geometry learns as slowly as in the release, which takes 30,000 steps.",
+        release_rates(quaternions=1e-3),
+    ),
+)
+
+ABLATIONS_3DGS_DR = varied(
+    RECIPE_3DGS_DR,
+    (
+        "consistent",
+        "Flat Gaussians whose normals agree with the depth: what geometry gives without polarization.",
+        staged(
+            lambda stage: replace(
+                stage, weights=replace(stage.weights, consistency=0.05, flatness=0.1), behind=BEHIND
+            )
+        ),
+    ),
+    (
+        "without-propagation",
+        "Neither propagations nor resets of the opacities: the row to compare with on real captures.",
+        without_propagation,
+    ),
+)
+
+ABLATIONS_PAPER = (
+    RECIPE_POLARGUIDE_PAPER_KIND,
+    *varied(RECIPE_POLARGUIDE_PAPER, _UNPOLARIZED),
+)
+
+ABLATIONS_POLARGUIDE = varied(
+    RECIPE_POLARGUIDE,
+    (
+        "only-normals",
+        "Polarization normals alone: no term on the separated layers.",
+        off("specular", "diffuse"),
+    ),
+    ("without-normals", "Separated layers alone: no term on the normals.", _NORMAL_TERMS_OFF),
+    (
+        "paper-candidates",
+        "PolarGuide-GSDR's four candidates in place of the six that physics allows.",
+        priors(candidates="paper"),
+    ),
+    (
+        "paper-separation",
+        "PolarGuide-GSDR's separation cue in place of the exact solution.",
+        priors(separation="paper"),
+    ),
+    (
+        "without-azimuth-weighting",
+        "Zenith trusted like azimuth, in the choice and in the term.",
+        both(weighing(lambda old: replace(old, azimuth=0.0, normal=old.azimuth)), priors(azimuth_weight=0.0)),
+    ),
+    (
+        "without-refresh",
+        "Priors computed once, not again as the Gaussians improve.",
+        without("refresh_priors"),
+    ),
+    (
+        "without-mask",
+        "Every pixel's polarization counts fully, however weak and noisy.",
+        priors(threshold=0.0, full_dolp=1e-6, snr=0.0),
+    ),
+    *_COMMON,
+    ("without-flatness", "Gaussians need not be flat.", off("flatness")),
+)
+
+ABLATIONS_STOKES = varied(
+    RECIPE_POLARGUIDE_STOKES,
+    ("without-stokes", "S1 and S2 are not rendered.", off("stokes")),
+    ("without-separation", "No term on the separated layers.", off("specular", "diffuse")),
+    ("without-normals", "No term on the normals except that on S1 and S2.", _NORMAL_TERMS_OFF),
+    (
+        "without-fresnel",
+        "Strength does not depend on the angle: the lerp of 3DGS-DR.",
+        shading(blend="lerp", first_strength=0.05, rough=False),
+    ),
+    (
+        "without-roughness",
+        "Dielectrics are mirrors; metals alone have a roughness.",
+        shading(rough=False),
+    ),
+    ("without-local", "Nothing near is reflected: the environment alone.", shading(local=False)),
+    (
+        "without-outer-side",
+        "Normals are always turned to the camera.",
+        both(without("orient_normals"), lambda recipe: replace(recipe, oriented=False)),
+    ),
+    *_COMMON,
+)
+
 
 GROUP = "polarguide.recipes"
 
@@ -81,7 +322,7 @@ def recipe_named(name: str) -> Method:
         "recipe",
         expected="one of " + ", ".join(names),
         found=name + broken,
-        remedy="Take one of these; a recipe of another version needs that version.",
+        remedy="Take one of these; a recipe of a package or of another version needs that one.",
     )
 
 

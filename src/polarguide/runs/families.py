@@ -25,13 +25,15 @@ from polarguide.runs.folder import CHECKPOINT, PLY
 from polarguide.runs.forecast import Forecast, MemoryPlan, forecast, plan_field_memory, plan_memory
 from polarguide.runs.health import Evidence, Polarization
 from polarguide.runs.model import GaussianModel, Model, write_run_ply
+from polarguide.runs.painted import FOLDER
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers, predicts_filters
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.distributed import Ranks
+from polarguide.training.feed import ViewStore
+from polarguide.training.metals.search import looks
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.trainer import warn_of_unused_materials
-from polarguide.training.view_store import ViewStore
 
 ANY = 90.0
 """Degrees: as far as two angles can be apart."""
@@ -151,9 +153,27 @@ class Family(ABC):
             raise PolarguideError(
                 out / CHECKPOINT,
                 expected=f"the state of a training of {settings.steps} steps",
-                found=f"one after step {state.step}",
+                found=f"the state after step {state.step}",
                 remedy="Train again into a new folder.",
             )
+
+    def go_back(
+        self, state: Any, method: Any, settings: ResolvedSettings, out: Path, reporter: Reporter
+    ) -> None:
+        """Take a run back to where what was painted over it still counts.
+
+        Args:
+            state: of the training; changed. None: it has not begun.
+
+        Raises:
+            PolarguideError: materials mean nothing to the recipe, or to a training this short.
+        """
+        raise PolarguideError(
+            out / FOLDER,
+            expected="a training that asks at some step what is metal",
+            found=f"one of {method.name} in {settings.steps} steps, with --materials {settings.materials}",
+            remedy="Remove the folder, or train polarguide-stokes in 1,500 steps or more.",
+        )
 
     @abstractmethod
     def trainer(
@@ -209,9 +229,23 @@ class GaussianFamily(Family):
             raise PolarguideError(
                 out / CHECKPOINT,
                 expected=f"the state of a training with {settings.views_per_step} views a step",
-                found=f"one with {views}",
+                found=f"a training with {views}",
                 remedy="Train again into a new folder.",
             )
+
+    def go_back(
+        self, state: Any, method: Recipe, settings: ResolvedSettings, out: Path, reporter: Reporter
+    ) -> None:
+        """See ``Family``: to the last step at which metals are looked for."""
+        steps = looks(method, settings)
+        step = steps[-1] if steps else None
+        if step is None:
+            super().go_back(state, method, settings, out, reporter)
+        elif state is not None and state.step > step:
+            reporter.say(
+                f"{out / FOLDER} has changed: training goes on from step {step}, which decides on metals"
+            )
+            state.step, state.frozen, state.footprints = step, None, None
 
     def trainer(
         self,

@@ -62,6 +62,7 @@ class RunConfiguration:
         downscale: side of the averaged pixel boxes. transfer: how the files were read.
         device: what it trained on. version: of the program.
         test_views: those held out; None in runs of the first versions, which held out every 8th without a split.json.
+        painted: digest of the materials that were painted over the run and are in it, see ``runs.painted``; None: none.
     """
 
     scene: Annotated[str, msgspec.Meta(min_length=1)]
@@ -74,6 +75,7 @@ class RunConfiguration:
     device: str
     version: str = __version__
     test_views: tuple[str, ...] | None = None
+    painted: str | None = None
 
     @classmethod
     def of(
@@ -82,8 +84,9 @@ class RunConfiguration:
         recipe: Method,
         settings: ResolvedSettings,
         device: torch.device,
+        painted: str | None = None,
     ) -> RunConfiguration:
-        """What is recorded of a training."""
+        """The record of a training."""
         return cls(
             scene=str(scene.root if scene.root == IN_MEMORY else scene.root.resolve()),
             scene_digest=scene.digest,
@@ -94,6 +97,7 @@ class RunConfiguration:
             transfer="srgb" if scene.transfer == "srgb" else "linear",
             device=str(device),
             test_views=scene.test_names,
+            painted=painted,
         )
 
     def save(self, run: Path) -> None:
@@ -122,7 +126,7 @@ class RunConfiguration:
             raise PolarguideError(
                 run,
                 expected=f"a run of polarguide {_series(__version__)}",
-                found=f"one of version {written}",
+                found=f"a run of version {written}",
                 remedy=f"Train again into a new folder, or open it with polarguide {_series(written)}.",
             )
         configuration = decode(data, cls, path, remedy=remedy)
@@ -141,7 +145,7 @@ def _refuse_unknown(data: dict[str, Any], record: RunConfiguration, path: Path, 
 
 @dataclass(frozen=True)
 class _Written:
-    """What is read of a run of any version."""
+    """The fields of ``run.json`` that are read of every version."""
 
     version: str
 
@@ -214,7 +218,7 @@ def load_checkpoint(run: Path, recipe: Method, device: torch.device | str = "cpu
 
 
 def trained_steps(run: Path) -> int | None:
-    """After how many steps a run's checkpoint was written; None where there is none that says so."""
+    """Number of steps of a run's checkpoint; None if no checkpoint states it."""
     try:
         with safe_open(run / CHECKPOINT, framework="pt") as file:
             record = (file.metadata() or {}).get("polarguide", "")
@@ -273,7 +277,7 @@ class RunLog:
             write_text(self._path, "".join(f"{line}\n" for line in lines))
 
     def rows(self) -> list[dict[str, Any]]:
-        """The lines that are whole, none where there is no log; a kill can cut one short.
+        """The complete lines of the log; none without a log. A line can be incomplete where a process was killed.
 
         Raises:
             PolarguideError: it cannot be read.

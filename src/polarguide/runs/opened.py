@@ -109,7 +109,7 @@ class OpenedRun:
 
     @classmethod
     def of(cls: type[Opened], run: OpenedRun) -> Opened:
-        """Another run as one of this class, with the same scene and in the same memory."""
+        """An opened run as an instance of this class, which shares its scene and its model."""
         scene, reporter = run._scene_source, run._reporter
         return cls(run.folder, run.configuration, run.recipe, run.model, scene=scene, reporter=reporter)
 
@@ -139,7 +139,7 @@ class OpenedRun:
         raise PolarguideError(
             what,
             expected="a run of Gaussians",
-            found=f"one of {self.recipe.name}, a signed-distance field",
+            found=f"a run of {self.recipe.name}, a signed-distance field",
             remedy="polarguide export --format mesh writes its surface.",
         )
 

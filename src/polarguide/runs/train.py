@@ -39,11 +39,13 @@ from polarguide.runs.folder import (
 from polarguide.runs.forecast import MemoryPlan, Stopwatch, TimeLeft, pixels_of
 from polarguide.runs.health import examine
 from polarguide.runs.opened import OpenedRun, read_scene
+from polarguide.runs.painted import read_painted
+from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.distributed import Ranks, backend_of, process_group
+from polarguide.training.feed import ViewStore
 from polarguide.training.losses import refuse_diverged
-from polarguide.training.recipe import Method, Recipe
+from polarguide.training.recipe import Method
 from polarguide.training.settings import ResolvedSettings, StepReport, TrainSettings
-from polarguide.training.view_store import ViewStore
 
 LOG_EVERY = 10
 Ends = Callable[[], bool]
@@ -121,15 +123,24 @@ def train(
             reporter.warn(f"{idle} of {ranks.world} processes have no view to look at")
         if settings.background == "auto" and resolved.background == "black" and leads:
             reporter.say("the edges of the pictures are black: nothing is taken to be behind the subject")
-        configuration = RunConfiguration.of(loaded, chosen, resolved, backend.device)
+        painted = read_painted(out, loaded) if resume else None
+        if painted is not None:
+            loaded = painted.over(loaded)
+        digest = None if painted is None else painted.digest
+        configuration = RunConfiguration.of(loaded, chosen, resolved, backend.device, digest)
         state = None
         if resume:
             if leads:
                 locked.enter_context(writing_to(out))
-            _check_same(RunConfiguration.load(out), configuration, out)
+            recorded = RunConfiguration.load(out)
+            _check_same(recorded, configuration, out)
             if (out / CHECKPOINT).exists():
                 state = load_checkpoint(out, chosen, backend.device)
                 family.check(state, resolved, out)
+            if recorded.painted != digest:
+                family.go_back(state, chosen, resolved, out, reporter)
+                if state is not None and leads:
+                    save_checkpoint(out, state)  # before run.json says that what was painted is in it
         expected = None
         if ranks.world == 1 and not resume:
             expected = family.forecast(loaded, chosen, resolved, backend, plan.peak)
@@ -148,8 +159,9 @@ def train(
                         raise problem
                 configuration.save(out)
             left = None
-            if expected is not None and isinstance(chosen, Recipe) and not resolved.begin_again:
-                left = TimeLeft(expected, chosen)
+            if expected is not None and isinstance(trainer, AngleTrainer) and not trainer.begins_again:
+                left = TimeLeft(expected, trainer.recipe)
+                trainer.flat.update(expected.flat)
             seconds = _Loop(trainer, out, session, reporter, should_stop, look, bound, left).run()
         model = family.model(trainer.state, chosen, resolved, backend)
         if expected is not None:
@@ -200,7 +212,8 @@ class _Loop:
         self._log = RunLog(out) if trainer.ranks.rank == 0 else None
         if self._log is not None:
             self._log.cut(trainer.state.step)
-        self._stopwatch = Stopwatch(*self._log.elapsed()) if self._log else Stopwatch()
+        seconds, alone = self._log.elapsed() if self._log else (0.0, True)
+        self._stopwatch = Stopwatch(seconds + (left.expected.spent if left else 0.0), alone)
 
     def run(self) -> float:
         """Train; see ``train``. Returns the seconds that it took."""
@@ -381,7 +394,7 @@ def _check_scene(scene: Scene) -> None:
         raise PolarguideError(
             scene.root,
             expected="training views from at least two places",
-            found=f"{len(centers)} from one",
+            found=f"{len(centers)} from one place",
             remedy="Add views, or correct the poses.",
         )
     cameras = [view.camera for view in scene.train_views]
@@ -402,8 +415,8 @@ def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None
             remedy="The stages of a training are shares of its steps, so that it cannot be made longer or shorter: "
             f"give --steps {old.settings.steps}, or train with --steps {new.settings.steps} into a new folder.",
         )
-    # All but where the scene lies and the device decide the result.
-    for field in sorted(old.__annotations__.keys() - {"scene", "device"}):
+    # All but where the scene lies and the device decide the result; what is painted may change.
+    for field in sorted(old.__annotations__.keys() - {"scene", "device", "painted"}):
         a, b = getattr(old, field), getattr(new, field)
         if a != b and a is not None:
             name, a, b = first_difference(field, a, b)

@@ -197,7 +197,7 @@ class ShadingModel(ABC):
         return {}
 
     def placed_parameters(self, far: Tensor) -> dict[str, Tensor]:
-        """Those of ``initial_parameters`` that depend on where the first Gaussians lie, which replace them.
+        """Initial parameters that depend on the positions of the first Gaussians; they replace ``initial_parameters``.
 
         Args:
             far: [N] bool, which of them lie farther away than the cameras (``gaussians.initialize.far_away``).

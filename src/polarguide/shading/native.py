@@ -53,7 +53,7 @@ class RoughnessArguments(NamedTuple):
 
 
 class ReflectArguments(NamedTuple):
-    """What ``reflect_native`` reads of a shading model and of its G-buffer.
+    """Arguments of ``reflect_native`` from a shading model and its G-buffer.
 
     Attributes:
         fresnel: Fresnel's weight of radiance, in place of the lerp with the logistic function of raw texels.
@@ -80,7 +80,7 @@ class ReflectArguments(NamedTuple):
 
     @property
     def levels(self) -> tuple[int, float, Tensor | None]:
-        """Those about the level of a look-up."""
+        """The arguments for the mip level of a look-up."""
         rough = self.roughness
         return (-1, 0.0, None) if rough is None else (rough.channel, rough.blur, rough.alpha)
 

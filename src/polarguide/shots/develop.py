@@ -23,7 +23,13 @@ from polarguide.capture.filter.develop import (
 )
 from polarguide.capture.filter.shots import Shots, read_shots, require_four_shots, stacked
 from polarguide.capture.formats.pictures import is_lossy
-from polarguide.capture.layout import KEPT, READ, find_layout, require_memory_of_each, select_views
+from polarguide.capture.layout import (
+    KEPT,
+    READ,
+    find_layout,
+    require_memory_of_each,
+    select_views,
+)
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic, spoiled
@@ -84,7 +90,7 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     x, y = options.offset_x + files.crop[0], options.offset_y + files.crop[1]
     analyzers = _analyzers(stored.shape, options)
     ratio = _ratio_of(values, dark, levels, pattern, None if analyzers is None else (analyzers, (x, y)))
-    gains, said = gains_of(ratio, options)
+    gains, gain_notes = gains_of(ratio, options)
     mode, way = options.demosaic, options.interpolation
     step = DEMOSAIC_MODES[mode]
     cut = _cut(part, values.shape, step)
@@ -117,7 +123,7 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
         factors=_placed(interpolation_factors(options.sensor, x, y, mode), options.calibration),
         mean_variance=averaged_factor(options.sensor, x, y, mode),
         pair_ratio=ratio,
-        notes=(*notes, *said),
+        notes=(*notes, *gain_notes),
         origin=(0, 0) if cut is None else (cut[1].start // step, cut[0].start // step),
         whole=whole,
     )
@@ -342,7 +348,7 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
         linear = linear / exposed.astype(np.float32)[:, None, None, None]
     gray = linear.mean(axis=3)
     ratio = pair_ratio(gray, ~(saturated | dark))
-    gains, said = gains_of(ratio, options)
+    gains, gain_notes = gains_of(ratio, options)
     if gains != UNIT_GAINS:
         linear = linear / np.asarray(gains, np.float32)[:, None, None, None]
         gray = linear.mean(axis=3)
@@ -364,7 +370,7 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
         factors=np.full((4, 1, 1), factor, np.float32),
         mean_variance=factor,
         pair_ratio=ratio,
-        notes=(*notes, *said),
+        notes=(*notes, *gain_notes),
     )
 
 

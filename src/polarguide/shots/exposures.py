@@ -234,7 +234,7 @@ def _views(layout: Layout) -> list[ExposureSet]:
 def _named_apart(found: list[ExposureSet]) -> list[ExposureSet]:
     """Sets of one name are called by their folder, too; it is their fault where that does not tell them apart.
 
-    So is a name that is none of a folder.
+    So is a name that a folder cannot have.
     """
     found = [shot if usable_name(shot.name) else _unusable(shot) for shot in found]
     names = Counter(shot.name for shot in found)
@@ -259,7 +259,7 @@ def require_name(shot: ExposureSet) -> None:
     """Refuse a shot whose files would not be written into a folder of its own.
 
     Raises:
-        PolarguideError: its name is none of a folder.
+        PolarguideError: a folder cannot have its name.
     """
     if not usable_name(shot.name):
         raise PolarguideError(

@@ -47,7 +47,7 @@ class Judgment:
 
 @dataclass(frozen=True)
 class _Angle:
-    """What the others predict of a picture: angle that it looks like and its error, radians (None: untold), gain."""
+    """Prediction of a picture from the others: apparent angle, its error (radians; None: undetermined), gain."""
 
     angle: float | None
     error: float
@@ -69,7 +69,7 @@ def judge(samples: SetSamples, gray: Floats) -> Judgment:
     """Compare the pictures of a set with one another, and choose those that are fitted.
 
     Each picture is fitted with Malus's law at an unknown angle and gain to the Stokes vectors of the others, over all
-    pixels at once. The picture that is off most is left out, as long as enough others agree without it.
+    pixels at once. The picture with the largest deviation is left out, as long as enough others agree without it.
 
     Args:
         samples: the set. gray: [K, N], its luminance at some pixels that are good in every picture.
@@ -127,7 +127,7 @@ def _contradicts(
 
 
 def _reason(samples: SetSamples, k: int, found: _Angle) -> str:
-    """What is wrong with a picture, for the user."""
+    """The reason why a picture is rejected, for the user."""
     head = f"{samples.labels[k]} ({samples.exposures[k].angle or 0.0:g} degrees)"
     if _off(samples, k, found) > MARKS:
         looks = f"{math.degrees(found.angle or 0.0) % 180:.0f} degrees"
@@ -169,10 +169,10 @@ def _predicted(rows: Floats, gray: Floats, used: NDArray[np.bool_], k: int) -> _
     form = forms[:, best]
     slope = 2 * np.array([0.0, -form[2], form[1]])
     spread = float(slope @ moments @ slope - (slope @ moments @ form) ** 2 / along[best])
-    shown = spread > _OVER_NOISE * float(slope @ extra @ slope) and spread > 0
-    error = math.sqrt(noise * (1 + leverage) / (pixels * spread)) / float(gain[best]) if shown else math.inf
-    told = math.degrees(error) < _TELLING
-    return _Angle(float(turns[best]) if told else None, error, float(gain[best]), residual)
+    certain = spread > _OVER_NOISE * float(slope @ extra @ slope) and spread > 0
+    error = math.sqrt(noise * (1 + leverage) / (pixels * spread)) / float(gain[best]) if certain else math.inf
+    determined = math.degrees(error) < _TELLING
+    return _Angle(float(turns[best]) if determined else None, error, float(gain[best]), residual)
 
 
 def _typical(squares: Floats, freedom: int) -> float:
@@ -182,13 +182,13 @@ def _typical(squares: Floats, freedom: int) -> float:
 
 def _picture(samples: SetSamples, k: int, angle: _Angle, used: bool) -> PictureFit:
     exposure = samples.exposures[k]
-    told = angle.angle is not None
+    determined = angle.angle is not None
     return PictureFit(
         label=samples.labels[k],
         angle=exposure.angle or 0.0,
         gain=exposure.gain,
-        looks_like=round(math.degrees(angle.angle or 0.0) % 180, 1) if told else None,
-        error=math.degrees(angle.error) if told else None,
+        looks_like=round(math.degrees(angle.angle or 0.0) % 180, 1) if determined else None,
+        error=math.degrees(angle.error) if determined else None,
         residual=angle.residual,
         left_out=not used,
     )

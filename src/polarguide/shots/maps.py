@@ -1,4 +1,4 @@
-"""What is measured in one exposure set, and what it is made of: a map per quantity, and why a pixel says nothing."""
+"""Maps of one exposure set: one for each quantity, their pictures, and the reasons why a pixel has no value."""
 
 from __future__ import annotations
 
@@ -228,8 +228,8 @@ def noise_line(x: NDArray[np.float64], y: NDArray[np.float64], least: float) -> 
 def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> NDArray[np.float32]:
     """Variance of each developed intensity, as a multiple of a sample's: [4, p, p] over a period p of the pattern.
 
-    Interpolated values are means of samples, which have less noise; each is read from what an impulse at every position
-    of the pattern becomes, by the demosaicing itself. Guided interpolation, which is not linear, is taken to be
+    Interpolated values are means of samples and have less noise. The weights of the samples are the responses of the
+    demosaicing to an impulse at each position of the pattern. Guided interpolation, which is not linear, is taken to be
     bilinear, and luminance as the mean of the colors. ``x`` and ``y`` are where the pattern of the sensor begins.
     """
     return _variances(sensor, x, y, mode)[0]
@@ -315,12 +315,12 @@ def gains_of(
         return options.calibration.gains, ()
     if ratio is None:
         return UNIT_GAINS, ()
-    said = f"I0 + I90 is {ratio - 1:+.2%} off I45 + I135"
+    deviation = f"I0 + I90 is {ratio - 1:+.2%} off I45 + I135"
     found = balancing_gains(ratio)
     if found is None:
-        return UNIT_GAINS, (f"{said}: the angles or the encoding are probably wrong.",)
+        return UNIT_GAINS, (f"{deviation}: the angles or the encoding are probably wrong.",)
     if options.gains == "auto":
-        return found, (f"{said}; corrected.",)
+        return found, (f"{deviation}; corrected.",)
     if abs(ratio - 1) > _LARGE_IMBALANCE:
-        return UNIT_GAINS, (f"{said}; not corrected (--gains auto does, a calibration does better).",)
+        return UNIT_GAINS, (f"{deviation}; not corrected (--gains auto does, a calibration does better).",)
     return UNIT_GAINS, ()

@@ -103,7 +103,7 @@ class ShotOptions(MosaicOptions):
         if self.read_noise and self.full_well is None:
             raise PolarguideError(
                 "--read-noise",
-                expected="a full well beside it, without which noise is estimated from each shot",
+                expected="--full-well with it: without, noise is estimated from each shot",
                 found=f"{self.read_noise:g} without --full-well",
                 remedy="Give --full-well, or leave it out.",
             )
@@ -114,7 +114,7 @@ class ShotOptions(MosaicOptions):
         return _changed(self)
 
     def called(self, name: str) -> str:
-        """What messages call an option; of the calibration, what it states."""
+        """Name of an option in messages; of the calibration, its contents."""
         if name == "calibration":
             return f"calibration ({', '.join(_changed(self.calibration))})"
         return _OPTION_OF.get(name, option_name(name))
@@ -136,7 +136,7 @@ class ShotOptions(MosaicOptions):
                 more = " Raw mosaics need --sensor." if owners == ("mosaic",) and self.sensor is None else ""
                 raise PolarguideError(
                     self.called(option),
-                    expected=f"{words}, which it is for",
+                    expected=f"{words}: the option is for these",
                     found=here,
                     remedy=f"Leave it out; it changes nothing there.{more}",
                 )
@@ -162,7 +162,7 @@ def _changed(options: Any) -> list[str]:
 
 @dataclass(frozen=True)
 class MeasureOptions:
-    """What is measured, and what it has to be.
+    """Quantities to measure, and their limits.
 
     Attributes:
         roi: Region x,y,width,height in pixels of the maps, or the corners of a polygon, x,y;x,y;x,y (in quotes), each

@@ -81,10 +81,10 @@ KINDS: tuple[MapKind, ...] = (
 """The maps of every shot, in the order in which they are shown."""
 
 _OF_SETS: tuple[MapKind, ...] = (
-    MapKind("residual", "residual", "standard deviations of the noise", "scalar", lambda m, s: _given(m.residual),
+    MapKind("residual", "residual", "standard deviations of the noise", "scalar", lambda m, s: _required(m.residual),
             "viridis", (0.0, 5.0), note="what the fit leaves of all pictures; 1 is noise alone, more is motion, "
             "clipping or a wrong angle"),
-    MapKind("left_out", "samples left out", "samples", "scalar", lambda m, s: _given(m.left_out), "viridis",
+    MapKind("left_out", "samples left out", "samples", "scalar", lambda m, s: _required(m.left_out), "viridis",
             note="at full scale, or against the other pictures of the set"),
 )  # fmt: skip
 ALL_KINDS = (*KINDS, *_OF_SETS)
@@ -97,7 +97,7 @@ def kinds_of(maps: ShotMaps) -> tuple[MapKind, ...]:
     return tuple(kind for kind in ALL_KINDS if there.get(kind.key, True))
 
 
-def _given(values: NDArray[Any] | None) -> NDArray[Any]:
+def _required(values: NDArray[Any] | None) -> NDArray[Any]:
     assert values is not None
     return values
 

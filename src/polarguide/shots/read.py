@@ -316,7 +316,7 @@ def _chosen_normal(
 
 
 NAME = "array"
-"""What a shot in memory is called where nothing else is said."""
+"""Default name of a shot in memory."""
 _MOSAIC = "a mosaic [H, W] of uint8 or uint16, as --sensor (ShotOptions.sensor) says"
 
 
@@ -346,9 +346,9 @@ def array_shot(
     if np.issubdtype(values.dtype, np.floating) and options.transfer == "srgb":
         raise PolarguideError(
             name,
-            expected="whole numbers, which srgb decodes",
+            expected="integers with srgb=True",
             found=kind_of(values),
-            remedy="Floats are linear.",
+            remedy="Leave srgb out: floats are linear.",
         )
     stored = stored_pictures(values, name)
     exposures_of(angles, len(stored), f"{name} (angles)")

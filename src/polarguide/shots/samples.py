@@ -165,7 +165,7 @@ def _samples(
 ) -> SetSamples:
     """Linear samples of stored ones, upright; ``read`` is used up: uint16, whatever ``kind`` the values have."""
     values, lost, dark, code = read.pictures, read.clipped, read.dark, read.orientation
-    levels, said = levels_of_shot(values, 8 * kind.itemsize, options)
+    levels, notes = levels_of_shot(values, 8 * kind.itemsize, options)
     every, step = np.arange(np.iinfo(kind).max + 1, dtype=kind), 1 / float(np.iinfo(kind).max)
     if levels is not None:
         every, step = rescaled(every, levels.white), 1 / levels.white
@@ -188,7 +188,7 @@ def _samples(
         dark=apply_orientation(dark, code),
         masked=np.zeros(apply_orientation(dark, code).shape, bool),
         step=step,
-        notes=tuple(said),
+        notes=tuple(notes),
     )
 
 
@@ -239,7 +239,7 @@ def require_no_order(calibration: Calibration, name: str) -> None:
         if given:
             raise PolarguideError(
                 f"calibration ({field})",
-                expected="pictures at 0, 45, 90 and 135 degrees, which it is for",
+                expected="pictures at 0, 45, 90 and 135 degrees: the option is for these",
                 found=f"{name}, a set of pictures at other angles",
                 remedy="Leave it out; sense and zero apply, and angles.csv has a column gain.",
             )
@@ -302,12 +302,12 @@ def _transfer(pictures: Sequence[SetPicture], asked: str) -> tuple[str, str]:
 
 def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:
     """The gain of each picture: as the table states, else as the files state their exposure; and notes."""
-    given = [picture.gain for picture in pictures]
-    if all(gain is None and picture.frame is None for gain, picture in zip(given, pictures, strict=True)):
+    gains = [picture.gain for picture in pictures]
+    if all(gain is None and picture.frame is None for gain, picture in zip(gains, pictures, strict=True)):
         stated = stated_exposures({"": [picture.path for picture in pictures]}).get("")
         if stated is not None:
             return stated, [corrected_note(stated)]
-    return [1.0 if gain is None else gain for gain in given], []
+    return [1.0 if gain is None else gain for gain in gains], []
 
 
 def samples_of_view(data: ViewData, full: int | None, options: ShotOptions) -> SetSamples:

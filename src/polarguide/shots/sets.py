@@ -56,7 +56,7 @@ class SetPicture:
 
     @property
     def label(self) -> str:
-        """What messages call it."""
+        """Its name in messages."""
         return self.path.name if self.frame is None else f"{self.path.name} frame {self.frame}"
 
 
@@ -101,7 +101,7 @@ class ExposureSet:
 
     @property
     def where(self) -> Path | str:
-        """What messages call it: its first file, or its name."""
+        """Its name in messages: its first file, or its name."""
         return self.paths[0] if self.paths else self.name
 
     @property
@@ -155,7 +155,7 @@ def known_places(view: str, exposures: Sequence[Exposure]) -> list[int]:
     return [place for place, angle in enumerate(angles) if not isinstance(angle, str)]
 
 
-def _made(
+def _exposure_set(
     name: str,
     pictures: Iterable[SetPicture],
     table: Path | None = None,
@@ -184,7 +184,7 @@ def _order(picture: SetPicture) -> tuple[bool, float, str, int]:
 
 
 def by_name(files: Sequence[Path]) -> tuple[list[ExposureSet], list[Path]]:
-    """Sets by the names of files, and the files that are none of a set: of four angles at most, or without an angle.
+    """Sets by the names of files, and the files that belong to no set: of four angles at most, or without an angle.
 
     Files named like angles alone are one set, called like their folder, where there is nothing else among the files.
     """
@@ -237,13 +237,15 @@ def _any_angles(folder: Path, views: dict[str, list[SetPicture]]) -> tuple[list[
 
 def _named_set(folder: Path, view: str, pictures: Sequence[SetPicture]) -> ExposureSet:
     """A set by names: two files that state the same number are one picture too many."""
-    seen: dict[Angle, Path] = {}
+    first: dict[Angle, Path] = {}
     for picture in pictures:
-        if picture.angle in seen:
+        if picture.angle in first:
             what = f"one picture of {view} at {angle_text(picture.angle)} degrees"
-            return _made(view, pictures, fault=ambiguous(folder, what, seen[picture.angle], picture.path))
-        seen[picture.angle] = picture.path
-    return _made(view, pictures)
+            return _exposure_set(
+                view, pictures, fault=ambiguous(folder, what, first[picture.angle], picture.path)
+            )
+        first[picture.angle] = picture.path
+    return _exposure_set(view, pictures)
 
 
 def by_table(root: Path) -> tuple[list[ExposureSet], list[Path]]:
@@ -292,7 +294,7 @@ def _of_lines(root: Path, table: Path, view: str, lines: Sequence[Line]) -> Expo
     pictures = [SetPicture(root / line.file, line.angle, line.gain) for line in lines]
     missing = [picture.path for picture in pictures if not picture.path.is_file()]
     if not missing:
-        return _made(view, pictures, table)
+        return _exposure_set(view, pictures, table)
     fault = PolarguideError(
         table,
         expected=f"the file {missing[0]}",
@@ -300,7 +302,7 @@ def _of_lines(root: Path, table: Path, view: str, lines: Sequence[Line]) -> Expo
         remedy="Correct the name, or remove the line.",
     )
     there = [picture for picture in pictures if picture.path.is_file()]
-    return _made(view, there, table, fault)
+    return _exposure_set(view, there, table, fault)
 
 
 def videos(files: Sequence[Path]) -> list[ExposureSet]:
@@ -313,8 +315,8 @@ def _video(path: Path) -> ExposureSet:
     try:
         pictures = [SetPicture(path, angle, None, frame) for frame, angle in read_frame_table(table, path)]
     except PolarguideError as error:
-        return _made(path.stem, [SetPicture(path, "unknown")], None, error)
-    return _made(path.stem, pictures, table)
+        return _exposure_set(path.stem, [SetPicture(path, "unknown")], None, error)
+    return _exposure_set(path.stem, pictures, table)
 
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")

@@ -36,8 +36,7 @@ from polarguide.shots.pictures import (
 from polarguide.shots.read import UNREADABLE, SurfaceMaps, camera_of, fault_of, read_shot, surface_maps
 from polarguide.shots.sets import ExposureSet
 from polarguide.visualization import figures
-from polarguide.visualization.embedded import data_uri
-from polarguide.visualization.pages import page, page_part, script_json
+from polarguide.visualization.pages import data_uri, page, page_part, script_json
 
 FORMATS = ("png", "exr", "npy", "page")
 UNITS_FILE = "maps.json"
@@ -45,7 +44,7 @@ UNITS_FILE = "maps.json"
 
 @dataclass(frozen=True)
 class WrittenShots:
-    """What came of several shots.
+    """The outcome of several shots.
 
     Attributes:
         folders: of the shots that were written, by name.
@@ -350,7 +349,7 @@ def _facts(maps: ShotMaps, surface: SurfaceMaps) -> dict[str, str]:
 
 
 def _facts_of_set(maps: ShotMaps) -> dict[str, str]:
-    """What the pictures of a set say of their angles, and how well they agree."""
+    """Angles of a set as its pictures imply them, and their residuals."""
     rows = [
         f"{fit.label}: {fit.angle:g}°"
         + (f", looks like {fit.looks_like:.1f}°" if fit.looks_like is not None else "")

@@ -69,7 +69,7 @@ OUTLIERS = 0.01
 VIRTUAL = 0.02
 SMOOTH = 0.1
 """Roughness below which reflections are sharp enough to be matched."""
-FOUND = 0.6
+MATCHED_SHARE = 0.6
 """Probability that a view that sees a point observes it."""
 
 
@@ -115,7 +115,7 @@ def sample_sparse_points(
     color, view = np.concatenate(colors), np.concatenate(home)
     hits = intersect(built, origin, ray)
     places = origin + hits.distance[:, None] * ray
-    visible = _visible(built, cameras, places) & (random.random((len(places), len(cameras))) < FOUND)
+    visible = _visible(built, cameras, places) & (random.random((len(places), len(cameras))) < MATCHED_SHARE)
     ghost, places = _mirrored(built, origin, ray, places, hits.normal, hits.thing, random)
     # A reflection is consistent only between neighbors.
     near = np.abs(np.arange(len(cameras)) - view[:, None]) <= 1

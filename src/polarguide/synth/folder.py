@@ -50,7 +50,7 @@ def folder_state(out: Path, request: dict[str, Any]) -> State:
         raise PolarguideError(
             out,
             expected="a new or an empty folder",
-            found="one with other files",
+            found="a folder with other files",
             remedy="Give another --out.",
         )
     before = with_current_keys(read_record(path, dict[str, Any], remedy=remedy))

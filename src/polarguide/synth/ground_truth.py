@@ -127,7 +127,7 @@ def _texture_values(texture: Array, uv: Array) -> Array:
 
 
 def _pixel_albedo(built: BuiltScene, camera: Camera) -> Array:
-    """Base color [H, W, 3], the mean over the part of each pixel that shows an object; 0 where none is."""
+    """Base color [H, W, 3], the mean over the part of each pixel that shows an object; 0 without an object."""
     fine = camera.scaled(SUBPIXELS, SUBPIXELS * camera.width, SUBPIXELS * camera.height)
     rays = fine.world_rays().numpy().astype(np.float64).reshape(-1, 3)
     hits = intersect(built, np.broadcast_to(fine.center.numpy(), rays.shape), rays)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from polarguide.capture.sensor.pattern import SENSORS
 from polarguide.capture.write import write_png, write_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import Reporter
@@ -28,12 +29,20 @@ from polarguide.synth.colmap import (
     view_names,
     write_model,
 )
-from polarguide.synth.film import LobeRadiance, render_lobes
 from polarguide.synth.folder import scene_record, verify_scene, write_manifest
 from polarguide.synth.ground_truth import ground_truth_maps, write_sheet
 from polarguide.synth.mesh import Array
 from polarguide.synth.schema import SceneSpec, require_unicode
-from polarguide.synth.sensor import FilterShot, Sensor, filter_jpeg, mosaic, noisy, plan_shot
+from polarguide.synth.sensor import (
+    FilterShot,
+    LobeRadiance,
+    Sensor,
+    filter_jpeg,
+    mosaic,
+    noisy,
+    plan_shot,
+    render_lobes,
+)
 from polarguide.synth.settings import LONG_SECONDS, Overrides, SynthSettings, choose_variant, rough_time
 from polarguide.synth.transport import PathLimits
 
@@ -79,7 +88,7 @@ class Plan:
     @property
     def mosaics(self) -> bool:
         """Whether raw mosaics are written."""
-        return self.settings.sensor.startswith("imx")
+        return self.settings.sensor in SENSORS
 
     def photograph(self, number: int) -> tuple[FilterShot, Path] | None:
         """How a view is photographed through a filter, and the file; None where it is not."""
@@ -178,7 +187,7 @@ def synthesize(
     if job.mosaics:
         gains = {str(45 * k): gain for k, gain in enumerate(job.sensor.gains)}
         folder.write_file(out / "calibration.json", json.dumps({"gains": gains}).encode())
-        record["sensor"] = {"name": settings.sensor.upper(), **asdict(job.sensor)}
+        record["sensor"] = {"name": settings.sensor, **asdict(job.sensor)}
     if settings.sensor == "filter":
         record["shots"] = {name: asdict(plan_shot(settings.seed, k)) for k, name in enumerate(names)}
     with_truth = [number for number, name in enumerate(names) if job.has_ground_truth(name)]
@@ -213,7 +222,7 @@ def _render_view(job: Job, number: int) -> None:
     light = render_lobes(job.built.scenes, big, samples, seed=settings.seed * 100003 + number, limits=limits)
     random = np.random.default_rng((settings.seed, 31, number))
     if job.mosaics:
-        raw = mosaic(light.stokes * job.exposure, settings.sensor.upper(), settings.noise, random, job.sensor)
+        raw = mosaic(light.stokes * job.exposure, settings.sensor, settings.noise, random, job.sensor)
         write_png(job.out / "raw" / f"{name}.png", raw)
         light = LobeRadiance(_halved(light.specular), _halved(light.diffuse), _halved(light.emitted))
     stokes = light.stokes * job.exposure

@@ -217,7 +217,7 @@ class CameraPath(Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         rings: of each ring ``radius``, ``height``, ``share`` of the views, and ``from`` and ``to`` in degrees about z.
-        target: what all look at; ``wander`` is by how much single cameras look past it.
+        target: the point that the cameras look at; ``wander``: largest random offset of a camera's target from it.
         fov: horizontal field of view.
         views: number of views.
         spacing: degrees between neighbors on a ring, about the middle of its arc; None fills the arc evenly.

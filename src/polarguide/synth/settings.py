@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
+from polarguide.capture.sensor.pattern import SENSORS, any_case, sensor_named
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.records import check_options
 from polarguide.synth.schema import SceneSpec, parse_scene, read_scene_file
@@ -48,14 +49,12 @@ class Variant:
         name: Mitsuba's name.
         color: "rgb" renders three channels one after the other, each with exact values; "spectral" follows four
             wavelengths a path and converts.
-        fast: whether paths are vectorized (LLVM) instead of scalar.
         paths_per_second: a rough figure for this machine.
         note: the reason for a slow variant; else empty.
     """
 
     name: str
     color: Color
-    fast: bool
     paths_per_second: float
     note: str = ""
 
@@ -83,14 +82,14 @@ def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
         if threads:
             dr.set_thread_count(threads)
         speed = FAST_PATHS_PER_SECOND * (threads or os.cpu_count() or 1)
-        return Variant(mi.variant(), color, True, speed)
+        return Variant(mi.variant(), color, speed)
     with _silent_stderr():
         mi.set_variant("scalar_spectral_polarized")
     note = (
         f"Mitsuba's fast variants need LLVM {OLDEST_LLVM} or newer as a shared library ({missing}); on Debian "
         "'apt-get install libllvm19', elsewhere set DRJIT_LIBLLVM_PATH. The slow scalar variant is used."
     )
-    return Variant(mi.variant(), "spectral", False, SLOW_PATHS_PER_SECOND, note)
+    return Variant(mi.variant(), "spectral", SLOW_PATHS_PER_SECOND, note)
 
 
 @contextlib.contextmanager
@@ -131,7 +130,7 @@ def rough_time(seconds: float) -> str:
 PRESETS = (
     *("figure", "kit", "car", "cup", "water"),
     *("metals-a", "metals-b", "ceramic-a", "ceramic-b", "rough", "lacquer"),
-    "proof",
+    *("glossy", "proof"),
 )
 TEST_EVERY = 8
 """As reports of 3DGS do."""
@@ -157,12 +156,18 @@ class SynthSettings:
     size: str = "256x192"
     samples: Annotated[int, Meta(ge=1, le=65536)] = 64
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
-    sensor: Literal["ideal", "imx250myr", "imx250mzr", "filter"] = "ideal"
+    sensor: Annotated[
+        Literal["ideal", "IMX250MYR", "IMX264MYR", "IMX250MZR", "filter"],
+        any_case("ideal", *SENSORS, "filter"),
+    ] = "ideal"
     noise: Annotated[float, Meta(ge=0, le=100)] = 0.0
     color: Color = "rgb"
     ground_truth: Literal["test", "all"] = "test"
     points: Annotated[int, Meta(ge=0)] = 5000
     test_every: Annotated[int, Meta(ge=2)] = TEST_EVERY
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sensor", sensor_named(self.sensor))
 
     @property
     def width(self) -> int:
@@ -178,6 +183,7 @@ class SynthSettings:
         """As JSON."""
         values = asdict(self)
         del values["size"]
+        values["sensor"] = self.sensor.lower()  # as folders of earlier versions have it
         if self.test_every == TEST_EVERY:  # folders of versions without this setting go on
             del values["test_every"]
         return {"width": self.width, "height": self.height, **values}

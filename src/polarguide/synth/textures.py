@@ -187,7 +187,7 @@ def image(file: str, folder: Path = Path(".")) -> Array:
         raise PolarguideError(
             path,
             expected="a color picture (PNG, JPEG or Radiance .hdr)",
-            found="one of another kind" if path.is_file() else "nothing",
+            found="a file of another kind" if path.is_file() else "nothing",
             remedy="File names of textures and environments start at the folder of the scene file.",
         )
     picture = stored[..., 2::-1].astype(np.float64)

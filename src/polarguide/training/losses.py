@@ -327,8 +327,8 @@ def normal_terms(step: Step, weights: Weights) -> Tensor:
     """The weighted sum of the terms that read the rendered normal.
 
     On the CPU in float32 they are one native pass, but for the Stokes term of a shading model with a prediction of its
-    own. ``normal_terms_reference`` is the reference implementation. Of a view without priors, the consistency is the
-    only one.
+    own. ``normal_terms_reference`` is the reference implementation. A view without priors has the
+    consistency term alone.
     """
     result, priors, shading = step.result, step.targets.priors, step.shading
     if not _native_fits(result, priors):

@@ -18,7 +18,7 @@ from polarguide.gaussians.gaussians import CORE_SHAPES, ORIENTED_SHAPES
 from polarguide.gaussians.initialize import Initialization
 from polarguide.shading.model import PLAIN, ShadingModel
 from polarguide.training.losses import Weights as Weights
-from polarguide.training.rules import AngleRules, FlatRules, MetalRules
+from polarguide.training.rules import AngleRules, FlatRules, MetalRules, MetalViews
 
 Action = Literal["reset_opacity", "propagate_normals", "refresh_priors", "orient_normals"]
 Candidates = Literal["paper", "azimuths", "physical"]
@@ -227,7 +227,7 @@ class Recipe(Method):
         means_decay: factor on the means' rate at the last step (exponential in between).
         oriented: whether normals keep the side from which training views see them ("orient_normals" finds it).
         metals: share of all steps between which refreshes look for metals, where the shading knows them.
-        metal_rules: how.
+        metal_rules: how. metal_views: from which measurements.
         angle_rules: how polarizer angles are fitted and judged.
         coarse: which steps look at smaller pictures.
         sh_fractions: shares of all steps at which SH degrees 1, 2 and 3 begin.
@@ -246,6 +246,7 @@ class Recipe(Method):
     oriented: bool = False
     metals: tuple[float, float] = (0.4, 0.72)
     metal_rules: MetalRules = field(default_factory=MetalRules)
+    metal_views: MetalViews = field(default_factory=MetalViews)
     angle_rules: AngleRules = field(default_factory=AngleRules)
     coarse: Coarse = field(default_factory=Coarse)
     sh_fractions: tuple[float, float, float] = (1 / 30, 2 / 30, 3 / 30)

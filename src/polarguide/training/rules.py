@@ -6,28 +6,27 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Limits:
-    """Where a neighborhood is a metal in polarized light.
+class MetalRules:
+    """The five constants of the energy whose minimum says what is metal (``training.metals.cut``).
 
     Attributes:
-        oblique: least polarization at 45 degrees to the plane of incidence, as a share of the radiance.
-        light: the same, as a share of the scene's mean radiance.
-        times: most of the metal's mean squared misfit, in units of the mean square of the oblique polarization.
-        ratio: least evidence, the logarithm of the dielectric's misfit over the metal's.
+        prior: nats per view by which a metal has to be likelier than a dielectric.
+        trust: nats that a single Gaussian's evidence counts at most: of 20 one may be wrong, whatever its evidence.
+        likeness: nats that it costs if one of two neighbors that look alike is a metal and the other is none.
+        like_color: standard deviation of the logarithm of the color of one material, from Gaussian to Gaussian.
+        surface: nats that a metal surface that hangs together has to be worth.
     """
 
-    oblique: float
-    light: float
-    times: float
-    ratio: float
+    prior: float = 0.45
+    trust: float = 3.0
+    likeness: float = 8.0
+    like_color: float = 0.3
+    surface: float = 40.0
 
 
 @dataclass(frozen=True)
-class MetalRules:
-    """Constants of the detection of metals: hysteresis on the graph of neighboring Gaussians.
-
-    Evidence is log(E_dielectric / E_metal), the ratio of the mean squared misfits of both explanations over a
-    neighborhood; a misfit is relative to the radiance.
+class MetalViews:
+    """Which measurements count in the search for metals, and how the first metals fix the light.
 
     Attributes:
         most_views: views that are looked at, evenly spread.
@@ -35,76 +34,27 @@ class MetalRules:
         least_normal: length of a blended normal above which a pixel counts: shorter ones mix surfaces.
         cosines: of the zenith angle, between which a view counts: head-on nothing is polarized, and at grazing angles
             normals and reflectances are uncertain.
-        least_views: effective number of views from which on a Gaussian is measured.
-        least_weight: sum of blending weights, in pixels, from which on a Gaussian is measured or labeled.
-        neighbors: Gaussians in a neighborhood, over which evidence is averaged.
-        least_residual: floor of mean squared misfits.
-        like_brightness, like_tint: standard deviation of the logarithm of brightness, and of color over brightness,
-            among Gaussians of one material.
-        levels, powers: reflectances that are tried: a level times a power of the observed color.
-        dark: radiance (full scale is 1) that is added to the one that misfits are relative to.
+        dark: radiance (full scale is 1) that is added to the one that errors are relative to.
         reach: metals are looked for within this share of the cameras' distance from the middle of the points: what is
             farther away is behind the subject in views from the other side.
-        nearest: neighbors that decide by majority.
-        least_support: share of the neighborhood that has to be measured.
-        begin, proceed, stay: evidence of a seed, of a neighbor that joins, and of a seed that was a metal before.
-        begin_misfit, proceed_misfit: least misfit of the dielectric, for a seed and for a neighbor.
-        crowd: share of metals among the nearest above which a neighbor joins.
-        alone: share of metals among the nearest up to which a metal is dropped as isolated.
-        among, majority: evidence above which a Gaussian joins whose nearest are metals by more than this share: a metal
-            that mirrors something uniform fits both explanations.
-        sure_share, fewest_sure: share and number of seeds that a connected region needs. True metals had 0.25 to 0.56,
-            a plate in polarized light 0.02 to 0.13.
-        touching: likeness of the normals from which on neighbors are connected.
-        least_tint: weakest over strongest color, over the scene's mean color, that a metal may have. No metal reflects
-            one color less than about 0.38 times another (gold, blue and red).
-        rounds, filling: most rounds in which regions grow, and in which holes are filled.
-        begin_oblique, proceed_oblique: limits in polarized light, of a seed and of a neighbor.
+        contradicted: share of a view's labels from which on a warning says that other views contradict them.
         gain_views: views from which the gain of the light is taken when the first metals are found.
         gain_share: share of metal above which a pixel counts for it.
         gain_pixels: least share of the pixels that have to count.
         most_gain: the largest gain.
-        contradicted: share of a view's labels from which on a warning says that other views contradict them.
     """
 
     most_views: int = 32
     least_share: float = 0.3
     least_normal: float = 0.3
     cosines: tuple[float, float] = (0.25, 0.97)
-    least_views: float = 4.0
-    least_weight: float = 0.3
-    neighbors: int = 64
-    least_residual: float = 2e-4
-    like_brightness: float = 0.4
-    like_tint: float = 0.25
-    levels: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.88, 0.95)
-    powers: tuple[float, ...] = (0.5, 0.75, 1.0)
     dark: float = 0.02
     reach: float = 0.5
-    nearest: int = 16
-    least_support: float = 0.35
-    begin: float = 2.2
-    proceed: float = 0.4
-    stay: float = 1.3
-    begin_misfit: float = 0.05
-    proceed_misfit: float = 0.02
-    crowd: float = 0.12
-    alone: float = 0.2
-    among: float = -0.7
-    majority: float = 0.4
-    sure_share: float = 0.18
-    fewest_sure: int = 10
-    touching: float = 0.2
-    least_tint: float = 0.25
-    rounds: int = 12
-    filling: int = 40
-    begin_oblique: Limits = Limits(0.03, 0.08, 4.0, 0.0)
-    proceed_oblique: Limits = Limits(0.02, 0.02, 6.0, -0.5)
+    contradicted: float = 0.15
     gain_views: int = 10
     gain_share: float = 0.6
     gain_pixels: float = 0.003
     most_gain: float = 4.0
-    contradicted: float = 0.15
 
 
 @dataclass(frozen=True)

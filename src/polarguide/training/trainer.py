@@ -24,15 +24,15 @@ from polarguide.shading.model import PLAIN
 from polarguide.shading.result import COLOR_CHANNELS, RenderResult
 from polarguide.training.actions import DensityControl, outward_directions, propagate_normals, reset_opacity
 from polarguide.training.distributed import ALONE, Ranks
-from polarguide.training.feed import Feed
+from polarguide.training.feed import Feed, ViewStore
+from polarguide.training.flat import Flat
 from polarguide.training.losses import step_loss
 from polarguide.training.metals.observations import index_offsets, numbers_in
-from polarguide.training.metals.search import MetalSearch
+from polarguide.training.metals.search import MetalSearch, refreshes
 from polarguide.training.recipe import Action, Recipe, Schedule, Stage
 from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.state import TrainingState, first_state, seeded
 from polarguide.training.targets import Step, StepTargets
-from polarguide.training.view_store import ViewStore
 
 
 class Trainer:
@@ -93,6 +93,17 @@ class Trainer:
         self._rate = math.sqrt(settings.views_per_step)
         self._use_batch_rates()
 
+    @property
+    def flat(self) -> dict[str, dict[str, Flat]]:
+        """Flat surfaces that have been found, as of ``Feed``; what is put there is not looked for."""
+        return self._feed.flat
+
+    def looks(self, step: int) -> tuple[bool, bool, bool]:
+        """Whether a step looks for metals, for the outer sides of normals, and for faint Gaussians."""
+        stage, actions = (position := self.schedule.at(step)).stage, position.actions
+        metals = "refresh_priors" in actions and self._metals.is_due(step)
+        return metals, "orient_normals" in actions, stage.densify and not self._densifies(step + 1)
+
     def set_exposures(self, exposures: Mapping[str, tuple[Exposure, ...]]) -> None:
         """Take views, by name, for captured with these exposures from now on; their targets are made anew."""
         self._exposures.update(exposures)
@@ -122,16 +133,15 @@ class Trainer:
         report = StepReport(state.step, stage.name, len(state.gaussians), mean, state.step + 1)
         state.step += 1
         if stage.densify:
-            self._density.after_step(state, last=not self._densifies_next())
+            self._density.after_step(state, last=not self._densifies(state.step))
         if state.step == self.settings.steps:
             cameras = (view.camera for view in self._views)
             state.footprints = footprints(state.gaussians["means"].detach(), cameras)
         self.whole = True
         return report
 
-    def _densifies_next(self) -> bool:
-        """Whether the next step belongs to a stage with density control."""
-        step = self.state.step
+    def _densifies(self, step: int) -> bool:
+        """Whether a step belongs to a stage with density control."""
         return step < self.settings.steps and self.schedule.at(step).stage.densify
 
     def exchange_statistics(self) -> None:
@@ -231,7 +241,7 @@ class Trainer:
             self.ranks.broadcast(outward)
             state.gaussians.overwrite("outward", outward)
         else:
-            if self._metals.is_due(state.step / steps):
+            if self._metals.is_due(state.step):
                 self._metals.look(state, self._views)
             self._set_indices()
             state.frozen = state.gaussians.snapshot()
@@ -266,13 +276,11 @@ def warn_of_unused_materials(
     scene: Scene, recipe: Recipe, settings: ResolvedSettings, backend: Backend, warn: Callable[[str], None]
 ) -> None:
     """Warn if ``materials/``, or refractive indices of single materials, have no effect on a training."""
-    steps, shading = settings.steps, recipe.shading.bind(settings.refractive_index)
-    schedule = Schedule(recipe, steps)
-    refreshes = [step / steps for step in range(steps) if "refresh_priors" in schedule.at(step).actions]
-    MetalSearch(scene, recipe, settings, shading, backend, ALONE, warn, UNBOUNDED).warn_if_never(refreshes)
+    shading = recipe.shading.bind(settings.refractive_index)
+    MetalSearch(scene, recipe, settings, shading, backend, ALONE, warn, UNBOUNDED).warn_if_never()
     if not scene.indices:
         return
-    if not (shading.knows_indices and refreshes):
+    if not (shading.knows_indices and refreshes(recipe, settings.steps)):
         why = f"the recipe {recipe.name} takes the run's for everything"
     elif not any(numbers_in(view) & scene.indices.keys() for view in scene.train_views):
         why = "no picture in materials/ of a training view has one of their numbers"

@@ -76,6 +76,13 @@ def letterbox(photograph: Camera, frame_size: tuple[int, int]) -> Letterbox:
     return Letterbox(scale, left, top, frame_size)
 
 
+def drawn_camera(camera: Camera, view: View | None) -> Camera:
+    """The camera of a window's picture: a free one, or that of a view's pose in a window of this size."""
+    if view is None:
+        return camera
+    return letterbox(view.camera, (camera.width, camera.height)).camera(view.camera)
+
+
 def window_fov(photograph: Camera, aspect: float) -> float:
     """Vertical field of view in radians with which a window of ``aspect`` (width / height) contains a photograph."""
     high, wide = 0.5 * photograph.height / photograph.fy, 0.5 * photograph.width / photograph.fx

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from polarguide.capture.presentation import STOPS, Crop, Presentation, Vector
 from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
+from polarguide.viewer.painting import PaintingControls
 from polarguide.viewer.presenting import PresentingControls
 from polarguide.viewer.scenery import MEASURED, Appearance
 
@@ -30,6 +31,7 @@ class PanelOptions:
         views: names of the photographs.
         trains: whether a training runs, which can be paused.
         presentation: as it was saved. saves: whether it can be saved to the run, rather than downloaded.
+        kinds: materials that can be painted, with their numbers; none: there is nothing to paint on.
     """
 
     layers: Sequence[str]
@@ -38,6 +40,7 @@ class PanelOptions:
     trains: bool
     presentation: Presentation = NOTHING
     saves: bool = False
+    kinds: Mapping[str, int] = field(default_factory=dict)
 
 
 class Panel:
@@ -94,7 +97,9 @@ class Panel:
             self.view = gui.add_dropdown("Go to", (FREE_VIEW, *options.views))
             self.step = gui.add_button_group("", STEPS)
             self.frusta = gui.add_checkbox("Show cameras", True)
-            hint = "At a photograph's pose: what was measured, from the left, in percent of the width"
+            hint = (
+                "In percent of the width, from the left: the run beside, else what was measured at this pose"
+            )
             self.wipe = gui.add_slider("Wipe", *WIPE, 1, 0, hint=hint)
         with gui.add_folder("Crop", expand_by_default=False):
             self._use_crop = gui.add_checkbox("Crop", self._saved_crop is not None)
@@ -102,6 +107,7 @@ class Panel:
             for label, sides in zip(SIDES, _percent(self._saved_crop), strict=True):
                 self._crop.append(gui.add_multi_slider(label, *CROP, 1, sides, min_range=1))
         self.presenting = PresentingControls(gui, options.presentation, saves=options.saves)
+        self.painting = PaintingControls(gui, options.kinds) if options.kinds else None
         with gui.add_folder("Picture and camera path", expand_by_default=False):
             self.screenshot = gui.add_button("Save picture")
             self.keyframes = gui.add_text("Keyframes", "0", disabled=True)
@@ -129,7 +135,9 @@ class Panel:
             *((control, pair(*CROP)) for control in self._crop),
             *((control, push) for control in pushed),
         ]
-        return {control._impl.uuid: accepts for control, accepts in controls} | self.presenting.accepts
+        painting = {} if self.painting is None else self.painting.accepts
+        own = {control._impl.uuid: accepts for control, accepts in controls}
+        return own | self.presenting.accepts | painting
 
     def show_note(self, note: str) -> None:
         """Show another note below the status, of which the same holds."""

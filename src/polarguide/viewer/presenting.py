@@ -123,6 +123,11 @@ class Presenting:
         """Whether a click waits to be looked up."""
         return self._clicked is not None
 
+    @property
+    def picks(self) -> bool:
+        """Whether the next click is a pick."""
+        return self._listener is not None
+
     def take_click(self) -> tuple[float, float] | None:
         """Where was clicked, in shares of the picture's width and height; None: nowhere."""
         return None if self._clicked is None else self._clicked[1:]

@@ -25,7 +25,7 @@ from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
 from polarguide.shading.result import POLARIZED, RenderResult
 from polarguide.training.angles.trainer import AngleTrainer
-from polarguide.viewer.cameras import letterbox
+from polarguide.viewer.cameras import drawn_camera, letterbox
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
 from polarguide.visualization.layers import (
@@ -225,8 +225,8 @@ class Appearance:
         strength: factor on the specular layer; predicted polarization is that of the layers as they were learned.
         turn: degrees of the far environment, counter-clockwise seen from above.
         crop: what is shown of the scene; None: all.
-        wipe: share of the picture's width, from the left, that shows what was measured (``BESIDE``) in place of the
-            layer, at a photograph's pose.
+        wipe: share of the picture's width, from the left, that shows the run beside in place of the layer; without one
+            what was measured (``BESIDE``), at a photograph's pose.
         white_balance, chart: as of ``Presentation``. up_axis: the axis of turning; None: as the cameras say.
     """
 
@@ -245,11 +245,11 @@ class Painter:
     """Draws a scene as a visitor wants it.
 
     Args:
-        around: the frame of the scene's cameras.
+        around: the frame of the scene's cameras. beside: another run of it, for wipes; None: what was measured.
     """
 
-    def __init__(self, around: SceneFrame) -> None:
-        self.around = around
+    def __init__(self, around: SceneFrame, beside: Scenery | None = None) -> None:
+        self.around, self._beside = around, beside
         self._depths: tuple[float, float] | None = None
 
     def paint(
@@ -278,28 +278,38 @@ class Painter:
         if view is not None and layer in MEASURED:
             place = letterbox(view.camera, (camera.width, camera.height))
             return self._with_scale(place.apply(self._measured(scenery, view, appearance)), layer)
-        if view is not None:
-            camera = letterbox(view.camera, (camera.width, camera.height)).camera(view.camera)
-        result = self._result(scenery, camera, appearance)
-        if layer in POLARIZED:
-            result = replace(result, predicted=scenery.stokes(result, camera))
-        picture = self._layer(result, camera, appearance, settled=settled)
-        if picture is None:
-            return None
-        if view is not None and appearance.wipe > 0:
-            picture = self._wiped(picture, scenery, view, appearance)
-        return self._with_scale(picture, layer)
+        camera = drawn_camera(camera, view)
+        picture = self._modeled(scenery, camera, appearance, settled=settled)
+        if picture is not None and appearance.wipe > 0:
+            picture = self._wiped(picture, scenery, camera, view, appearance)
+        return None if picture is None else self._with_scale(picture, layer)
 
-    def _wiped(self, picture: Picture, scenery: Scenery, view: View, appearance: Appearance) -> Picture:
-        """A picture of a layer with what was measured to the left; as it is where nothing of the kind was."""
+    def _modeled(
+        self, scenery: Scenery, camera: Camera, appearance: Appearance, *, settled: bool
+    ) -> Picture | None:
+        """A picture of a layer; None where there is no such layer."""
+        result = self._result(scenery, camera, appearance)
+        if appearance.layer in POLARIZED:
+            result = replace(result, predicted=scenery.stokes(result, camera))
+        return self._layer(result, camera, appearance, settled=settled)
+
+    def _wiped(
+        self, picture: Picture, scenery: Scenery, camera: Camera, view: View | None, appearance: Appearance
+    ) -> Picture:
+        """A picture of a layer with the other run, or what was measured, to the left; as it is where there is none."""
         other = BESIDE.get(appearance.layer)
-        if other is None or (other in OF_POLARIZATION and not view.is_determined):
+        if self._beside is not None:
+            left = self._modeled(self._beside, camera, appearance, settled=False)
+        elif view is None or other is None or (other in OF_POLARIZATION and not view.is_determined):
+            left = None
+        else:
+            place = letterbox(view.camera, (picture.shape[1], picture.shape[0]))
+            left = place.apply(self._measured(scenery, view, replace(appearance, layer=other)))
+        if left is None:
             return picture
-        place = letterbox(view.camera, (picture.shape[1], picture.shape[0]))
-        measured = place.apply(self._measured(scenery, view, replace(appearance, layer=other)))
         column = round(min(appearance.wipe, 1.0) * picture.shape[1])
         wiped = picture.copy()
-        wiped[:, :column] = measured[:, :column]
+        wiped[:, :column] = left[:, :column]
         wiped[:, max(0, column - 1) : column + 1] = 255
         return wiped
 
@@ -325,8 +335,7 @@ class Painter:
         place: tuple[float, float],
     ) -> SurfacePoint | None:
         """The surface at a place of the picture that ``paint`` draws, in shares of its width and height."""
-        if view is not None:
-            camera = letterbox(view.camera, (camera.width, camera.height)).camera(view.camera)
+        camera = drawn_camera(camera, view)
         plain = Appearance(layer="depth", crop=appearance.crop)
         result = self._result(scenery, camera, plain)
         return surface_at(result, camera, place[0] * camera.width, place[1] * camera.height)

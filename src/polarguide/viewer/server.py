@@ -33,11 +33,13 @@ from polarguide.results.rendering.picking import gray_world
 from polarguide.runs.families import AnyTrainer
 from polarguide.runs.model import layers_of
 from polarguide.runs.opened import OpenedRun
+from polarguide.runs.painted import FOLDER, read_painted, write_painted
 from polarguide.runs.train import Ends, Look
 from polarguide.shading.model import ShadingModel
 from polarguide.viewer.cameras import Photograph, photographs
 from polarguide.viewer.guard import Gate, guarded
 from polarguide.viewer.messages import Accepts, checked
+from polarguide.viewer.painting import KINDS, Materials, Paintable, kinds_of
 from polarguide.viewer.panel import NOTHING, PanelOptions
 from polarguide.viewer.scenery import Scenery, run_scenery, training_scenery
 from polarguide.viewer.session import Session
@@ -67,8 +69,9 @@ class Viewer:
         visitors: who may look besides pages of this machine.
         presentation: as it was saved. save: writes a choice to the run, and returns a message in plain text; None:
             visitors can download it. That is all they can do where other machines may look.
+        paintable: what can be painted, where nobody else may look; None: nothing.
         title: plain text.
-        warn: called with the reason why a browser was disconnected.
+        warn: called with the reason why a browser was disconnected. beside: another run, for wipes.
 
     Raises:
         PolarguideError: viser is not installed or not as it was tested, or the server cannot listen at the address.
@@ -86,19 +89,24 @@ class Viewer:
         visitors: VisitorOptions = VisitorOptions(),
         presentation: Presentation = NOTHING,
         save: Callable[[Presentation], str] | None = None,
+        paintable: Paintable | None = None,
         title: str = "polarguide",
         warn: Callable[[str], None] = lambda text: None,
+        beside: Scenery | None = None,
     ) -> None:
         viser = optional_import("viser", "the viewer")
         # viser warns of pictures for a browser that has just disconnected.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        self._current, self._photographs = current, photographs
+        self._current, self._photographs, self._beside = current, photographs, beside
         self._scene_frame = scene_frame([photograph.view.camera for photograph in photographs.values()])
         turns = shading.radiance_cubemap is not None
         others = visitors.allow_host or visitors.allow_origin
         self._save = save if host in LOOPBACK and not others else None
+        self._paintable = None if self._save is None else paintable
+        kinds = {} if self._paintable is None else self._paintable.kinds
+        saves = self._save is not None
         self._options = PanelOptions(
-            layers_of(shading), turns, tuple(photographs), trains, presentation, self._save is not None
+            layers_of(shading), turns, tuple(photographs), trains, presentation, saves, kinds
         )
         self._gray: Vector | None = None
         self._sessions: dict[int, Session] = {}
@@ -140,7 +148,9 @@ class Viewer:
                 self._wake.set,
                 gray_world=self._gray_world,
                 save=None if self._save is None else self._saved,
+                paintable=self._paintable,
                 drop=drop,
+                beside=self._beside,
             )
             session.go(next(iter(self._photographs)))
         except Exception as error:
@@ -279,18 +289,26 @@ def view_run(
     port: int = 8080,
     visitors: VisitorOptions = VisitorOptions(),
     reporter: Reporter = SILENT,
+    beside: OpenedRun | None = None,
 ) -> None:
     """Serve a run to browsers: its layers from any side, beside the photographs. KeyboardInterrupt ends it.
 
     Args:
-        run: the run; its scene is read.
+        run: the run; its scene is read. beside: another of the same scene, which a wipe shows from the left.
         host: address to listen at. port: the next free one is taken if it is in use.
         visitors: who may look besides pages of this machine.
         reporter: receives the address.
 
     Raises:
-        PolarguideError: the address cannot be listened at.
+        PolarguideError: the address cannot be listened at, or the run beside is of another scene.
     """
+    if beside is not None and beside.configuration.scene_digest != run.configuration.scene_digest:
+        raise PolarguideError(
+            beside.folder,
+            expected=f"a run of {run.configuration.scene}",
+            found=f"one of {beside.configuration.scene}",
+            remedy="Name another run, or train one on this scene.",
+        )
     scenery = run_scenery(run)
     with _opened(
         lambda: scenery,
@@ -303,9 +321,35 @@ def view_run(
         visitors=visitors,
         presentation=run.presentation,
         save=functools.partial(save_to_run, run),
+        beside=None if beside is None else run_scenery(beside),
+        paintable=paintable_run(run),
     ) as viewer:
         while True:
             viewer.serve(1.0)
+
+
+def paintable_run(run: OpenedRun) -> Paintable | None:
+    """What can be painted over a run; None where its recipe tells no metals."""
+    if not run.model.shading.knows_metals:
+        return None
+    model, scene = run.gaussian_model("view"), run.scene
+    gaussians, rasterize = model.state.gaussians, model.backend.rasterize
+    kinds = {name: number for number, name in enumerate(KINDS)}
+    kinds |= {f"dielectric of index {index:g}": number for number, index in sorted(scene.indices.items())}
+
+    def materials() -> Materials:
+        painted = read_painted(run.folder, scene)
+        if painted is None:
+            return Materials(gaussians, rasterize)
+        first = functools.partial(kinds_of, gaussians, rasterize, scene.train_views, painted.numbers)
+        return Materials(gaussians, rasterize, first)
+
+    def save(materials: Materials) -> str:
+        pictures = {view.name: materials.picture(view.camera) for view in scene.train_views}
+        write_painted(run.folder, pictures)
+        return f"Saved to {FOLDER}/ of the run; polarguide train --resume goes on with them"
+
+    return Paintable(materials, kinds, save)
 
 
 def save_to_run(run: OpenedRun, chosen: Presentation) -> str:

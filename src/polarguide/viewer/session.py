@@ -20,9 +20,11 @@ from polarguide.viewer.cameras import (
     Keyframes,
     Photograph,
     ViewPose,
+    drawn_camera,
     free_camera,
     move_to_view,
 )
+from polarguide.viewer.painting import Paintable, Painting
 from polarguide.viewer.panel import FREE_VIEW, Panel, PanelOptions
 from polarguide.viewer.presenting import Presenting
 from polarguide.viewer.scenery import Painter, Scenery
@@ -108,7 +110,7 @@ class Session:
         options: of the panel. wake: called when a picture may be due.
         gray_world: gives the gains of the photographs' mean.
         save: writes a presentation to the run, and returns a message; None: the browser downloads it.
-        drop: called with what a callback has raised, to let the browser go.
+        drop: called with what a callback has raised, to let the browser go. beside: as of ``Painter``.
     """
 
     def __init__(
@@ -121,12 +123,14 @@ class Session:
         *,
         gray_world: Callable[[], Vector] = lambda: (1.0, 1.0, 1.0),
         save: Callable[[Presentation], str] | None = None,
+        paintable: Paintable | None = None,
         drop: Callable[[Exception], None] = _raise,
+        beside: Scenery | None = None,
     ) -> None:
         self._client, self._photographs, self._drop = client, photographs, drop
         self._scene_frame, self._wake = scene_frame, wake
         self._lock = threading.Lock()
-        self._painter = Painter(scene_frame)
+        self._painter = Painter(scene_frame, beside)
         self.pacing = FramePacing()
         self._view_pose: ViewPose | None = None
         self._last_pose: ViewPose | None = None  # of the view that was asked for last, left or not
@@ -149,6 +153,17 @@ class Session:
             noted=lambda: self.panel.show_note(self._presenting.note),
             caught=self._caught,
         )
+        self._painting = None
+        if paintable is not None and self.panel.painting is not None:
+            self._painting = Painting(
+                client,
+                self.panel.painting,
+                paintable,
+                changed=self._changed,
+                noted=self.panel.show_note,
+                caught=self._caught,
+                busy=lambda: self._presenting.picks,
+            )
         self._frusta = Frusta(
             client.scene,
             list(photographs.values()),
@@ -321,9 +336,8 @@ class Session:
         """The kind of picture that is due: "coarse", "sharp", or None."""
         with self._lock:
             self._follow_path()
-            return (
-                "sharp" if self._screenshot or self._presenting.waits else self.pacing.due(time.monotonic())
-            )
+            waits = self._presenting.waits or (self._painting is not None and self._painting.waits)
+            return "sharp" if self._screenshot or waits else self.pacing.due(time.monotonic())
 
     def draw(self, scenery: Scenery, kind: str) -> None:
         """Render a picture and send it to the browser."""
@@ -341,6 +355,10 @@ class Session:
             self._presenting.found(self._painter.point(scenery, viewpoint, appearance, view, place))
         appearance = self.panel.appearance(self._presenting.chosen)
         picture = self._painter.paint(scenery, viewpoint, appearance, view, settled=sharp)
+        if self._painting is not None and picture is not None:
+            drawn = drawn_camera(viewpoint, view)
+            self._painting.act(drawn)
+            picture = self._painting.tinted(picture, drawn)
         self._send(picture, frame_size, sharp=sharp)
         self._frusta.hide_near(None if view else viewpoint.center.numpy())
         if screenshot and picture is not None:

@@ -89,7 +89,7 @@ def depth_picture(depth: Tensor, depths: Depths) -> Picture:
 
 
 def layer_scale(name: str, depths: Depths | None = None) -> Picture | None:
-    """What the colors of a layer mean, 256 pixels wide; None of radiance, and of depth without a range."""
+    """The color scale of a layer, 256 pixels wide; None for radiance, and for depth without a range."""
     name = name.partition(",")[0]
     if name in _SHARES:
         return figures.scale_bar(0.0, 1.0, "viridis")
@@ -130,17 +130,22 @@ def true_depths(view: View) -> Tensor | None:
     return None if truth is None or truth.depth is None else truth.depth
 
 
+def true_name(name: str) -> str:
+    """What the truth of a layer is called: that of the picture is the photograph."""
+    return "photograph" if name == "final" else f"{name}, true"
+
+
 def reference_pictures(
     view: View, color: Tensor | None = None, depths: Depths | None = None
 ) -> dict[str, Picture]:
-    """What a view knows of layers, by ``NAME, true`` and ``NAME, measured``: the photograph as ``final``, ground truth,
-    and the polarization that its pictures measure, as 8-bit pictures.
+    """Reference pictures of a view's layers, 8-bit: the ``photograph``, the ground truth of others as ``NAME, true``,
+    and the polarization that its pictures measure as ``NAME, measured``.
 
     Args:
         color, depths: as for ``layer_picture``.
     """
     pictures = {
-        f"{name}, true": picture for name, picture in ground_truth_pictures(view, color, depths).items()
+        true_name(name): picture for name, picture in ground_truth_pictures(view, color, depths).items()
     }
     if view.is_determined:
         stokes = view.stokes()

@@ -1,14 +1,22 @@
-"""Pages and files from the templates in the folders ``page`` of this package: HTML that asks for nothing outside."""
+"""Pages and files from the templates in the folders ``page`` of this package: HTML that asks for nothing outside.
+
+Their pictures are data URIs that fit a limit of size.
+"""
 
 from __future__ import annotations
 
 import base64
 import hashlib
 import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import cv2
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, select_autoescape
+
+from polarguide.visualization.figures import Picture, check_picture
 
 BASE = "polarguide.visualization"
 """Its folder ``page`` has what all pages share: ``base.html`` with the head, and ``chart.svg``."""
@@ -30,7 +38,7 @@ def templates(package: str) -> Environment:
 
 
 def page_part(package: str, name: str) -> str:
-    """A file of the page that a package brings in its folder ``page``, as it is."""
+    """The text of a file in a package's folder ``page``, unchanged."""
     loader = templates(package).loader
     assert loader is not None
     return loader.get_source(templates(package), name)[0]
@@ -66,3 +74,93 @@ def content_policy(script: str = "", *, more: str = "") -> str:
         digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
         allowed = f" script-src 'sha256-{digest}'{more};"
     return f"default-src 'none';{allowed} img-src data:; style-src 'unsafe-inline'; form-action 'none'; base-uri 'none'"
+
+
+LAYERS: dict[str, str] = {
+    "final": "final",
+    "diffuse": "diffuse",
+    "specular": "specular",
+    "normal": "normal",
+    "error": "error of final",
+    "normal_error": "normal error",
+    "metalness": "metalness",
+}
+"""Layers of the report, in order: key and label."""
+LOSSLESS = ("normal",)
+JPEG_QUALITY = 90
+SIDES = (1600, 1200, 800, 600, 400, 300, 200)
+"""Longest sides in pixels to try until a view fits its share of the file."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """One method (or the ground truth) on one view: its layers, and its scores there as a line of text a layer."""
+
+    name: str
+    pictures: Mapping[str, Picture]
+    scores: Mapping[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class EmbeddedView:
+    """One view of a scene with all its tiles as data URIs.
+
+    Attributes:
+        scene, view: names. width, height: of the captured pictures, for the shape of the tiles.
+        tiles: for each its name, its layers as data URIs, and its lines of scores.
+    """
+
+    scene: str
+    view: str
+    width: int
+    height: int
+    tiles: tuple[tuple[str, dict[str, str], dict[str, str]], ...]
+
+
+def embed(scene: str, view: str, tiles: Sequence[Tile], limit: int) -> tuple[EmbeddedView | None, str | None]:
+    """Encode one view, smaller if it has to be.
+
+    Args:
+        scene, view: names.
+        tiles: at least one, of pictures of one size.
+        limit: bytes that the data URIs may take.
+
+    Returns:
+        The view, or None if it does not fit; and a sentence on what was reduced or left out, or None.
+    """
+    height, width = next(iter(tiles[0].pictures.values())).shape[:2]
+    longest = max(height, width)
+    for side in (longest, *(side for side in SIDES if side < longest)):
+        encoded = tuple(
+            (t.name, {key: data_uri(p, key, side) for key, p in t.pictures.items()}, dict(t.scores))
+            for t in tiles
+        )
+        if sum(len(uri) for _, uris, _ in encoded for uri in uris.values()) <= limit:
+            note = f"{scene}, {view}: pictures reduced from {longest} to {side} pixels."
+            return EmbeddedView(scene, view, width, height, encoded), note if side < longest else None
+    return None, f"{scene}, {view}: pictures left out, they would make the file too large."
+
+
+def data_uri(picture: Picture, layer: str, side: int) -> str:
+    """A picture uint8 RGB [H, W, 3] as a data URI, its longer side at most ``side`` pixels."""
+    check_picture(picture, layer)
+    factor = side / max(picture.shape[:2])
+    resized = picture
+    if factor < 1:
+        size = (max(1, round(picture.shape[1] * factor)), max(1, round(picture.shape[0] * factor)))
+        resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(picture.dtype)
+    if layer in LOSSLESS:
+        kind, options = "png", [cv2.IMWRITE_PNG_COMPRESSION, 9]
+    else:
+        kind, options = "jpeg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    encoded, data = cv2.imencode(f".{kind}", resized[..., ::-1], options)
+    if not encoded:
+        raise ValueError(f"{layer}: the picture could not be encoded")
+    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
+
+
+def chosen_views(names: Sequence[str], count: int) -> list[str]:
+    """At most ``count`` of the names, evenly spread, the first among them."""
+    if count >= len(names):
+        return list(names)
+    return [names[index * len(names) // count] for index in range(count)]

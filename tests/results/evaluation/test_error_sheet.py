@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from known_scene import HEIGHT, WIDTH, known_scene, rendered
 
-from polarguide.results.evaluation import error_sheet
-from polarguide.results.evaluation.error_sheet import COLUMNS, ErrorSheet
+from polarguide.results.evaluation import evaluate
+from polarguide.results.evaluation.evaluate import COLUMNS, ErrorSheet
 from polarguide.results.evaluation.target import SceneFacts, ViewTarget
 from polarguide.visualization import figures
 
@@ -24,7 +24,7 @@ def drawn(monkeypatch, tmp_path: Path, scene, *, layers=True):
         seen.update(rows=rows, labels=labels, columns=columns, footer=footer)
         return np.zeros((4, 4, 3), np.uint8)
 
-    monkeypatch.setattr(error_sheet, "contact_sheet", catch)
+    monkeypatch.setattr(evaluate, "contact_sheet", catch)
     facts, sheet = SceneFacts.of(scene), ErrorSheet(len(scene.views))
     for view in scene.views:
         result, stokes, _ = rendered(known_scene().views[0] if view.ground_truth is None else view, 5)
@@ -44,10 +44,10 @@ def test_heat_maps_have_the_colors_of_their_errors(monkeypatch, tmp_path):
     picture = figures.error_to_rgb(result.final, view.photograph())
     valid = ~view.invalid.numpy()
     assert (np.abs(tiles["picture error"].astype(int) - picture)[valid] <= 1).all()
-    assert (tiles["picture error"][~valid] == error_sheet.NOT_COUNTED).all()
+    assert (tiles["picture error"][~valid] == evaluate.NOT_COUNTED).all()
     outside = ~view.ground_truth.mask.numpy()
     for name in ("normal error", "specular error", "diffuse error", "S1, S2 error"):
-        assert (tiles[name][outside] == error_sheet.NOT_COUNTED).all(), name
+        assert (tiles[name][outside] == evaluate.NOT_COUNTED).all(), name
         assert len(np.unique(tiles[name][~outside], axis=0)) > 20, name
     four = view.intensities()
     errors = (stokes[1] - (four[0] - four[2])).abs() + (stokes[2] - (four[1] - four[3])).abs()
@@ -79,7 +79,7 @@ def test_a_key_to_its_colors_stands_below_every_column(monkeypatch, tmp_path):
     seen = drawn(monkeypatch, tmp_path, known_scene())
     keys = dict(zip(seen["columns"], seen["footer"], strict=True))
     assert len(keys) == len(COLUMNS)
-    assert (keys["photograph"][:22] == error_sheet.NOT_COUNTED).all()
+    assert (keys["photograph"][:22] == evaluate.NOT_COUNTED).all()
     for name in ("AoLP x DoLP / 0.5", "predicted"):
         assert np.array_equal(keys[name], figures.angle_wheel())
     for name in ("picture error", "normal error", "specular error", "diffuse error", "S1, S2 error"):

@@ -14,7 +14,7 @@ from skimage.color import rgb2lab, rgb2xyz, xyz2lab
 from torch import nn
 
 from polarguide.optics.color import shown
-from polarguide.results.evaluation import perceptual, vgg
+from polarguide.results.evaluation import perceptual
 from polarguide.results.evaluation.perceptual import PIXELS_PER_DEGREE, flip, load_package
 
 
@@ -42,13 +42,13 @@ def network():
 @pytest.fixture
 def weights(network, monkeypatch, tmp_path):
     """A folder that is torch's cache; with the network's weights. Nothing may be downloaded."""
-    monkeypatch.delenv(vgg.FOLDER, raising=False)
+    monkeypatch.delenv(perceptual.FOLDER, raising=False)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(torch.hub, "download_url_to_file", None)
     folder = tmp_path / "checkpoints"
     folder.mkdir()
     state = {f"features.{name}": values for name, values in network.state_dict().items()}
-    torch.save(state | {"classifier.0.weight": torch.zeros(2)}, folder / vgg.NETWORK)
+    torch.save(state | {"classifier.0.weight": torch.zeros(2)}, folder / perceptual.NETWORK)
     return folder
 
 
@@ -70,7 +70,7 @@ def test_distance(weights):
     far, _ = perceptual.lpips(picture(2), true)
     assert perceptual.lpips(true, true) == (0.0, None)
     assert 0 < near < far
-    assert vgg.load_lpips()[0] is vgg.load_lpips()[0]
+    assert perceptual.load_lpips()[0] is perceptual.load_lpips()[0]
 
 
 def test_left_out_pixels_have_no_influence(weights):
@@ -87,15 +87,18 @@ def test_weights_from_a_folder(weights, monkeypatch, tmp_path):
     expected = perceptual.lpips(picture(1), picture(2))
     folder = tmp_path / "elsewhere"
     folder.mkdir()
-    shutil.move(weights / vgg.NETWORK, folder)
-    monkeypatch.setenv(vgg.FOLDER, str(folder))
-    assert f"{vgg.CHANNELS} are not in {folder} ({vgg.FOLDER}" in perceptual.lpips(picture(1), picture(2))[1]
-    shutil.copy(Path(reference.__file__).parent / "lpips_models" / vgg.CHANNELS, folder)
+    shutil.move(weights / perceptual.NETWORK, folder)
+    monkeypatch.setenv(perceptual.FOLDER, str(folder))
+    assert (
+        f"{perceptual.CHANNELS} are not in {folder} ({perceptual.FOLDER}"
+        in perceptual.lpips(picture(1), picture(2))[1]
+    )
+    shutil.copy(Path(reference.__file__).parent / "lpips_models" / perceptual.CHANNELS, folder)
     assert perceptual.lpips(picture(1), picture(2)) == expected
 
 
 def test_without_weights_there_is_a_reason_and_nothing_is_downloaded(weights, monkeypatch):
-    file = weights / vgg.NETWORK
+    file = weights / perceptual.NETWORK
     file.write_bytes(file.read_bytes()[:1000])
     value, reason = perceptual.lpips(picture(1), picture(2))
     assert value is None
@@ -103,9 +106,9 @@ def test_without_weights_there_is_a_reason_and_nothing_is_downloaded(weights, mo
     file.unlink()
     value, reason = perceptual.lpips(picture(1), picture(2))
     assert value is None
-    assert f"{vgg.NETWORK} are not in {weights} (fetch it: {vgg.FETCH_COMMAND})" in reason
+    assert f"{perceptual.NETWORK} are not in {weights} (fetch it: {perceptual.FETCH_COMMAND})" in reason
     file.touch()
-    monkeypatch.setattr(vgg, "find_spec", lambda name: None)
+    monkeypatch.setattr(perceptual, "find_spec", lambda name: None)
     assert reason != (reason := perceptual.lpips(picture(1), picture(2))[1])
     assert reason.endswith("(the extra lpips brings it)")
 

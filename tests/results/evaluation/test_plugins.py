@@ -14,7 +14,7 @@ import tomllib
 from plugins import install
 
 from polarguide.core.errors import PolarguideWarning
-from polarguide.results.evaluation.plugins import GROUP, plugged_metrics
+from polarguide.results.evaluation.metric import GROUP, plugged_metrics
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "how-to" / "write-a-plugin.md"
 

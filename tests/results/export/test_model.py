@@ -5,6 +5,7 @@ import math
 import struct
 import subprocess
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,15 +27,16 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.optics.color import srgb_decode_array
 from polarguide.results.export.model import build
-from polarguide.results.export.model.build import require_room, textured_model
+from polarguide.results.export.model.build import charted_subject, require_room, textured_model
 from polarguide.results.export.model.gltf import Textured, color_pixels, write_glb
-from polarguide.results.export.model.irradiance import Surroundings, irradiance
+from polarguide.results.export.model.irradiance import Surroundings, arriving_light, irradiance
 from polarguide.results.export.model.obj import write_obj
 from polarguide.results.export.model.texels import texels_of
 from polarguide.results.export.model.topology import Topology, cleaned, topology
 from polarguide.results.export.model.unwrap import Unwrapped, unwrap
 from polarguide.results.export.placement import IN_PLACE
 from polarguide.results.rendering.mesh import ColoredMesh, Surface
+from polarguide.results.rendering.relight import mirrored_light
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.result import RenderResult
 
@@ -162,11 +164,24 @@ def wall_and_floor(wall: float) -> ColoredMesh:
 def test_irradiance_beside_a_wall(wall: float, share: float) -> None:
     """Half of the light of an even sky, and what the wall gives back; of it all, a dielectric of index 1.5 lets pass
     all but 9.2 % (Walsh's integral of Fresnel's reflectance)."""
-    places = np.array([[0.5, y, 0.0] for y in np.linspace(-1, 1, 40)])
+    places = np.array([[0.05, y, 0.0] for y in np.linspace(-1, 1, 40)])
     normals = np.tile([0.0, 0.0, 1.0], (40, 1))
     around = Surroundings(lambda directions: np.full_like(directions, 2.0), wall_and_floor(2 * wall))
-    light = irradiance(places, normals, around, 1.5, lambda *_, **__: None)
+    light = irradiance(arriving_light(places, normals, around, lambda *_, **__: None), normals, 1.5)
     assert light.mean() == pytest.approx(2 * share * 0.908, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("normal", "share"), [((0.0, 0.0, 1.0), 1.0), ((1.0, 0.0, 0.0), 0.5), ((0.0, 0.0, -1.0), 0.0)]
+)
+def test_irradiance_is_that_of_the_normal_asked_for(normal: tuple[float, float, float], share: float) -> None:
+    """Over a black floor under an even sky: all of its light for what looks up, half of it for what looks aside."""
+    both = wall_and_floor(0.0)
+    floor = ColoredMesh(replace(both.surface, faces=both.surface.faces[:2]), both.colors)
+    sky = Surroundings(lambda directions: np.full_like(directions, 2.0), floor)
+    light = arriving_light(np.zeros((40, 3)), np.tile([0.0, 0.0, 1.0], (40, 1)), sky, lambda *_, **__: None)
+    found = irradiance(light, np.tile(normal, (40, 1)), 1.5)
+    assert found.mean() == pytest.approx(2 * share * 0.908, abs=0.04)
 
 
 def glb_tree(path: Path) -> dict[str, Any]:
@@ -207,8 +222,8 @@ def albedo(points: np.ndarray) -> np.ndarray:
     return 0.5 + 0.3 * points * np.array([1.0, -1.0, 0.5])
 
 
-def ball_view(camera: Camera) -> RenderResult:
-    """The unit sphere under an even light of radiance 1: index 1.5, roughness 0.3, strength 0.5."""
+def ball_view(camera: Camera, mirrored: float = 1.0) -> RenderResult:
+    """The unit sphere under an even light of radiance 1: index 1.5, roughness 0.3, strength 0.5. It mirrors another."""
     rays = camera.world_rays(dtype=torch.float64)
     center = camera.center
     along = rays @ center
@@ -220,8 +235,9 @@ def ball_view(camera: Camera) -> RenderResult:
     diffuse = torch.from_numpy(albedo(points.numpy())) * 0.96 * 0.908 * hit[..., None]
     picture, alpha = diffuse.float(), hit.float()
     normal = torch.where(hit[..., None], points, 0.0).float()
-    result = RenderResult(picture + 0.2 * alpha[..., None], picture, picture, picture, None, 0.5 * alpha, normal, depth,
-                          alpha, Tensor())  # fmt: skip
+    specular = 0.2 * alpha[..., None].expand_as(picture)
+    result = RenderResult(picture + specular, specular, picture, picture, 5 * mirrored * specular, 0.5 * alpha, normal,
+                          depth, alpha, Tensor())  # fmt: skip
     return replace(result, roughness=0.3 * alpha)
 
 
@@ -234,7 +250,8 @@ def ball_run(light: float = 1.0) -> Any:
     texels = torch.full((6, 4, 4, 3), math.log(light))
     return SimpleNamespace(
         model=model, gaussian_model=lambda _: model, light={"texels": texels}, cameras=CAMERAS,
-        camera_frame=frame, frame=frame, result=ball_view, scene=SimpleNamespace(train_views=views),
+        camera_frame=frame, frame=frame, result=partial(ball_view, mirrored=light),
+        scene=SimpleNamespace(train_views=views),
     )  # fmt: skip
 
 
@@ -243,7 +260,9 @@ def model_of(
 ) -> Textured:
     folder.mkdir(exist_ok=True)
     chosen = ModelOptions(triangles=3000, texture=512, **options)
-    return textured_model(ball_run(light), ball_view, presentation, IN_PLACE, chosen, 64, folder, SILENT)
+    run = ball_run(light)
+    subject = charted_subject(run, ball_view, presentation, chosen, 64, folder, SILENT)
+    return textured_model(run, subject, presentation, IN_PLACE, chosen, SILENT)
 
 
 @pytest.mark.parametrize(
@@ -300,6 +319,20 @@ def test_nothing_is_whiter_than_surfaces_are(tmp_path: Path) -> None:
     middle = (right > 60) & (bright < 250)
     ratio = (linear[1] / linear[0].clip(0.01))[middle]
     assert np.quantile(ratio, 0.75) < 1.02 * np.quantile(ratio, 0.25)
+
+
+def test_light_that_gaussians_add_is_folded_in() -> None:
+    """The learned light is 0.2 everywhere, and what the sphere mirrors is 3; where it mirrors nothing, 0.2 stays."""
+    run = ball_run(3.0)
+    cubemap = run.model.shading.radiance_cubemap
+    run.light["texels"] = torch.full((6, 4, 4, 3), math.log(0.2))
+    found = [cubemap.radiance(mirrored_light(run, cubemap, lambda *_: None))]
+    run.result = lambda camera: replace(
+        ball_view(camera), specular=torch.zeros(camera.height, camera.width, 3)
+    )
+    found.append(cubemap.radiance(mirrored_light(run, cubemap, lambda *_: None)))
+    for values, expected in zip(found, (3.0, 0.2), strict=True):
+        np.testing.assert_allclose(values, expected, rtol=5e-3)
 
 
 def test_an_obj_holds_the_same(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.ply import read_ply
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.optics.color import srgb_decode_array, srgb_encode_array
+from polarguide.results.export.model import build
 from polarguide.results.export.model.gltf import Textured
 from polarguide.results.export.model.subject import subject_of
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
@@ -155,9 +157,12 @@ def test_an_stl_is_closed_in_millimeters_and_upright(credited: Path, tmp_path: P
     assert not head.startswith(b"solid")
 
 
-def test_a_package_tells_of_itself(credited: Path, tmp_path: Path) -> None:
+def test_a_package_tells_of_itself(credited: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "out"
+    once = Mock(wraps=build.unwrap)  # its two models share their charts
+    monkeypatch.setattr(build, "unwrap", once)
     exported(credited, out, "all")
+    once.assert_called_once()
     record = json.loads((out / "model.json").read_text())
     assert {*record["files"], "model.json"} == {path.name for path in out.iterdir()}
     assert {"model.glb", "model-unlit.glb", "splats-srgb.glb", "environment.hdr", "preview.png"} <= {

@@ -64,9 +64,9 @@ def test_the_sheet_has_both_names_a_scale_each_and_no_empty_column(
     monkeypatch.setattr(pictures, "contact_sheet", contact_sheet)
     run.write_pictures(tmp_path, views="v000", layers=["final", "metalness", "depth", "dolp", "aolp"])
     ((columns, footer, caption),) = drawn
-    assert columns[:2] == ["final", "final, true"]
+    assert columns[:2] == ["final", "photograph"]
     assert columns[-6:] == ["depth", "depth, true", "dolp", "dolp, measured", "aolp", "aolp, measured"]
-    assert [cell is None for cell in footer] == [name.startswith("final") for name in columns]
+    assert [cell is None for cell in footer] == [name in ("final", "photograph") for name in columns]
     assert "metalness" not in columns
     assert caption.endswith("left out, the same everywhere: metalness")
 

@@ -383,7 +383,7 @@ def test_what_exists_is_not_overwritten(tmp_path: Path) -> None:
         calibrate_sensor, tmp_path / "shots", tmp_path / "mine.json", CalibrateSettings("IMX250MZR")
     )
     assert (tmp_path / "mine.png").read_bytes() == b"a photograph"
-    Fault(found="one among the shots").raised_by(
+    Fault(found="the folder of the shots").raised_by(
         calibrate_sensor,
         tmp_path / "shots",
         tmp_path / "shots" / "new.safetensors",

@@ -27,7 +27,7 @@ _PLACE = 3  # x, y and the number of a point; pycolmap checks all of them, lines
 
 @dataclass(frozen=True)
 class TextImages:
-    """What pycolmap may read in place of an ``images.txt``.
+    """A text model that pycolmap can read in place of an ``images.txt``.
 
     Attributes:
         data: the same file with names that have no blanks.
@@ -136,10 +136,10 @@ class ColmapModel:
             if view in columns
             for image in images
         }
-        seen = torch.zeros(len(self._tracks), len(views), dtype=torch.bool)
+        observed = torch.zeros(len(self._tracks), len(views), dtype=torch.bool)
         for row, track in enumerate(self._tracks):
-            seen[row, [by_id[number] for number in track if number in by_id]] = True
-        return seen
+            observed[row, [by_id[number] for number in track if number in by_id]] = True
+        return observed
 
 
 def read_model(root: Path) -> ColmapModel:

@@ -91,9 +91,9 @@ class Undistortion:
         rows, columns = np.mgrid[: self.target.height, : self.target.width]
         places = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1)  # COLMAP's pixel centers
         rays = self.target.cam_from_img(places)
-        seen = self.source.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
-        seen = np.nan_to_num(seen, nan=-10.0).reshape(*rows.shape, 2).astype(np.float32) - np.float32(0.5)
-        return np.ascontiguousarray(seen[..., 0]), np.ascontiguousarray(seen[..., 1])
+        pixels = self.source.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+        pixels = np.nan_to_num(pixels, nan=-10.0).reshape(*rows.shape, 2).astype(np.float32) - np.float32(0.5)
+        return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
 
 
 def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:

@@ -192,11 +192,11 @@ def run_step(
             thread.join(_POLL_SECONDS)
             advance(done())
     if "error" in outcome:
-        said = str(outcome["error"]).strip().splitlines() or [type(outcome["error"]).__name__]
+        message = str(outcome["error"]).strip().splitlines() or [type(outcome["error"]).__name__]
         raise PolarguideError(
             label,
             expected="COLMAP to succeed",
-            found=said[0].rstrip("."),
+            found=message[0].rstrip("."),
             remedy="Repeat the command, or bring a model with --poses PATH.",
         ) from outcome["error"]
     return outcome["value"]
@@ -314,8 +314,8 @@ def tone_mapped(intensities: NDArray[np.float32], pictures: str = "photograph") 
     """
     photograph = intensities.min(axis=0) if pictures == "minimum" else intensities.mean(axis=0)
     white = max(float(np.percentile(photograph, 99.0)), 1e-4)
-    shown = srgb_encode_array(np.clip(photograph / white, 0.0, 1.0))
-    return np.rint(255.0 * shown).astype(np.uint8)
+    encoded = srgb_encode_array(np.clip(photograph / white, 0.0, 1.0))
+    return np.rint(255.0 * encoded).astype(np.uint8)
 
 
 def reconstruct(
@@ -388,13 +388,13 @@ def reconstruct(
     make_folder(chosen)
     best.write_binary(str(chosen))
     chosen.rename(model)
-    said = f"{registered} of {len(sizes)} views registered"
+    share = f"{registered} of {len(sizes)} views registered"
     reporter.say(
-        f"{said}, {best.num_points3D()} points, mean reprojection error "
+        f"{share}, {best.num_points3D()} points, mean reprojection error "
         f"{best.compute_mean_reprojection_error():.2f} pixels; {len(models)} model(s) found."
     )
     if registered < _FEW_SHARE * len(sizes):
-        reporter.warn(f"Only {said}. {ADVICE} {untried}")
+        reporter.warn(f"Only {share}. {ADVICE} {untried}")
     return model
 
 

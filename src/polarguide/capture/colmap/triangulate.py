@@ -96,25 +96,25 @@ def _seen_by_most(
     masks: Mapping[str, NDArray[np.bool_]],
 ) -> NDArray[np.bool_]:
     """Which points [N, 3] enough cameras see, inside their masks: [N]."""
-    seen, inside = np.zeros(len(places)), np.zeros(len(places))
+    counts, inside = np.zeros(len(places)), np.zeros(len(places))
     for view, camera in cameras.items():
         local = places @ camera.rotation.T + camera.translation
         before = local[:, 2] > 1e-6
         where = np.full((len(places), 2), -1.0)
         where[before] = np.nan_to_num(np.asarray(pixels[view].img_from_cam(local[before])), nan=-1.0)
         hit = before & (where >= 0).all(axis=1) & (where < [camera.width, camera.height]).all(axis=1)
-        seen += hit
+        counts += hit
         if view in masks:
             column, row = where[hit].astype(int).T
             inside[hit] += masks[view][row, column]
-    enough = seen >= max(1.0, _SHARE_OF_VIEWS * len(cameras))
-    return np.asarray(enough & (inside >= _SHARE_IN_MASKS * seen)) if masks else np.asarray(enough)
+    enough = counts >= max(1.0, _SHARE_OF_VIEWS * len(cameras))
+    return np.asarray(enough & (inside >= _SHARE_IN_MASKS * counts)) if masks else np.asarray(enough)
 
 
 FEWEST = 200
 """With fewer triangulated points than this, points are sampled in the visual hull instead."""
 SAMPLES = 20_000
-FOUND = "points.json"
+NOTE_FILE = "points.json"
 
 
 def add_points(
@@ -146,7 +146,7 @@ def add_points(
     Raises:
         PolarguideError: the cameras have no common field of view, or a file cannot be written.
     """
-    model, note = folder / "model", folder / FOUND
+    model, note = folder / "model", folder / NOTE_FILE
     if model.is_dir() and note.exists():
         return model, read_record(note, dict[str, Any])
     start, trial = folder / "start", folder / "triangulated"
@@ -247,7 +247,7 @@ def _colors(
     folder: Path, cameras: Mapping[str, PosedCamera], places: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
     """Mean color of the photographs at the projections of points [N, 3], [N, 3] RGB."""
-    total, seen = np.zeros((len(places), 3)), np.zeros(len(places))
+    total, counts = np.zeros((len(places), 3)), np.zeros(len(places))
     views = sorted(cameras)
     for view in views[:: max(1, len(views) // 8)]:
         path = folder / "images" / f"{view}.png"
@@ -263,6 +263,6 @@ def _colors(
         column, row = pixel[inside].astype(int).T
         small = cv2.blur(picture, (3, 3))
         total[inside] += small[row, column]
-        seen[inside] += 1
-    gray = np.where(seen[:, None] > 0, total / np.maximum(seen, 1)[:, None], 128)
+        counts[inside] += 1
+    gray = np.where(counts[:, None] > 0, total / np.maximum(counts, 1)[:, None], 128)
     return np.rint(gray).astype(np.uint8)

@@ -399,5 +399,5 @@ def distorted_camera(
 def missing_entry(path: Path, key: str, found: Mapping[str, object]) -> PolarguideError:
     """The error that a file lacks an entry."""
     names = sorted(found)
-    shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-    return not_as_published(path, f"the entry {key}", shown or "no entry")
+    listing = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+    return not_as_published(path, f"the entry {key}", listing or "no entry")

@@ -134,8 +134,8 @@ def _opened(path: Path, opener: Callable[[io.BytesIO], Any] | None = None) -> It
 
 def _words(error: Exception) -> str:
     """LibRaw's error message, which may be bytes, as one line."""
-    said = error.args[0] if error.args else ""
-    text = said.decode(errors="replace") if isinstance(said, bytes) else str(said)
+    reason = error.args[0] if error.args else ""
+    text = reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)
     return (text.strip().splitlines() or [type(error).__name__])[0]
 
 
@@ -245,7 +245,7 @@ _TIME, _F_NUMBER, _ISO = 33434, 33437, 34855
 
 
 @dataclass(frozen=True)
-class Taken:
+class ExposureData:
     """How a photograph was taken, as its file says.
 
     Attributes:
@@ -258,31 +258,31 @@ class Taken:
     light: float | None
 
 
-def read_taken(path: Path) -> Taken:
-    """What a file says about its exposure: EXIF of pictures and of camera raw that is built like TIFF; else LibRaw.
+def read_exposure_data(path: Path) -> ExposureData:
+    """Exposure data of a file: EXIF of pictures and of camera raw that is built like TIFF; else LibRaw.
 
     Raises:
         PolarguideError: the file cannot be read, or LibRaw is needed and missing.
     """
     raw = is_camera_raw(path)
     data = read_file(path) if raw else read_picture(path)
-    found = taken(data)
+    found = exif_data(data)
     if not raw or found.light is not None or data[:4] in TIFF:
         return found
     libraw = optional_import("rawpy", str(path))
     # LibRaw's errors: whoever develops the file says what is wrong with it.
     with contextlib.suppress(Exception), libraw.imread(io.BytesIO(data)) as opened:
         other = opened.other  # which some versions of rawpy do not have
-        return Taken("", _light(other.shutter, other.iso_speed, other.aperture))
+        return ExposureData("", _light(other.shutter, other.iso_speed, other.aperture))
     return found
 
 
-def taken(data: bytes) -> Taken:
-    """What the EXIF tags of a picture file say; damaged ones say nothing."""
+def exif_data(data: bytes) -> ExposureData:
+    """Exposure data in the EXIF tags of a picture file; damaged tags count as missing."""
     tags = tags_of(data)
     names = (str(tags.get(tag, "")).partition("\0")[0].strip() for tag in (_MAKER, _MODEL))
     light = _light(*(_number(tags.get(tag)) for tag in (_TIME, _ISO, _F_NUMBER)))
-    return Taken(" ".join(filter(None, names)), light)
+    return ExposureData(" ".join(filter(None, names)), light)
 
 
 def _light(seconds: float | None, iso: float | None, f_number: float | None) -> float | None:
@@ -345,7 +345,7 @@ def _profile(data: bytes) -> bytes | None:
 
 
 def _decoded_middle(profile: bytes) -> float | None:
-    """What the red or gray curve of a profile makes of half scale (ICC.1, curveType and parametricCurveType)."""
+    """Value of a profile's red or gray curve at half scale (ICC.1, curveType and parametricCurveType)."""
     (count,) = struct.unpack_from(">I", profile, 128)
     entries = [struct.unpack_from(">4sII", profile, 132 + 12 * number) for number in range(min(count, 100))]
     at = next((at for name, at, _ in entries if name in _CURVES), None)

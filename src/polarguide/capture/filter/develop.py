@@ -214,13 +214,13 @@ def linear_intensities(pictures: NDArray[Any], transfer: str) -> NDArray[np.floa
 
 
 def rounding_of_bytes(transfer: str, smallest: float) -> Rounding:
-    """What codes of 8-bit pictures are rounded to: by their steps, which grow with sRGB's.
+    """Rounding of the codes of 8-bit pictures, by their steps, which grow with sRGB's.
 
     Args:
         transfer: "linear" or "srgb". smallest: factor of the linear intensities.
     """
-    shown = np.arange(256) / 255
-    return rounding_of(FULL_CODE * smallest * (srgb_decode_array(shown) if transfer == "srgb" else shown))
+    levels = np.arange(256) / 255
+    return rounding_of(FULL_CODE * smallest * (srgb_decode_array(levels) if transfer == "srgb" else levels))
 
 
 LOSSY, PLAIN, CAMERA_RAW = "JPEG, WebP or HEIC", "PNG, TIFF or BMP", "camera raw"
@@ -273,14 +273,14 @@ def decide_transfer(shots: Sequence[Shots], *, lossy: bool) -> TransferDecision:
     """
     slope = _slope(shots, "linear")
     found = checks.encoding(slope)
-    said = "too few pixels are polarized to tell"
+    evidence = "too few pixels are polarized to tell"
     if slope is not None:
-        said = f"the curvature of the response is {slope:+.2f}; linear files have 0, sRGB about -0.6"
+        evidence = f"the curvature of the response is {slope:+.2f}; linear files have 0, sRGB about -0.6"
     if found is not None:
-        return TransferDecision(found, f"{found}: {said}", _doubt(shots, found))
+        return TransferDecision(found, f"{found}: {evidence}", _doubt(shots, found))
     fallback = "srgb" if lossy else "linear"
     kind = "JPEG, WebP and HEIC files" if lossy else "PNG, TIFF and BMP files"
-    reason = f"{fallback}, as {kind} usually are: {said} (--transfer sets it)"
+    reason = f"{fallback}, as {kind} usually are: {evidence} (--transfer sets it)"
     return TransferDecision(fallback, reason, _doubt(shots, fallback))
 
 
@@ -295,7 +295,7 @@ def _slope(shots: Sequence[Shots], transfer: str) -> float | None:
 
 
 def _doubt(shots: Sequence[Shots], transfer: str) -> str:
-    """What to say where the chosen transfer leaves the response bent, as a camera's own tone curve does."""
+    """The warning where the chosen transfer leaves the response curved, as a camera's own tone curve does."""
     left = _slope(shots, transfer)
     if left is None or checks.ENCODED[0] <= left <= checks.DECODED[0]:
         return ""

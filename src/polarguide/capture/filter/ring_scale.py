@@ -66,7 +66,7 @@ def _mark(step: int, middle: float, inner: float) -> list[str]:
 
 
 def _top(middle: float, inner: float) -> list[str]:
-    """What belongs above: an arrow, and a slit to open the ring by below."""
+    """Marks at the top, an arrow, and at the bottom, a slit to open the ring."""
     y = middle - inner - BAND + 1.0
     (x1, y1), (x2, y2) = (place(_SLIT, middle, radius) for radius in (inner, inner + BAND))
     return [
@@ -83,14 +83,14 @@ def _foot(middle: float, width: float, diameter: float) -> list[str]:
         f'<line x1="{left + x:.3f}" y1="{y - 1.5:.3f}" x2="{left + x:.3f}" y2="{y + 1.5:.3f}" {_INK}/>'
         for x in (0.0, RULER)
     ]
-    said = (
+    text_lines = (
         f"{RULER:g} mm: print at 100 %. Hole {diameter:g} mm.",
         "Fix it to the lens behind the filter's ring, arrow up. Read it",
         "from the front, at a mark on the ring where its axis ends.",
     )
     lines = [
         f'<text x="{middle:.3f}" y="{y + 5 + 4 * k:.3f}" font-size="2.8" text-anchor="middle">{text}</text>'
-        for k, text in enumerate(said)
+        for k, text in enumerate(text_lines)
     ]
     return [
         f'<line x1="{left:.3f}" y1="{y:.3f}" x2="{left + RULER:.3f}" y2="{y:.3f}" {_INK}/>',

@@ -96,7 +96,7 @@ def find_shots(root: Path, *, nested: bool = False) -> dict[str, dict[int, Path]
 
 
 def list_shots(root: Path, *, nested: bool = False) -> tuple[Candidates, list[Path]]:
-    """What ``find_shots`` finds, with every file of a view and angle where there are several, and the other pictures.
+    """The shots of ``find_shots``, with every file of a view and angle where there are several, and the other pictures.
 
     Raises:
         PolarguideError: a folder of an angle is missing, or there are two.
@@ -330,7 +330,7 @@ def find_single_shots(root: Path, angles: str | None = None) -> tuple[list[Singl
         raise PolarguideError(
             root,
             expected="an angle in the name of every photograph",
-            found=f"{len(without)} of {len(files)} without one ({listed(without)})",
+            found=f"{len(without)} of {len(files)} without an angle in their names ({listed(without)})",
             remedy=NAMING,
         )
     shots = [SingleShot(path, *found) for path, found in named.items() if found is not None]
@@ -415,7 +415,7 @@ def _checked(root: Path, shots: list[SingleShot]) -> list[SingleShot]:
     Raises:
         PolarguideError: a name is no file's, or two photographs of a view have one angle.
     """
-    seen: dict[tuple[str, object], Path] = {}
+    first: dict[tuple[str, object], Path] = {}
     for shot in shots:
         if (
             any(sign in shot.view for sign in "/\\")
@@ -424,17 +424,17 @@ def _checked(root: Path, shots: list[SingleShot]) -> list[SingleShot]:
         ):
             raise PolarguideError(
                 root / TABLE,
-                expected="names of views that files may have",
+                expected="a view name that can be a file name",
                 found=repr(shot.view),
                 remedy="Rename the view.",
             )
         if shot.angle == "unknown":
             continue
         key = (shot.view, shot.angle)  # half a turn apart, two pictures are as good as one taken twice
-        if key in seen:
+        if key in first:
             at = "without a filter" if shot.angle == "none" else f"at {angle_text(shot.angle)} degrees"
-            raise ambiguous(root, f"one photograph of {shot.view} {at}", seen[key], shot.path)
-        seen[key] = shot.path
+            raise ambiguous(root, f"one photograph of {shot.view} {at}", first[key], shot.path)
+        first[key] = shot.path
 
     def order(shot: SingleShot) -> tuple[str, bool, float, str]:
         word = isinstance(shot.angle, str)

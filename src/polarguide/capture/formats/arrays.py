@@ -57,7 +57,7 @@ def read_array(path: Path) -> NDArray[Any]:
     try:
         return _array(data)
     except BROKEN as error:
-        found = "an empty file" if not data else f"{len(data)} bytes that are none"
+        found = "an empty file" if not data else f"{len(data)} bytes of another kind"
         raise damaged(path, "a complete .npy file of numbers", found) from error
 
 
@@ -193,7 +193,7 @@ def read_radiance(path: Path) -> NDArray[np.float32]:
 
 def _read_hdr(path: Path) -> NDArray[Any]:
     data = read_file(path)
-    found = "an empty file" if not data else "a file that is none"
+    found = "an empty file" if not data else "a file of another kind"
     if (size := hdr_size(data)) is not None:
         found = f"one that is damaged or cut short (it ends after {len(data)} bytes)"
         # Run lengths reach 127 pixels with two bytes a channel: fewer bytes than this cannot be complete.

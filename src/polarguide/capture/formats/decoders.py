@@ -30,7 +30,7 @@ _ANIMATED = 2
 
 @dataclass(frozen=True)
 class PlainHead:
-    """What the header of an uncompressed file says.
+    """The header of an uncompressed file.
 
     Attributes:
         size: width and height. channels: samples of a pixel. full: value of full scale.
@@ -129,7 +129,7 @@ def webp_size(data: bytes) -> tuple[int, int] | None:
 
 
 def plain_damage(data: bytes) -> str | None:
-    """What is wrong with a BMP, PGM, PPM or WebP file as far as its structure tells, or None."""
+    """The damage that the structure of a BMP, PGM, PPM or WebP file shows, in words, or None."""
     if is_webp(data):
         if webp_size(data) is None:
             return "a WebP file without a size, or an animated one"
@@ -159,7 +159,7 @@ _HIGH_RANGE = {16: "PQ", 18: "HLG"}
 
 @dataclass(frozen=True)
 class HeifHead:
-    """What the header of a HEIC file says of its picture.
+    """The header of a HEIC file.
 
     Attributes:
         size: width and height as stored, before it is turned. turns: quarter turns counter-clockwise for display.
@@ -235,7 +235,7 @@ def _associated(data: bytes, start: int, item: int) -> list[int]:
 
 
 def heif_damage(data: bytes) -> str | None:
-    """What is wrong with a HEIC or AVIF file as far as its structure tells, or None."""
+    """The damage that the structure of a HEIC or AVIF file shows, in words, or None."""
     if data[8:12] in _AVIF:
         return "an AVIF file"
     if max((end for _, _, end in _boxes(data, 0, len(data))), default=0) > len(data):

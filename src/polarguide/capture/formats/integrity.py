@@ -50,7 +50,7 @@ def damaged(path: Path, expected: str, found: str) -> PolarguideError:
 
 
 def find_damage(data: bytes) -> str | None:
-    """What is wrong with a picture file as far as its structure tells, or None.
+    """The damage that the structure of a picture file shows, in words, or None.
 
     Args:
         data: the whole file.
@@ -74,7 +74,7 @@ def find_damage(data: bytes) -> str | None:
         return plain_damage(data)
     if is_heif(data):
         return heif_damage(data)
-    return "a file that is none of these"
+    return "a file of another kind"
 
 
 def declared_size(data: bytes) -> tuple[int, int] | None:

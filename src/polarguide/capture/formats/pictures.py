@@ -213,10 +213,10 @@ def linear_codes(pixels: NDArray[Any], transfer: str) -> NDArray[np.uint16]:
 @functools.cache
 def _table(full: int, transfer: str) -> NDArray[np.uint16]:
     """Linear code of every stored value in 0..full."""
-    shown = np.arange(full + 1) / full
+    levels = np.arange(full + 1) / full
     if transfer == "srgb":
-        shown = srgb_decode_array(shown)
-    return np.rint(shown * FULL_CODE).astype(np.uint16)
+        levels = srgb_decode_array(levels)
+    return np.rint(levels * FULL_CODE).astype(np.uint16)
 
 
 def rescaled(pixels: NDArray[Any], full: int) -> NDArray[Any]:
@@ -258,8 +258,8 @@ def _decoded(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
                 path,
                 expected="one ordinary gray or RGB picture in a TIFF file",
                 found=str(error),
-                remedy="Export it as such. Of four angles in one file, save each as a shot of its own, such as "
-                f"{path.stem}_0.tif and {path.stem}_45.tif; or give the raw mosaic.",
+                remedy="Export one gray or RGB picture. Of four angles in one file, save each as a file of its own, "
+                f"such as {path.stem}_0.tif and {path.stem}_45.tif; or give the raw mosaic.",
             ) from None
         except Exception:  # tifffile and its codecs raise what they please for damaged files
             pixels = None
@@ -286,7 +286,7 @@ def _decoded(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
 
 
 def _unreadable(path: Path, found: str) -> PolarguideError:
-    """The error that a file is none that is read; ``found``: a noun phrase."""
+    """The error for a file of an unsupported kind; ``found``: a noun phrase."""
     if "HEIC" in found or "AVIF" in found:
         return PolarguideError(
             path,

@@ -161,8 +161,8 @@ def _damaged(path: Path, found: str) -> PolarguideError:
 
 
 def _checksum(metadata: _Metadata, vectors: NDArray[Any]) -> str:
-    said = {key: value for key, value in msgspec.to_builtins(metadata).items() if key != "sha256"}
-    digest = hashlib.sha256(json.dumps(said, ensure_ascii=False, sort_keys=True).encode())
+    fields = {key: value for key, value in msgspec.to_builtins(metadata).items() if key != "sha256"}
+    digest = hashlib.sha256(json.dumps(fields, ensure_ascii=False, sort_keys=True).encode())
     digest.update(f"{vectors.dtype.str} {vectors.shape}".encode())
     digest.update(np.ascontiguousarray(vectors).tobytes())
     return digest.hexdigest()

@@ -72,7 +72,7 @@ CALIBRATED_IMBALANCE = 0.01
 
 
 def imbalance_notes(ratio: float | None) -> list[str]:
-    """What to tell the user of the ratio of the pair sums that a calibration leaves."""
+    """Notes for the user on the ratio of the pair sums after calibration."""
     notes = [] if ratio is None else [f"With the calibration, I0 + I90 is {ratio - 1:+.2%} off I45 + I135."]
     if ratio is not None and abs(ratio - 1) > CALIBRATED_IMBALANCE:
         notes.append("That is more than a calibration of this camera leaves: is it one of another?")
@@ -95,7 +95,7 @@ class AnalyzerCalibration:
 
     Attributes:
         sensor: its name, a key of ``SENSORS``.
-        lens: what the user calls the lens; "" where nothing was said.
+        lens: the user's name of the lens; "" without one.
         offset: column and row of the sensor at which the region starts. size: width and height of the region.
         block: side in pixels of the blocks that share vectors; the pattern's period where each pixel has its own.
         vectors: [rows, columns, P, P, 3] float32 for a pattern of the period P: the vector of a pixel in column x and
@@ -138,7 +138,7 @@ class AnalyzerCalibration:
             raise PolarguideError(
                 where,
                 expected=f"a calibration of the sensor {sensor}",
-                found=f"one of {self.sensor}",
+                found=f"the calibration of {self.sensor}",
                 remedy="Give the calibration of this camera, or the --sensor that it was made with.",
             )
 
@@ -158,13 +158,13 @@ class AnalyzerCalibration:
         if not inside:
             raise PolarguideError(
                 where,
-                expected=f"a calibration of {_region(offset, size)}, or more",
-                found=f"one of {_region(self.offset, self.size)}",
+                expected=f"a calibration that covers {_region(offset, size)}",
+                found=f"the calibration of {_region(self.offset, self.size)}",
                 remedy="Calibrate with the region of these files; --offset-x and --offset-y say where it starts.",
             )
 
     def record(self) -> dict[str, str]:
-        """What ``scene.json`` says of it."""
+        """The calibration's entry in ``scene.json``."""
         return {"sensor": self.sensor, "lens": self.lens, "sha256": self.sha256}
 
     def apply(
@@ -271,8 +271,8 @@ class AnalyzerCalibration:
         if scale is None and not fitting:
             raise PolarguideError(
                 "calibration",
-                expected=f"one of a sensor that gives pictures of {width}x{height} pixels",
-                found=f"one of {_region(self.offset, self.size)}",
+                expected=f"the calibration of a sensor with pictures of {width}x{height} pixels",
+                found=f"the calibration of {_region(self.offset, self.size)}",
                 remedy="Give the calibration of this camera, made with the region of these pictures.",
             )
         step = fitting[0] if scale is None else scale

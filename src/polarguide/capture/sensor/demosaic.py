@@ -391,6 +391,6 @@ def defects(mosaics: Iterable[NDArray[Any]], period: int) -> NDArray[np.bool_]:
 
 
 def defects_note(count: int, samples: int) -> str:
-    """What to tell the user of so many defects among all samples of a mosaic."""
+    """A note for the user on the number of defects among all samples of a mosaic."""
     share = f"{count} samples ({count / samples:.3%})"
     return f"{share} stand out from all alike beside them (hot or dead pixels): invalid."

@@ -8,17 +8,36 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
+from tyro.constructors import PrimitiveConstructorSpec
 
 from polarguide.core.errors import PolarguideError
 
 _CELL = np.array([[90, 45], [135, 0]])
 _BAYER = np.array([[0, 1], [1, 2]])  # R G / G B, one entry a polarizer cell
 
-SensorName = Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"]
 SENSORS: dict[str, bool] = {"IMX250MYR": True, "IMX264MYR": True, "IMX250MZR": False}
 """Sony sensors by name, and whether they are color sensors."""
 SENSOR_NAMES = "IMX250MYR and IMX264MYR (color), IMX250MZR (monochrome)"
 """The same for people."""
+
+
+def sensor_named(name: str) -> str:
+    """The name of a sensor whose letters may be small; another word as it is."""
+    return name.upper() if name.upper() in SENSORS else name
+
+
+def any_case(*names: str) -> PrimitiveConstructorSpec[Any]:
+    """How the command line reads one of some names, sensors among them; the settings check it."""
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=f"{{{','.join(names)}}}",
+        instance_from_str=lambda words: sensor_named(words[0]),
+        is_instance=lambda value: value in names,
+        str_from_instance=lambda name: [name],
+    )
+
+
+SensorName = Annotated[Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"], any_case(*SENSORS)]
 
 SENSOR_SIZE = (2464, 2056)
 """Width and height of all of them, in pixels; cameras give 2448 x 2048."""
@@ -52,6 +71,10 @@ class MosaicOptions:
     offset_x: NotNegative = 0
     offset_y: NotNegative = 0
     black_level: Annotated[float, Meta(ge=0)] = 0.0
+
+    def __post_init__(self) -> None:
+        if isinstance(self.sensor, str):
+            object.__setattr__(self, "sensor", sensor_named(self.sensor))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,10 +174,12 @@ class Levels:
             dark: dark frame in stored values, in the same shape; it takes the place of the black level pixel by pixel.
         """
         floor = np.float32(self.black) if dark is None else dark
-        shown = ((values.astype(np.float32) - floor) / np.float32(self.white - self.black)).astype(np.float32)
+        scaled = ((values.astype(np.float32) - floor) / np.float32(self.white - self.black)).astype(
+            np.float32
+        )
         if self.gamma == 1.0:
-            return shown
-        return np.asarray(np.copysign(np.abs(shown) ** np.float32(1 / self.gamma), shown))
+            return scaled
+        return np.asarray(np.copysign(np.abs(scaled) ** np.float32(1 / self.gamma), scaled))
 
 
 def estimate_levels(
@@ -235,7 +260,7 @@ def clipping_bits(counts: NDArray[np.int64]) -> int | None:
 
 
 def level_notes(levels: Levels, counts: NDArray[np.int64], container: int, bits: int | None) -> list[str]:
-    """What was assumed of the levels of 16-bit files, for the user; ``bits``: as given, or None."""
+    """Notes for the user on the assumed levels of 16-bit files; ``bits``: as specified, or None."""
     if container != 16:
         return []
     notes = []

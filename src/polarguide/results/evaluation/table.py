@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from polarguide.results.evaluation.metric import Layers, Measure, Metric
+from polarguide.results.evaluation.metric import Layers, Measure, Metric, plugged_metrics
 from polarguide.results.evaluation.metrics import (
     beyond_share,
     coverage_error,
@@ -25,7 +25,6 @@ from polarguide.results.evaluation.metrics import (
     ssim,
     stokes_error,
 )
-from polarguide.results.evaluation.plugins import plugged_metrics
 from polarguide.results.evaluation.target import ViewTarget
 
 HIGHEST_PSNR = 100.0

@@ -32,7 +32,7 @@ from polarguide.optics.color import srgb_encode
 from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
 from polarguide.results.evaluation.table import shown_metrics
 from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
-from polarguide.results.export.model.build import BASE_COLORS, textured_model
+from polarguide.results.export.model.build import BASE_COLORS, Charted, charted_subject, textured_model
 from polarguide.results.export.model.gltf import write_glb
 from polarguide.results.export.model.obj import write_obj
 from polarguide.results.export.model.subject import counted, subject_of, subject_surface, write_stl
@@ -51,7 +51,13 @@ from polarguide.results.export.splat_glb import COLOR_SPACES, Encoding, write_sp
 from polarguide.results.export.splats import write_sog, write_spz
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
 from polarguide.results.rendering.mesh import RESOLUTION, implicit_mesh, scene_mesh
-from polarguide.results.rendering.relight import needs_radiance, panorama, write_exr, write_hdr
+from polarguide.results.rendering.relight import (
+    mirrored_light,
+    needs_radiance,
+    panorama,
+    write_exr,
+    write_hdr,
+)
 from polarguide.runs.model import write_run_ply
 from polarguide.runs.opened import OpenedRun
 from polarguide.visualization import figures
@@ -109,7 +115,7 @@ def export(
         "usdz": lambda: _model(run, presented, folder, resolution, model, reporter, "usdz"),
         "stl": lambda: _stl(run, presented, folder / "model.stl", resolution, model, reporter),
         "points": lambda: _points(run, presented, folder),
-        "environment": lambda: _environment(run, presented, folder),
+        "environment": lambda: _environment(run, presented, folder, reporter),
         "cameras": lambda: _cameras(run, presented, folder),
         "all": lambda: _all(run, presented, folder, resolution, model, reporter),
     }
@@ -275,10 +281,35 @@ def _model(
     reporter: Reporter,
     kind: Literal["glb", "obj", "usdz"],
 ) -> list[Path]:
+    subject = _charted(run, presented, folder, resolution, options, reporter, kind)
+    return _textured(run, presented, folder, subject, options, reporter, kind)
+
+
+def _charted(
+    run: OpenedRun,
+    presented: Presented,
+    folder: Path,
+    resolution: int,
+    options: ModelOptions,
+    reporter: Reporter,
+    kind: str,
+) -> Charted:
     view = presented.surface_view(run, f"format {kind}")
-    place, presentation = presented.placement, presented.presentation
     with temporary_folder(folder / kind) as parts:
-        textured = textured_model(run, view, presentation, place, options, resolution, parts, reporter)
+        return charted_subject(run, view, presented.presentation, options, resolution, parts, reporter)
+
+
+def _textured(
+    run: OpenedRun,
+    presented: Presented,
+    folder: Path,
+    subject: Charted,
+    options: ModelOptions,
+    reporter: Reporter,
+    kind: Literal["glb", "obj", "usdz"],
+) -> list[Path]:
+    place = presented.placement
+    textured = textured_model(run, subject, presented.presentation, place, options, reporter)
     meaning = BASE_COLORS[options.resolved_base_color]
     if kind == "obj":
         upright = replace(place, upright=False)  # +y is up whatever was chosen
@@ -332,11 +363,12 @@ def _all(
         lit = replace(lit, base_color="diffuse")
     unlit = replace(options, unlit=True, base_color=None)
     with atomic_folder(folder) as parts:
+        subject = _charted(run, presented, parts, resolution, lit, reporter, "glb")
         for chosen in (lit, unlit):
-            _model(run, presented, parts, resolution, chosen, reporter, "glb")
+            _textured(run, presented, parts, subject, chosen, reporter, "glb")
         _splat_glb(run, presented, parts)
         if radiant:
-            _environment(run, presented, parts)
+            _environment(run, presented, parts, reporter)
         view = (run.scene.test_views + run.scene.train_views)[0]
         shown = colored(run.result(view.camera).to("cpu").final, presented.presentation.color)
         figures.write_png(parts / "preview.png", figures.radiance_to_rgb(shown))
@@ -358,9 +390,10 @@ def _points(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
     return [path]
 
 
-def _environment(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
+def _environment(run: OpenedRun, presented: Presented, folder: Path, reporter: Reporter) -> list[Path]:
     cubemap = needs_radiance(run.model.shading, what="format")
-    learned = panorama(run.light[cubemap.name], cubemap, run.frame, PANORAMA_HEIGHT)
+    with reporter.track("light that is mirrored", len(run.scene.train_views)) as progress:
+        learned = panorama(mirrored_light(run, cubemap, progress), cubemap, run.frame, PANORAMA_HEIGHT)
     picture = colored(learned, presented.presentation.color)
     paths = [folder / f"environment.{kind}" for kind in ("exr", "hdr", "png")]
     credit = presented.presentation.credit

@@ -278,5 +278,5 @@ def transforms(cameras: Mapping[str, Camera]) -> dict[str, Any]:
 
 
 def write_transforms(path: Path, cameras: Mapping[str, Camera], about: Mapping[str, Any] = {}) -> None:
-    """Write ``transforms.json``, with more to say ``about`` it, which readers pass over."""
+    """Write ``transforms.json``; ``about``: further fields, which readers ignore."""
     write_text(path, json.dumps({**transforms(cameras), **about}, indent=1) + "\n")

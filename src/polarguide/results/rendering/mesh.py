@@ -24,6 +24,8 @@ from polarguide.shading.result import RenderResult
 
 TRUNCATION = 4.0  # voxels
 _SLAB = 1 << 21  # voxels at a time
+_BOX_POINTS = 1 << 20
+"""Points of all views together that the box is found from, about; all of a large capture would take gigabytes."""
 
 
 class NoSurfaceError(PolarguideError):
@@ -212,10 +214,18 @@ def fused_surface(
     optional_import("skimage.measure", "a mesh")
     views = [(camera, _kept(render(camera).to("cpu"), camera)) for camera in cameras.values()]
     around = scene_frame(list(cameras.values()))
-    points = [seen_points(camera, samples.depth, samples.mask) for camera, samples in views]
+    points = [
+        _some(seen_points(camera, samples.depth, samples.mask), _BOX_POINTS // len(views))
+        for camera, samples in views
+    ]
     box = box_around(points, around.center, around.distance, resolution)
     field, weight = fuse(box, ((camera, samples.depth, samples.mask) for camera, samples in views))
     return surface_of(box, field, weight), views, box
+
+
+def _some(points: Tensor, count: int) -> Tensor:
+    """At most ``count`` of points [M, 3], evenly."""
+    return points[:: max(1, -(-len(points) // count))].clone()
 
 
 def implicit_surface(cameras: Mapping[str, Camera], model: FieldModel, *, resolution: int) -> Surface:
@@ -264,7 +274,8 @@ def _in_pictures(cameras: Mapping[str, Camera], places: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class DepthSamples:
-    """Of one view: depth [H, W], where it counts [H, W], diffuse color and world normal [H, W, 3]."""
+    """Of one view: depth [H, W], where it counts [H, W], diffuse color and world normal [H, W, 3] in half precision,
+    since all views are held together."""
 
     depth: Tensor
     mask: Tensor
@@ -278,7 +289,9 @@ def _kept(result: RenderResult, camera: Camera) -> DepthSamples:
     normal = unit(result.normal, 1e-3)
     cosine = -dot(camera.world_rays(), normal)
     diffuse = result.base if result.diffuse is None else result.diffuse
-    return DepthSamples(result.depth, (result.alpha > OPAQUE) & (cosine > _STEEPEST), diffuse, normal)
+    return DepthSamples(
+        result.depth, (result.alpha > OPAQUE) & (cosine > _STEEPEST), diffuse.half(), normal.half()
+    )
 
 
 def painted(surface: Surface, views: list[tuple[Camera, DepthSamples]], box: Box) -> ColoredMesh:

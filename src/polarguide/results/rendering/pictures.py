@@ -33,6 +33,7 @@ from polarguide.visualization.layers import (
     layer_scale,
     reference_pictures,
     true_depths,
+    true_name,
 )
 
 SHEET_VIEWS = 8
@@ -189,7 +190,7 @@ def _sheet(
     Left out are columns that some view has not, and layers of one color in all views, such as metalness where there is
     no metal: the caption names these.
     """
-    titles = [column for name in names for column in (name, f"{name}, true", f"{name}, measured")]
+    titles = [column for name in names for column in (name, true_name(name), f"{name}, measured")]
     columns = [column for column in titles if all(column in cells for _, cells in views)]
     even = [column for column in columns if all(_is_even(cells[column]) for _, cells in views)]
     columns = [column for column in columns if column not in even] or columns

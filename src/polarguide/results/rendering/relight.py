@@ -22,11 +22,12 @@ from polarguide.capture.presentation import in_camera
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import atomic, in_utf8, write_whole
 from polarguide.core.options import PathLike
-from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.progress import SILENT, Advance, Reporter
 from polarguide.geometry.scene_frame import SceneFrame
+from polarguide.geometry.vectors import unit
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.cubemap import cubemap_lookup, texel_directions
-from polarguide.shading.model import RadianceCubemap, ShadingModel
+from polarguide.shading.model import RadianceCubemap, ShadingModel, mirrored
 
 LARGEST = 8192 * 4096
 RELIT_RESOLUTION = 128
@@ -79,6 +80,36 @@ def needs_radiance(shading: ShadingModel, *, what: str) -> RadianceCubemap:
         found="one whose light is something else" if shading.reflects else "a run without reflection",
         remedy="Take a run of 3dgs-dr, polarguide or polarguide-stokes.",
     )
+
+
+@torch.no_grad()
+def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -> Tensor:
+    """Raw texels [6, R, R, 3] of the learned light with what the Gaussians add of their own folded in.
+
+    A texel is the mean of what all training views see mirrored from its direction, weighted by the square of the share
+    that is mirrored: the least squares fit to the specular layers. Learned light counts as one more pixel of a surface
+    that mirrors with all of its strength, seen squarely.
+    """
+    texels = run.light[cubemap.name].detach().cpu()
+    shading = run.model.shading
+    sums = torch.zeros(*texels.shape[:3], 4, requires_grad=True)
+    views = run.scene.train_views
+    for count, view in enumerate(views, 1):
+        result = run.result(view.camera).to("cpu")
+        assert result.specular is not None
+        assert result.reflection is not None
+        assert result.normal is not None
+        seen = result.reflection
+        share = (result.specular.sum(-1) / seen.sum(-1).clamp(min=1e-6)).clamp(0, 1)[..., None].square()
+        directions = mirrored(view.camera.world_rays(), unit(result.normal, 1e-3)).reshape(-1, 3)
+        with torch.enable_grad():
+            # The gradient of a look-up shares each pixel among the texels that it would read.
+            cubemap_lookup(sums, directions).backward(torch.cat([share * seen, share], dim=-1).reshape(-1, 4))
+        advance(count)
+    assert sums.grad is not None
+    total, weight = sums.grad.split([3, 1], dim=-1)
+    own = ((shading.refractive_index - 1) / (shading.refractive_index + 1)) ** 4
+    return cubemap.raw((total + own * cubemap.radiance(texels)) / (weight + own))
 
 
 @torch.no_grad()

@@ -25,7 +25,7 @@ from polarguide.core.files import make_folder
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.shots.calibration.report import Position, calibration_picture, lines, positions
 from polarguide.shots.calibration.settings import CalibrateSettings
-from polarguide.shots.calibration.shots import Measured, Shots
+from polarguide.shots.calibration.shots import ShotMeans, Shots
 from polarguide.shots.calibration.solve import ShotFit, solve_shots
 from polarguide.visualization.figures import write_png
 
@@ -198,7 +198,7 @@ def _at_pixels(
 
 
 def _brightness(throughput: NDArray[np.float64], pattern: Pattern) -> NDArray[np.float64]:
-    """What the light and the lens do to each pixel, [H, W]: a smooth surface through the brightness of its color.
+    """Relative illumination of each pixel, [H, W]: a smooth surface fitted to the brightness of its color.
 
     It is smooth, and a plane over a cell, so that a light that is not quite uniform does not look like polarization.
 
@@ -264,7 +264,7 @@ DOUBTFUL = 0.005
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """What came of it.
+    """The outcome of a calibration.
 
     Attributes:
         path: the file. picture: the PNG beside it.
@@ -314,7 +314,7 @@ def calibrate_sensor(
         raise PolarguideError(
             source,
             expected="polarizers near the angles of the sensor's pattern at nearly all pixels",
-            found=f"others at {defects / pixels.defects.size:.0%} of them",
+            found=f"other angles at {defects / pixels.defects.size:.0%} of the pixels",
             remedy="Check --sensor, --offset-x and --offset-y, and that the polarizer covers the whole field.",
         )
     choice = choose_block(pixels, settings.offset, files.pattern, settings.block)
@@ -325,14 +325,14 @@ def calibrate_sensor(
         settings.polarizer_extinction,
     )  # fmt: skip
     make_folder(out.parent)
-    said = positions(found)
+    analyzers = positions(found)
     found = replace(found, sha256=write_analyzers(out, found))
     picture = out.with_suffix(".png")
-    write_png(picture, calibration_picture(found, said, fit, measured.means, files.pattern))
+    write_png(picture, calibration_picture(found, analyzers, fit, measured.means, files.pattern))
     _say_choice(choice, settings, files, defects, reporter)
-    for line in lines(found, said):
+    for line in lines(found, analyzers):
         reporter.say(line)
-    return Calibrated(out, picture, found, said, fit, choice, defects)
+    return Calibrated(out, picture, found, analyzers, fit, choice, defects)
 
 
 def _require_apart(out: Path, shots: Path, settings: CalibrateSettings) -> None:
@@ -346,7 +346,7 @@ def _require_apart(out: Path, shots: Path, settings: CalibrateSettings) -> None:
             raise PolarguideError(
                 out,
                 expected=f"a place outside of {folder}",
-                found="one among the shots, which would hold the picture, too",
+                found="the folder of the shots, where the picture would count as a shot",
                 remedy="Give another --out; nothing was written.",
             )
 
@@ -361,7 +361,7 @@ def _require_new(out: Path) -> None:
             raise PolarguideError(
                 path,
                 expected="a new file",
-                found="one that exists",
+                found="an existing file",
                 remedy="Give another --out, or remove it; nothing was written.",
             )
 
@@ -372,7 +372,7 @@ def _diattenuation(settings: CalibrateSettings) -> float:
 
 
 def _solved(
-    files: Shots, measured: Measured, settings: CalibrateSettings, known: list[float] | None
+    files: Shots, measured: ShotMeans, settings: CalibrateSettings, known: list[float] | None
 ) -> ShotFit:
     return solve_shots(
         measured.means,
@@ -385,8 +385,8 @@ def _solved(
     )
 
 
-def _say_shots(fit: ShotFit, settings: CalibrateSettings, measured: Measured, reporter: Reporter) -> None:
-    """What was found about the shots, and what nothing in them tells."""
+def _say_shots(fit: ShotFit, settings: CalibrateSettings, measured: ShotMeans, reporter: Reporter) -> None:
+    """Report of the estimates from the shots, and of quantities that the shots do not determine."""
     angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(fit.angles))
     reporter.say(
         f"{len(fit.angles)} shots, polarizer at {angles} degrees; misfit {fit.misfit:.2%} of their mean."

@@ -1,4 +1,4 @@
-"""What the analyzers of a sensor are like: figures by position, the table for the console, and a picture."""
+"""Figures of a sensor's analyzers by position, the table for the console, and a picture."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def spread(values: Array) -> tuple[float, float, float]:
 
 
 def effect(calibration: AnalyzerCalibration) -> tuple[float, float]:
-    """What the sensor reads without correction: the DoLP of unpolarized light, and of fully polarized light.
+    """Readings of the sensor without correction: the DoLP of unpolarized and of fully polarized light.
 
     Both are medians over the blocks, the latter over angles of the light, too.
     """
@@ -98,10 +98,10 @@ def _dolp(four: Array) -> Array:
     return np.asarray(np.hypot(s1, s2) / s0)
 
 
-def lines(calibration: AnalyzerCalibration, said: list[Position]) -> list[str]:
+def lines(calibration: AnalyzerCalibration, analyzers: list[Position]) -> list[str]:
     """The table for the console."""
     rows = ["position   throughput             extinction ratio       angle error in degrees"]
-    for position in said:
+    for position in analyzers:
         cells = [
             _cell(position.throughput, "{:.3f}"),
             _cell(position.extinction, "{:.0f}"),
@@ -132,16 +132,20 @@ _GRID = (222, 222, 222)
 
 
 def calibration_picture(
-    calibration: AnalyzerCalibration, said: Sequence[Position], fit: ShotFit, means: Array, pattern: Pattern
+    calibration: AnalyzerCalibration,
+    analyzers: Sequence[Position],
+    fit: ShotFit,
+    means: Array,
+    pattern: Pattern,
 ) -> Picture:
     """Draw a calibration.
 
     Args:
-        calibration: it. said: its positions. fit: of the shots. means: of the shots by position, [T, K], and
+        calibration: it. analyzers: its positions. fit: of the shots. means: of the shots by position, [T, K], and
         pattern: of the region, to which they belong.
     """
-    maps = _maps(said)
-    curves = _curves(calibration, said, fit, means, pattern)
+    maps = _maps(analyzers)
+    curves = _curves(calibration, analyzers, fit, means, pattern)
     width = max(maps.shape[1], curves.shape[1])
     padded = [
         np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0)), constant_values=255)
@@ -150,13 +154,15 @@ def calibration_picture(
     return np.concatenate(padded)
 
 
-def _maps(said: Sequence[Position]) -> Picture:
+def _maps(analyzers: Sequence[Position]) -> Picture:
     """Throughput, extinction ratio and angle error by block: a row an angle, three columns a color."""
-    colors = sorted({position.color for position in said}, key=lambda color: -1 if color is None else color)
+    colors = sorted(
+        {position.color for position in analyzers}, key=lambda color: -1 if color is None else color
+    )
     kinds = (
-        ("throughput", "viridis", [p.throughput for p in said]),
-        ("extinction ratio", "magma", [p.extinction for p in said]),
-        ("angle error, degrees", "turbo", [p.angle_error for p in said]),
+        ("throughput", "viridis", [p.throughput for p in analyzers]),
+        ("extinction ratio", "magma", [p.extinction for p in analyzers]),
+        ("angle error, degrees", "turbo", [p.angle_error for p in analyzers]),
     )
     rows: list[list[Picture | None]] = [[] for _ in ANGLES]
     labels, footer = [], []
@@ -167,7 +173,7 @@ def _maps(said: Sequence[Position]) -> Picture:
             footer.append(scale_bar(low, high, colormap))
             for index, angle in enumerate(ANGLES):
                 shown = next(
-                    v for p, v in zip(said, values, strict=True) if p.angle == angle and p.color == color
+                    v for p, v in zip(analyzers, values, strict=True) if p.angle == angle and p.color == color
                 )
                 rows[index].append(scalar_to_rgb(torch.from_numpy(shown.copy()), low, high, colormap))
     most = 420 if len(colors) == 1 else 256
@@ -193,7 +199,11 @@ def _range(values: Array, *, signed: bool) -> tuple[float, float]:
 
 
 def _curves(
-    calibration: AnalyzerCalibration, said: Sequence[Position], fit: ShotFit, means: Array, pattern: Pattern
+    calibration: AnalyzerCalibration,
+    analyzers: Sequence[Position],
+    fit: ShotFit,
+    means: Array,
+    pattern: Pattern,
 ) -> Picture:
     """Mean intensity of the positions of an angle against the angle of the polarizer, with Malus's law through it."""
     drawn: Picture = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
@@ -202,7 +212,7 @@ def _curves(
     turns = np.radians(np.linspace(0, 180, 181))
     light = np.stack([np.ones_like(turns), np.cos(2 * turns), np.sin(2 * turns)], axis=1)
     curves = {a: light @ fit.vectors[places == a].mean(axis=0) for a in ANGLES}
-    seen = {a: means[:, places == a].mean(axis=1) / fit.levels for a in ANGLES}
+    readings = {a: means[:, places == a].mean(axis=1) / fit.levels for a in ANGLES}
     top_value = max(float(curve.max()) for curve in curves.values()) * 1.05
 
     def at(angle: float, value: float) -> tuple[int, int]:
@@ -229,7 +239,7 @@ def _curves(
             [at(float(np.degrees(t)), float(v)) for t, v in zip(turns, curves[angle], strict=True)]
         )
         cv2.polylines(drawn, [points.astype(np.int32)], False, _CURVES[angle], 1, cv2.LINE_AA)
-        for turn, value in zip(fit.angles, seen[angle], strict=True):
+        for turn, value in zip(fit.angles, readings[angle], strict=True):
             cv2.circle(drawn, at(float(np.degrees(turn)), float(value)), 4, _CURVES[angle], -1, cv2.LINE_AA)
     lens = f", {calibration.lens}" if calibration.lens else ""
     block = calibration.block
@@ -237,20 +247,20 @@ def _curves(
     title = f"{calibration.sensor}{lens}: {calibration.size[0]}x{calibration.size[1]} pixels, {own}"
     _text(drawn, title, 12, 26, 0.6)
     _text(drawn, f"{len(means)} shots, misfit {fit.misfit:.2%} of their mean", 12, 50)
-    _legend(drawn, said, right + 24)
+    _legend(drawn, analyzers, right + 24)
     return drawn
 
 
-def _legend(drawn: Picture, said: Sequence[Position], x: int) -> None:
+def _legend(drawn: Picture, analyzers: Sequence[Position], x: int) -> None:
     """Medians of the positions."""
     columns = (90, 168, 242)
     for text, place in zip(("throughput", "extinction", "angle error"), columns, strict=True):
         _text(drawn, text, x + place - 4, 50, 0.4)
-    for line, position in enumerate(said):
+    for line, position in enumerate(analyzers):
         throughput, extinction, error = (
             spread(values)[0] for values in (position.throughput, position.extinction, position.angle_error)
         )
-        y = _TOP + line * (26 if len(said) == len(ANGLES) else 20)
+        y = _TOP + line * (26 if len(analyzers) == len(ANGLES) else 20)
         cv2.circle(drawn, (x + 6, y - 4), 5, _CURVES[position.angle], -1, cv2.LINE_AA)
         _text(drawn, f"{position.name} deg", x + 18, y)
         ratio = f">{COUNTLESS:.0f}" if extinction > 0.999 * COUNTLESS else f"{extinction:.0f}"

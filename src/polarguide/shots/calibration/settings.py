@@ -1,4 +1,4 @@
-"""What ``calibrate`` may be asked for. Nothing here imports torch, OpenCV or SciPy."""
+"""Settings of ``calibrate``. Nothing here imports torch, OpenCV or SciPy."""
 
 from __future__ import annotations
 

@@ -42,8 +42,8 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
-    """What all shots have in common, and their means.
+class ShotMeans:
+    """Shared properties of all shots, and their means.
 
     Attributes:
         levels: of the stored values. means: of each shot over the sensor, by the pixel's place in the pattern of the
@@ -94,7 +94,7 @@ class Shots:
         assert self._first is not None
         return self._first[1][1], self._first[1][0]
 
-    def measure(self, reporter: Reporter) -> Measured:
+    def measure(self, reporter: Reporter) -> ShotMeans:
         """Read all files once.
 
         Raises:
@@ -137,7 +137,7 @@ class Shots:
                 remedy="Expose longer; half of full scale is a good mean.",
             )
         shots = len(self.files)
-        return Measured(levels, means[:shots], means[shots:].mean(axis=0) if self._flat else None)
+        return ShotMeans(levels, means[:shots], means[shots:].mean(axis=0) if self._flat else None)
 
     def linear(
         self, levels: Levels, reporter: Reporter

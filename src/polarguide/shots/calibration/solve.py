@@ -111,13 +111,13 @@ def solve_shots(
                 found=f"a DoLP of {np.hypot(s1, s2) / s0:.0%}",
                 remedy="Take it without the polarizer, of a light behind a thick diffuser; no screen, no reflection.",
             )
-    seen = np.arctan2(start[:, 2], start[:, 1]) / 2
+    apparent = np.arctan2(start[:, 2], start[:, 1]) / 2
     if known is None and flat is None:
         _require_steady(start[:, 0], folder)
     if known is not None:
-        _require_match(np.asarray(known), seen, folder, to_mean)
-    _require_different(seen if known is None else np.asarray(known), folder, known is not None)
-    angles, levels = _refined(means, seen, start[:, 0], known, flat, diattenuation)
+        _require_match(np.asarray(known), apparent, folder, to_mean)
+    _require_different(apparent if known is None else np.asarray(known), folder, known is not None)
+    angles, levels = _refined(means, apparent, start[:, 0], known, flat, diattenuation)
     levels = levels / levels.mean()
     light = _stokes(angles, levels, diattenuation)
     vectors = np.asarray(np.linalg.lstsq(light, means, rcond=None)[0].T, np.float64)
@@ -182,7 +182,7 @@ def _seen(means: Array, nominal: Array) -> Array:
 
 def _refined(
     means: Array,
-    seen: Array,
+    apparent: Array,
     brightness: Array,
     known: Sequence[float] | None,
     flat: Array | None,
@@ -190,7 +190,7 @@ def _refined(
 ) -> tuple[Array, Array]:
     """Angles and levels that fit best; the first angle, or all that are known, and the first level are held."""
     count = len(means)
-    held = seen if known is None else np.asarray(known)
+    initial = apparent if known is None else np.asarray(known)
     # Known angles determine the levels by themselves: a flat field then is a test, not a measurement.
     with_flat = flat if known is None else None
     data = means / means.mean()
@@ -202,7 +202,7 @@ def _refined(
     turns = count - 1 if known is None else 0
 
     def unpacked(free: Array) -> tuple[Array, Array]:
-        angles, levels = held.copy(), np.ones(len(data))
+        angles, levels = initial.copy(), np.ones(len(data))
         angles[count - turns :] = free[:turns]
         if free_levels:
             levels[1:] = np.exp(free[turns:])
@@ -216,7 +216,7 @@ def _refined(
         basis, _ = np.linalg.qr(light)
         return np.asarray((data - basis @ (basis.T @ data)).ravel())
 
-    begin = held[count - turns :]
+    begin = initial[count - turns :]
     if free_levels:
         begin = np.append(begin, np.log(levels_at_first[1:] / levels_at_first[0]))
     if len(begin):
@@ -249,9 +249,9 @@ def _require_different(angles: Array, folder: Path, known: bool) -> None:
     )
 
 
-def _require_match(known: Array, seen: Array, folder: Path, to_mean: bool) -> None:
+def _require_match(known: Array, apparent: Array, folder: Path, to_mean: bool) -> None:
     """Refuse given angles that count the other way, have another zero, or belong to other shots."""
-    along, against = (np.mean(np.exp(2j * (seen - sign * known))) for sign in (1, -1))
+    along, against = (np.mean(np.exp(2j * (apparent - sign * known))) for sign in (1, -1))
     if abs(along) < ALIKE:
         remedy = "List the angles in the order of the files' names."
         if abs(against) >= ALIKE:
@@ -259,7 +259,7 @@ def _require_match(known: Array, seen: Array, folder: Path, to_mean: bool) -> No
         raise PolarguideError(
             "--angles",
             expected="angles like those that the sensor sees",
-            found=f"others ({', '.join(f'{np.degrees(a) % 180:.0f}' for a in seen[:8])}, ... are seen)",
+            found=f"angles that look like {', '.join(f'{np.degrees(a) % 180:.0f}' for a in apparent[:8])}, ...",
             remedy=remedy,
         )
     zero = float(np.angle(along)) / 2

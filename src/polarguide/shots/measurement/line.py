@@ -43,13 +43,13 @@ from polarguide.visualization.figures import write_png
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredShot:
     """A shot that was measured.
 
     Attributes:
         maps: of it. differences: to the reference, None without one.
         regions: by ``Field.key``, from ``region`` on. status: the worst of them.
-        beyond: all regions with the limits that they are beyond; empty where none is.
+        beyond: all regions with the limits that they are beyond; empty if all regions are within.
     """
 
     maps: ShotMaps
@@ -93,16 +93,15 @@ class Measurer:
         return () if self.reference is None else self.reference.shot.paths
 
     def read(self, shot: ExposureSet, *, whole: bool = False) -> ShotMaps:
-        """The maps of a shot: of all of it where ``whole``, or where it is compared with a reference; else at least of
-        the regions.
+        """The maps of a shot: of the whole picture if ``whole`` or with a reference, else at least of the regions.
 
         Raises:
             PolarguideError, OSError, MemoryError: it cannot be read.
         """
         return read_shot(shot, self._reading, part=None if whole else self._part)
 
-    def measured(self, shot: ExposureSet, maps: ShotMaps) -> Measured:
-        """What its maps say.
+    def measured(self, shot: ExposureSet, maps: ShotMaps) -> MeasuredShot:
+        """The figures of its maps.
 
         Raises:
             PolarguideError: it does not fit the regions or the reference.
@@ -115,7 +114,7 @@ class Measurer:
             "beyond" if "beyond" in statuses else "within" if "within" in statuses else "measured"
         )
         beyond = [(region, which) for region, _, which in found] if status == "beyond" else []
-        return Measured(maps, differences, tuple(figures for _, figures, _ in found), status, beyond)
+        return MeasuredShot(maps, differences, tuple(figures for _, figures, _ in found), status, beyond)
 
     def entry(self, shot: ExposureSet) -> Entry:
         """The line of a shot, which says why where it cannot be measured."""
@@ -147,7 +146,7 @@ class Measurer:
         return region, {**head, **figures}, beyond
 
     def settings(self) -> dict[str, Any]:
-        """What the figures depend on, as JSON."""
+        """The settings that the figures depend on, as JSON."""
         reading = {f.name: getattr(self._reading, f.name) for f in dataclasses.fields(self._reading)}
         named = [value for value in reading.values() if isinstance(value, Path)]
         made: dict[str, Any] = msgspec.to_builtins(
@@ -191,7 +190,7 @@ def ignore(entry: Entry) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a command has done.
+    """The outcome of a command.
 
     Attributes:
         folder: of the table; None where nothing was written.
@@ -261,8 +260,8 @@ class Line:
         if stamps(shot.paths) != files:
             raise ChangedWhileRead(
                 shot.where,
-                expected="a file that stays as it is",
-                found="that it was written to meanwhile",
+                expected="a file that does not change while it is read",
+                found="a file that was written to",
                 remedy="Repeat the command when it is complete; --watch waits for that.",
             )
         measured = self.measurer.measured(shot, maps)
@@ -276,7 +275,7 @@ class Line:
         self.table.add(entry)
         return entry
 
-    def _draw(self, shot: ExposureSet, measured: Measured) -> str:
+    def _draw(self, shot: ExposureSet, measured: MeasuredShot) -> str:
         """Write pictures before the line of the table: where that is, they are. Their name, "" if there are none."""
         maps, differences = measured.maps, measured.differences
         if not measured.beyond and differences is None:
@@ -330,7 +329,7 @@ def measure_shots(
         0.213
 
     Raises:
-        PolarguideError: there is no shot, an option is wrong, an array is none of a shot, or the table cannot be
+        PolarguideError: there is no shot, an option is wrong, an array is no shot, or the table cannot be
             written. A shot that cannot be read raises nothing: its line says why.
     """
     shots, total = _shots_of(paths, out, reading, angles)
@@ -388,9 +387,9 @@ def _shots_of(
         remedy = "Put it into a list: measure([array])."
         raise PolarguideError("paths", expected="several shots", found="one array", remedy=remedy)
     if not isinstance(paths, Sequence):
-        return (_given(shot, number, reading, angles) for number, shot in enumerate(paths, 1)), None
+        return (_array_set(shot, number, reading, angles) for number, shot in enumerate(paths, 1)), None
     if paths and all(isinstance(shot, ExposureSet) or is_array(shot) for shot in paths):
-        return [_given(shot, number, reading, angles) for number, shot in enumerate(paths, 1)], len(paths)
+        return [_array_set(shot, number, reading, angles) for number, shot in enumerate(paths, 1)], len(paths)
     files = [path for path in paths if isinstance(path, str | os.PathLike)]
     if len(files) < len(paths):
         remedy = "Measure files and arrays by calls of their own."
@@ -401,7 +400,7 @@ def _shots_of(
     return found, len(found)
 
 
-def _given(shot: Source, number: int, reading: ShotOptions, angles: Sequence[Angle]) -> ExposureSet:
+def _array_set(shot: Source, number: int, reading: ShotOptions, angles: Sequence[Angle]) -> ExposureSet:
     if isinstance(shot, ExposureSet):
         return shot
     name = f"{NAME}-{number}"

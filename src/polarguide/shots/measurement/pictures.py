@@ -57,17 +57,15 @@ def regions_picture(maps: ShotMaps, found: Sequence[tuple[Region, Sequence[str]]
 def _photograph(maps: ShotMaps) -> tuple[Picture, float]:
     """S0 / 2 as a display shows it, and how much larger it is than the maps."""
     linear = maps.s0 / 2
-    shown = np.rint(255 * srgb_encode_array(np.clip(linear, 0, 1))).astype(np.uint8)
-    width = shown.shape[1]
+    gray = np.rint(255 * srgb_encode_array(np.clip(linear, 0, 1))).astype(np.uint8)
+    width = gray.shape[1]
     if width > _WIDEST:
         scale = _WIDEST / width
-        shown = np.asarray(
-            cv2.resize(shown, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8
-        )
+        gray = np.asarray(cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
     else:
         scale = float(max(1, math.ceil(_NARROWEST / width)))
-        shown = shown.repeat(int(scale), axis=0).repeat(int(scale), axis=1)
-    return np.repeat(shown[..., None], 3, axis=2), scale
+        gray = gray.repeat(int(scale), axis=0).repeat(int(scale), axis=1)
+    return np.repeat(gray[..., None], 3, axis=2), scale
 
 
 def _name(picture: Picture, name: str, x: int, y: int, color: tuple[int, int, int]) -> None:

@@ -32,8 +32,8 @@ from polarguide.core.files import (
     writing,
 )
 from polarguide.core.records import decode, first_difference, read_record, shortened, to_json
-from polarguide.core.spreadsheet import csv_lines
 from polarguide.core.system import only_writer
+from polarguide.core.text import csv_lines
 from polarguide.shots.measurement.fields import FORMAT, KEYS, Value
 
 LINES, CSV, SETTINGS, LOCK = "table.jsonl", "table.csv", "measure.json", ".lock"
@@ -52,7 +52,7 @@ class FileStamp(msgspec.Struct, frozen=True):
 
 
 def stamps(paths: Sequence[Path]) -> tuple[FileStamp, ...]:
-    """What files are now.
+    """The present state of files.
 
     Raises:
         OSError: one is not there.

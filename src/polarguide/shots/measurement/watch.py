@@ -34,18 +34,18 @@ class _Coming:
 
     Attributes:
         files: as they were when last looked at. since: when they became so.
-        doubtful: reading them failed in a way that more bytes may mend. said: that it is not complete.
+        doubtful: reading them failed in a way that more bytes may fix. reported: that it is incomplete.
     """
 
     files: tuple[FileStamp, ...]
     since: float
     doubtful: bool = False
-    said: bool = False
+    reported: bool = False
 
 
 @dataclass
 class _Folder:
-    """What is in a watched folder."""
+    """The contents of a watched folder."""
 
     root: Path
     reading: ShotOptions
@@ -204,8 +204,8 @@ class _Watch:
         if shot.kind == "set" and not late and not shot.whole:  # more angles may come
             return False
         if shot.kind == "filter" and len(shot.files) < len(ANGLES):
-            if late and not state.said:
-                state.said = True
+            if late and not state.reported:
+                state.reported = True
                 missing = [str(angle) for angle in ANGLES if angle not in shot.files]
                 self._reporter.warn(
                     f"{shot.name}: still no picture at {' and '.join(missing)} degrees; it waits."

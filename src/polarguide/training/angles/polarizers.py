@@ -175,7 +175,7 @@ class Polarizers:
         self.beliefs = self._beliefs()
 
     def due(self, step: int) -> bool:
-        """Whether angles are to be fitted before a step; none is once all fits have been made."""
+        """Whether angles are to be fitted before a step; False once all fits are made."""
         return not self.settled and step in self._rounds[self.ended]
 
     @property
@@ -196,7 +196,7 @@ class Polarizers:
 
     @property
     def searched(self) -> int:
-        """Those of them that belong to searches that have ended."""
+        """Number of steps of finished searches."""
         return sum(times[-1] for times in self._rounds[: self.ended]) if self._unknown else 0
 
     def believed(self, view: View) -> View:

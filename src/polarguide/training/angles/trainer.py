@@ -16,11 +16,12 @@ from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import ShadingModel
 from polarguide.training.angles.polarizers import Polarizers, search_steps
 from polarguide.training.distributed import ALONE, Ranks
+from polarguide.training.feed import ViewStore
+from polarguide.training.flat import Flat
 from polarguide.training.recipe import Recipe, Schedule
 from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.state import TrainingState
 from polarguide.training.trainer import Trainer
-from polarguide.training.view_store import ViewStore
 
 
 class AngleTrainer:
@@ -92,13 +93,18 @@ class AngleTrainer:
 
     @property
     def done(self) -> int:
-        """Those of them that are done."""
+        """Number of finished steps."""
         return (self.polarizers.searched if self.begins_again else 0) + self.state.step
 
     @property
     def state(self) -> TrainingState:
-        """That of the present search, or of the training."""
+        """The state of the current search, or of the training."""
         return self._trainer.state
+
+    @property
+    def flat(self) -> dict[str, dict[str, Flat]]:
+        """As of ``Trainer``."""
+        return self._trainer.flat
 
     @property
     def shading(self) -> ShadingModel:

@@ -1,131 +1,121 @@
-"""Evidence for each Gaussian and its neighborhood: how well a dielectric and a metal explain all views.
+"""Evidence for each Gaussian: how much likelier what the views measured of it is of a metal than of a dielectric.
 
-At a Gaussian, a view measures S0 and, per color, the polarization P across the rendered normal's plane of incidence.
+At a Gaussian, a view measures S0 and, per color, the polarization P across the rendered normal's plane of incidence and
+U at 45 degrees to it. ``rho`` are Fresnel's degrees of polarization.
 
-- A dielectric's body light d is the same from everywhere, and its specular light s is free:
-  ``S0 = d + s``, ``P = rho_s s - rho_d d``. Without s, ``(rho_s + rho_d) d = rho_s S0 - P`` in every view.
-- A metal mirrors light that is free, but polarizes it as its reflectance r says: ``P = rho(r) S0`` in every view.
+- A dielectric's body light d is the same from everywhere, and its specular light s is free: ``S0 = d + s``,
+  ``P = k rho_s s - rho_d d``; k, from ``ROUGH`` to 1, is what roughness leaves of the polarization.
+- A metal mirrors light that is free, but polarizes it as its reflectance r says: ``P = rho(r) S0``. Its color is that
+  of the light that it mirrors times r, so that r follows the color that is seen.
 
-Either has one unknown per color, which all views share, and one per color and view. Compared are their residuals E
-across the line of what the free light can explain, as log(E_dielectric / E_metal) over a neighborhood. That a metal
-fits better counts only where no dielectric fits: a matte white body under an even sky could as well be aluminum. And a
-metal's color is that of the light it mirrors times r, so that r follows the color that it shows.
+Unpolarized light leaves no U. Light that is polarized changes P about as much as U. A metal keeps nearly all of U, a
+dielectric ``sqrt(Rs Rp)`` times the scene's light at most. Either explanation is therefore excused in P for as much U
+as it explains, and has the rest of U as an error.
 
-In polarized light neither fits. A metal then shows light that is polarized at 45 degrees to the plane of incidence, of
-which a dielectric reflects a twentieth at most, up to 60 degrees: where there is much of it, measured by the light of
-the scene, and the metal is not much farther off across the plane than at 45 degrees to it, is metal, too.
+The errors E, mean squares relative to the light, of n views of unknown variance, at least that of the scene's typical
+error e, give the log likelihood ratio ``n log((e^2 + E_dielectric) / (e^2 + E_metal))``: n/2 for each of P and U.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import View
 from polarguide.core.system import UNBOUNDED, MemoryBound
-from polarguide.gaussians.geometry import shortest_axis_normals
-from polarguide.geometry.vectors import dot
+from polarguide.optics.fresnel import reflectances_from_cosine
 from polarguide.raster import Rasterize
 from polarguide.shading.metal import FIRST_REFLECTANCE
 from polarguide.shading.model import Parameters
-from polarguide.training.metals.observations import ViewSamples, evenly, label_weights, samples_of, view_sums
-from polarguide.training.rules import MetalRules
+from polarguide.training.metals.observations import (
+    LEAST_PIXELS,
+    ViewSamples,
+    evenly,
+    label_weights,
+    samples_of,
+    view_sums,
+)
+from polarguide.training.rules import MetalRules, MetalViews
 
-
-def _relative(samples: ViewSamples, dark: float) -> tuple[Tensor, Tensor]:
-    """Weights [V, N, 3] of squares, and what their sums over the views are relative to [N, 3]."""
-    above = samples.s0.clamp(min=0) + dark  # the variance of light that is counted grows with the light
-    weight = samples.weight[..., None] / above
-    return weight, (weight * above * above).sum(dim=0).clamp(min=1e-9)
-
-
-def residuals(
-    samples: ViewSamples, refractive_index: float, rules: MetalRules
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean squares of the relative residuals of a dielectric and of a metal [N], and the metal's reflectance [N, 3]."""
-    s0, across, cosine = samples.s0, samples.across, samples.cosine[..., None]
-    sine2 = 1 - cosine * cosine
-    weight, scale = _relative(samples, rules.dark)
-    specular, diffuse = (slope * sine2 for slope in optics.dolp_slopes(cosine, refractive_index))
-    seen_body, of_body = specular * s0 - across, specular + diffuse
-    by_line = weight / (1 + specular * specular)
-    body = (by_line * of_body * seen_body).sum(dim=0) / (by_line * of_body**2).sum(dim=0).clamp(min=1e-9)
-    misfit = (by_line * (seen_body - of_body * body.clamp(min=0)) ** 2).sum(dim=0) / scale
-    color = (samples.weight[..., None] * s0).sum(dim=0)
-    color = (color / color.amax(dim=1, keepdim=True).clamp(min=1e-6)).clamp(min=0.05)
-    best = torch.full_like(misfit[:, 0], torch.inf)
-    fitted = torch.zeros_like(color)
-    for power in rules.powers:
-        for level in rules.levels:
-            reflectance = level * color**power
-            degree = optics.conductor(cosine, reflectance)[1] * sine2
-            off = (weight * (across - degree * s0) ** 2 / (1 + degree * degree)).sum(dim=0) / scale
-            error = off.mean(dim=1)
-            better = error < best
-            best = torch.where(better, error, best)
-            fitted = torch.where(better[:, None], reflectance, fitted)
-    return misfit.mean(dim=1), best, fitted
-
-
-def oblique_light(samples: ViewSamples, dark: float) -> Tensor:
-    """Mean squares [N] of the polarization at 45 degrees to the plane of incidence, relative like the residuals."""
-    weight, scale = _relative(samples, dark)
-    return ((weight * samples.oblique**2).sum(dim=0) / scale).mean(dim=1)
-
-
+# Shares of its specular polarization that a dielectric's roughness may leave.
+ROUGH = (1.0, 0.85, 0.7, 0.55)
+# Reflectances that are tried: a level times a power of the observed color.
+LEVELS, POWERS = (0.5, 0.6, 0.7, 0.8, 0.88, 0.95), (0.5, 0.75, 1.0)
+# Weakest over strongest reflectance of the most deeply colored metal, gold.
+GOLD = 0.38
+# Unknowns of either explanation, for which as many views tell nothing.
+UNKNOWNS = 2
+# Mean square of the noise of the views, relative to the light: the scene's typical error is no less.
+NOISE = 1e-4
+# Gaussians at a time, so that intermediate tensors take little memory.
 CHUNK = 1 << 14
-"""Gaussians at a time, so that intermediate tensors take little memory."""
+
+
+class Errors(NamedTuple):
+    """Errors [N] of both explanations, mean squares relative to the light, and the metal's reflectance [N, 3]."""
+
+    dielectric: Tensor
+    metal: Tensor
+    reflectance: Tensor
 
 
 class Evidence(NamedTuple):
     """Evidence of the views for N Gaussians.
 
     Attributes:
-        ratio: [N] log(E_dielectric / E_metal), over the neighborhood, in which those of like brightness count.
-        misfit: [N] root of the mean E_dielectric of the neighborhood: how far from any dielectric.
+        ratio: [N] log likelihood ratio of metal and dielectric, per view. views: [N] how many independent views it has.
         reflectance: [N, 3] of the metal that fits best.
-        near: [N, K] int64 the neighborhoods, nearest first.
-        alike: [N, K] in [0, 1], how alike neighbors are turned, and how alike their color is: others belong to
-            another surface, such as the table under a pot, or are of another material, such as the tire around a wheel.
-        brightness: [N] mean S0 of what is seen, over that of all that is seen.
-        tint: [N] in [0, 1], what is seen in the weakest over that in the strongest color, each over the scene's mean,
-            of the neighborhood: of a metal no less than its reflectances are apart.
-        metal_misfit: [N] root of the mean E_metal of the neighborhood.
-        oblique: [N] root of the mean square of what is polarized at 45 degrees to the plane of incidence, of the
-            neighborhood, relative like the residuals.
-        support: [N] share of the neighborhood that enough views show.
+        color: [N, 3] mean S0.
         labels: [N, 2] weight of pixels that the user calls dielectric and metal.
     """
 
     ratio: Tensor
-    misfit: Tensor
+    views: Tensor
     reflectance: Tensor
-    near: Tensor
-    alike: Tensor
-    brightness: Tensor
-    tint: Tensor
-    metal_misfit: Tensor
-    oblique: Tensor
-    support: Tensor
+    color: Tensor
     labels: Tensor
 
 
-class _Explanations(NamedTuple):
-    """How each of N Gaussians is explained by itself: mean squares of residuals as a dielectric and as a metal, that
-    metal's reflectance [N, 3], the mean square at 45 degrees, how much is known of it, and its color [N, 3].
-    """
+def errors(samples: ViewSamples, refractive_index: float, light: float, dark: float) -> Errors:
+    """Errors of both explanations of N Gaussians.
 
-    dielectric: Tensor
-    metal: Tensor
-    reflectance: Tensor
-    oblique: Tensor
-    known: Tensor
-    color: Tensor
+    Args:
+        light: mean radiance of the scene, S0. dark: radiance added to the one that errors are relative to.
+    """
+    s0, across, cosine = samples.s0, samples.across, samples.cosine[..., None]
+    sine2 = 1 - cosine * cosine
+    above = s0.clamp(min=0) + dark  # the variance of light that is counted grows with the light
+    weight = samples.weight[..., None] / above
+    scale = (weight * above * above).sum(dim=0).clamp(min=1e-9)
+
+    def mean(square: Tensor) -> Tensor:
+        return ((weight * square).sum(dim=0) / scale).mean(dim=1)
+
+    specular, diffuse = (slope * sine2 for slope in optics.dolp_slopes(cosine, refractive_index))
+    bodies = []
+    for left in ROUGH:
+        over = left * specular
+        by_line, of_body, seen = weight / (1 + over * over), over + diffuse, over * s0 - across
+        body = (by_line * of_body * seen).sum(dim=0) / (by_line * of_body**2).sum(dim=0).clamp(min=1e-9)
+        bodies.append(mean((seen - of_body * body.clamp(min=0)) ** 2 / (1 + over * over)))
+    color = (samples.weight[..., None] * s0).sum(dim=0)
+    color = (color / color.amax(dim=1, keepdim=True).clamp(min=1e-6)).clamp(min=0.05)
+    metals, tried = [], [level * color**power for power in POWERS for level in LEVELS]
+    for reflectance in tried:
+        degree = optics.conductor(cosine, reflectance)[1] * sine2
+        metals.append(mean((across - degree * s0) ** 2 / (1 + degree * degree)))
+    metal, chosen = torch.stack(metals).min(dim=0)
+    s, p = reflectances_from_cosine(cosine, refractive_index)
+    oblique = mean(samples.oblique**2)
+    beyond = mean((samples.oblique.abs() - (s * p).sqrt() * light).clamp(min=0) ** 2)
+    dielectric = (torch.stack(bodies).amin(dim=0) - (oblique - beyond).clamp(min=0)).clamp(min=0) + beyond
+    best = torch.stack(tried)[chosen, torch.arange(len(chosen), device=chosen.device)]
+    return Errors(dielectric, (metal - oblique).clamp(min=0), best)
 
 
 @torch.no_grad()
@@ -135,6 +125,7 @@ def evidence(
     rasterize: Rasterize,
     refractive_index: float,
     rules: MetalRules,
+    limits: MetalViews,
     memory: MemoryBound = UNBOUNDED,
 ) -> Evidence:
     """Evidence of the views for each Gaussian; see ``training.metals.evidence``.
@@ -142,115 +133,43 @@ def evidence(
     Views whose pictures do not determine the Stokes vector say what the user says of materials in them, no more.
     """
     labels = label_weights(gaussians, views, rasterize, memory)
-    explained = None
-    if measured := evenly([view for view in views if view.is_determined], rules.most_views):
-        looks = view_sums(gaussians, memory.between(measured), rasterize, rules)
-        explained = _explained(looks, refractive_index, rules)
-        del looks
+    measured = evenly([view for view in views if view.is_determined], limits.most_views)
+    if not measured:
+        none = labels.new_zeros(len(labels))
+        gray = labels.new_full((len(labels), 3), FIRST_REFLECTANCE)
+        return Evidence(none, none, gray, torch.zeros_like(gray), labels)
+    looks = view_sums(gaussians, memory.between(measured), rasterize, limits)
+    result = of_views(looks, labels, refractive_index, rules, limits)
+    del looks
     memory.clear()
-    near, alike = _neighborhoods(gaussians, rules.neighbors)
-    if explained is None:
-        return _nothing_measured(near, alike, labels)
-    return _of_neighbors(explained, near, alike, labels, rules)
+    return result
 
 
-def _chunks(count: int) -> list[slice]:
-    """Some Gaussians at a time, so that what is computed of all of them takes little memory."""
-    return [slice(begin, min(begin + CHUNK, count)) for begin in range(0, max(1, count), CHUNK)]
-
-
-def _neighborhoods(gaussians: Parameters, most: int) -> tuple[Tensor, Tensor]:
-    """The nearest of each Gaussian [N, K], and how alike they are turned."""
-    means = gaussians["means"].detach()
-    places = means.cpu().double().numpy()
-    count = min(most, len(places))
-    tree, axes = (
-        cKDTree(places),
-        shortest_axis_normals(
-            means, gaussians["quaternions"], gaussians["log_scales"], means.new_zeros(3), None
-        ),
-    )
-    near = torch.empty(len(places), count, dtype=torch.int64, device=means.device)
-    alike = means.new_empty(len(places), count)
-    for chunk in _chunks(len(places)):
-        neighbors = torch.from_numpy(tree.query(places[chunk], k=count)[1])
-        near[chunk] = neighbors.view(-1, count).to(means.device)
-        alike[chunk] = dot(axes[chunk, None], axes[near[chunk]]) ** 4
-    return near, alike
-
-
-def _nothing_measured(near: Tensor, alike: Tensor, labels: Tensor) -> Evidence:
-    """Evidence of the user's words alone."""
-    none = labels.new_zeros(len(labels))
-    gray = labels.new_full((len(labels), 3), FIRST_REFLECTANCE)
-    return Evidence(none, none, gray, near, alike, none, none, none, none, none, labels)
-
-
-def _explained(looks: Sequence[Tensor], refractive_index: float, rules: MetalRules) -> _Explanations:
-    """Explanations of all Gaussians, of which ``looks`` are ``view_sums``."""
-    parts = []
-    for chunk in _chunks(len(looks[0])):
-        samples = samples_of(looks, chunk, rules)
-        total = samples.weight.sum(dim=0)
-        effective = total * total / (samples.weight**2).sum(dim=0).clamp(min=1e-9)
-        color = (samples.weight[..., None] * samples.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
-        certainty = total.clamp(max=20) * (effective > rules.least_views)
-        fitted = residuals(samples, refractive_index, rules)
-        parts.append(
-            _Explanations(*fitted, oblique_light(samples, rules.dark), certainty, color.clamp(min=0))
-        )
-    return _Explanations(*(torch.cat(values) for values in zip(*parts, strict=True)))
-
-
-def _of_neighbors(
-    explained: _Explanations, near: Tensor, alike: Tensor, labels: Tensor, rules: MetalRules
+def of_views(
+    looks: Sequence[Tensor], labels: Tensor, refractive_index: float, rules: MetalRules, limits: MetalViews
 ) -> Evidence:
-    """Evidence of what was measured, over neighborhoods in which those of like color count."""
-    certainty = explained.known
-    mean = (explained.color * certainty[:, None]).sum(dim=0) / certainty.sum().clamp(min=1e-6)
-    tints = explained.color / mean.clamp(min=1e-6)
-    color = explained.color + rules.dark
-    brightness = color.mean(dim=1)
-    floor = rules.least_residual
-    ratio = (explained.dielectric.clamp(min=floor) / explained.metal.clamp(min=floor)).log()
-    each = (
-        ratio,
-        explained.dielectric,
-        explained.metal,
-        explained.oblique,
-        *explained.reflectance.unbind(1),
-        *tints.unbind(1),
+    """Evidence of what views measured, as of ``view_sums``, and of the user's labels."""
+    sums = torch.stack([look.sum(dim=0) for look in looks]).sum(dim=0)
+    light = float(sums[1:4].mean() / sums[0].clamp(min=1e-6))
+    parts = []
+    for begin in range(0, len(labels), CHUNK):
+        samples = samples_of(looks, slice(begin, begin + CHUNK), limits)
+        total = samples.weight.sum(dim=0)
+        count = total * total / (samples.weight**2).sum(dim=0).clamp(min=1e-9) * (total > LEAST_PIXELS)
+        color = (samples.weight[..., None] * samples.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
+        parts.append((*errors(samples, refractive_index, light, limits.dark), count, color, total))
+    dielectric, metal, reflectance, count, color, total = (
+        torch.cat(values) for values in zip(*parts, strict=True)
     )
-    means, support = [], []
-    for chunk in _chunks(len(near)):
-        nearest = near[chunk]
-        like_color = _like_color(color, chunk, nearest, rules)
-        trust = (certainty + 1e-6)[nearest] * like_color
-        whole = trust.sum(dim=1)
-        means.append(torch.stack([(values[nearest] * trust).sum(dim=1) / whole for values in each]))
-        support.append((certainty > rules.least_weight).float()[nearest].mean(dim=1))
-        alike[chunk] *= like_color
-    ratio, dielectric, metal, oblique, *rest = torch.cat(means, dim=1)
-    tints = torch.stack(rest[3:], dim=1)
-    return Evidence(
-        ratio=ratio,
-        misfit=dielectric.sqrt(),
-        reflectance=torch.stack(rest[:3], dim=1),
-        near=near,
-        alike=alike,
-        brightness=brightness * certainty.sum() / (brightness * certainty).sum().clamp(min=1e-6),
-        tint=tints.amin(dim=1) / tints.amax(dim=1).clamp(min=1e-6),
-        metal_misfit=metal.sqrt(),
-        oblique=oblique.sqrt(),
-        support=torch.cat(support),
-        labels=labels,
-    )
+    typical = torch.minimum(dielectric, metal)[count > UNKNOWNS]
+    error = typical.median().clamp(min=NOISE) if len(typical) else dielectric.new_tensor(1.0)
+    ratio = ((error + dielectric) / (error + metal)).log() - _tint_cost(color, total, rules)
+    return Evidence(ratio, (count - UNKNOWNS).clamp(min=0), reflectance, color.clamp(min=0), labels)
 
 
-def _like_color(color: Tensor, which: slice, near: Tensor, rules: MetalRules) -> Tensor:
-    """How much the neighbors [n, K] of some Gaussians look like them, in [0, 1]; of colors [N, 3] over 0."""
-    brightness, logarithms = color.mean(dim=1).log(), color.log()
-    tint = logarithms - logarithms.mean(dim=1, keepdim=True)
-    brighter = (brightness[near] - brightness[which, None]) / rules.like_brightness
-    tinted = (tint[near] - tint[which, None]) / rules.like_tint
-    return torch.exp(-0.5 * (brighter.square() + tinted.square().mean(dim=2)))
+def _tint_cost(color: Tensor, weight: Tensor, rules: MetalRules) -> Tensor:
+    """What it costs a metal [N] to be more deeply colored than gold in the mean light of the scene."""
+    mean = (color * weight[:, None]).sum(dim=0) / weight.sum().clamp(min=1e-6)
+    tints = (color / mean.clamp(min=1e-6)).clamp(min=1e-3)
+    tint = (tints.amin(dim=1) / tints.amax(dim=1)).log()
+    return 0.5 * ((math.log(GOLD) - tint).clamp(min=0) / rules.like_color) ** 2

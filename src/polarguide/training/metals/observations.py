@@ -22,7 +22,10 @@ from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.metal import any_nonzero
 from polarguide.shading.model import Parameters
 from polarguide.training.priors import guide_normals
-from polarguide.training.rules import MetalRules
+from polarguide.training.rules import MetalViews
+
+# Pixels in all views from which on a Gaussian is measured, or labeled.
+LEAST_PIXELS = 0.3
 
 
 class ViewSamples(NamedTuple):
@@ -38,12 +41,12 @@ class ViewSamples(NamedTuple):
 
 
 def view_sums(
-    gaussians: Parameters, views: Iterable[View], rasterize: Rasterize, rules: MetalRules
+    gaussians: Parameters, views: Iterable[View], rasterize: Rasterize, limits: MetalViews
 ) -> list[Tensor]:
     """Sums [N, 11] over the pixels of each view; every view has to determine the Stokes vector. ``samples_of`` turns
     them into means.
     """
-    return [_look(gaussians, view, rasterize, rules.least_normal) for view in views]
+    return [_look(gaussians, view, rasterize, limits.least_normal) for view in views]
 
 
 def evenly(views: Sequence[View], most: int) -> Sequence[View]:
@@ -51,13 +54,13 @@ def evenly(views: Sequence[View], most: int) -> Sequence[View]:
     return views[:: max(1, -(-len(views) // most))]
 
 
-def shares(gaussians: Parameters, view: View, target: Tensor, rasterize: Rasterize) -> Tensor:
+def shares(gaussians: Parameters, camera: Camera, target: Tensor, rasterize: Rasterize) -> Tensor:
     """Sums [N, C] over the pixels of a picture [H, W, C], each by what the Gaussian has in it."""
     with torch.no_grad():
         fixed = splats(gaussians)
     features = target.new_zeros(len(fixed.means), target.shape[-1], requires_grad=True)
     with torch.enable_grad():
-        (rasterize(fixed._replace(features=features), view.camera).features * target).sum().backward()
+        (rasterize(fixed._replace(features=features), camera).features * target).sum().backward()
     assert features.grad is not None
     return features.grad
 
@@ -79,17 +82,17 @@ def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal:
     one = torch.ones_like(x)[..., None]
     good = (reliable & ~(view.invalid | view.saturated))[..., None]
     target = torch.cat((one, s0, across, oblique, -dot(guide, rays)[..., None]), dim=-1) * good
-    return shares(gaussians, view, target.contiguous(), rasterize)
+    return shares(gaussians, view.camera, target.contiguous(), rasterize)
 
 
-def samples_of(looks: Sequence[Tensor], which: slice, rules: MetalRules) -> ViewSamples:
+def samples_of(looks: Sequence[Tensor], which: slice, limits: MetalViews) -> ViewSamples:
     """Means of the sums of some Gaussians, with the weight of views that count."""
     sums = torch.stack([look[which] for look in looks])
     weight = sums[..., 0]
     means = sums[..., 1:] / weight.clamp(min=1e-6)[..., None]
     cosine = means[..., 9].clamp(0, 1)
-    counts = weight > rules.least_share * weight.amax(dim=0)
-    counts &= (cosine > rules.cosines[0]) & (cosine < rules.cosines[1])
+    counts = weight > limits.least_share * weight.amax(dim=0)
+    counts &= (cosine > limits.cosines[0]) & (cosine < limits.cosines[1])
     return ViewSamples(weight * counts, means[..., :3], means[..., 3:6], means[..., 6:9], cosine)
 
 
@@ -123,7 +126,7 @@ def contradicted(
     views: Iterable[View],
     rasterize: Rasterize,
     labels: Tensor,
-    rules: MetalRules,
+    limits: MetalViews,
     memory: MemoryBound = UNBOUNDED,
 ) -> dict[str, float]:
     """Views whose words the other views contradict, the most contradicted first, with the share of those words of
@@ -136,10 +139,10 @@ def contradicted(
     for view in memory.between(labeled_views(views)):
         own = _labels_in(gaussians, view, rasterize)
         others = (labels - own).clamp(min=0)
-        own = own * (others.sum(dim=1, keepdim=True) > rules.least_weight)
+        own = own * (others.sum(dim=1, keepdim=True) > LEAST_PIXELS)
         opposed = (own * (others.flip(1) > others)).sum()
         share = float(opposed / own.sum().clamp(min=1e-6))
-        if share > rules.contradicted:
+        if share > limits.contradicted:
             views_contradicted[view.name] = share
     return dict(sorted(views_contradicted.items(), key=lambda item: -item[1]))
 
@@ -147,8 +150,20 @@ def contradicted(
 def _labels_in(gaussians: Parameters, view: View, rasterize: Rasterize) -> Tensor:
     assert view.materials is not None
     kinds = view.materials.to(gaussians["means"].device)
-    target = torch.stack(((kinds == 1) | (kinds > 2), kinds == 2), dim=-1).float()
-    return shares(gaussians, view, target, rasterize)
+    return _labeled(gaussians, view, [(kinds == 1) | (kinds > 2), kinds == 2], rasterize)
+
+
+def _labeled(gaussians: Parameters, view: View, kinds: Sequence[Tensor], rasterize: Rasterize) -> Tensor:
+    """Pixels [N, K] of kinds [H, W] bool in a view, where labels cover at least half of what it shows of a Gaussian.
+
+    At the outline of what is labeled, what lies behind and beside it is in the same pixels.
+    """
+    assert view.materials is not None
+    named = view.materials.to(gaussians["means"].device) > 0
+    target = torch.stack((named, torch.ones_like(named), *kinds), dim=-1).float()
+    parts = [part.contiguous() for part in target.split(MAX_CHANNELS, dim=-1)]
+    sums = torch.cat([shares(gaussians, view.camera, part, rasterize) for part in parts], dim=1)
+    return sums[:, 2:] * (sums[:, 0] >= 0.5 * sums[:, 1])[:, None]
 
 
 # Pixels of a Gaussian in all views from which on what they say counts.
@@ -180,10 +195,9 @@ def index_offsets(
         assert view.materials is not None
         kinds = view.materials.to(means.device)
         here = [number for number in numbers if number in labels[view.name]]
-        target = torch.stack(((kinds == 1) | (kinds == 2), *(kinds == k for k in here)), dim=-1).float()
         columns = [0, *(1 + numbers.index(number) for number in here)]
-        for some, part in zip(_batched(columns), target.split(MAX_CHANNELS, dim=-1), strict=True):
-            weights[:, some] += shares(gaussians, view, part.contiguous(), rasterize)
+        masks = [(kinds == 1) | (kinds == 2), *(kinds == number for number in here)]
+        weights[:, columns] += _labeled(gaussians, view, masks, rasterize)
     offsets = means.new_tensor([0.0, *(indices[number] - refractive_index for number in numbers)])
     most, chosen = weights.max(dim=1)
     specified = torch.where(most > LEAST_SEEN, offsets[chosen], torch.zeros_like(most))
@@ -194,11 +208,6 @@ def index_offsets(
 def numbers_in(view: View) -> set[int]:
     """Numbers of the dielectrics with indices of their own that a view says it shows."""
     return set() if view.materials is None else set(view.materials.unique().tolist()) - {0, 1, 2}
-
-
-def _batched(columns: list[int]) -> list[list[int]]:
-    """So many at a time as a rasterizer takes channels."""
-    return [columns[k : k + MAX_CHANNELS] for k in range(0, len(columns), MAX_CHANNELS)]
 
 
 @torch.no_grad()

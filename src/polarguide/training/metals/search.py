@@ -1,18 +1,13 @@
-"""The search for metals in a training: when it looks, how it decides, and what it tells the user.
-
-Seeds begin, likely neighbors join, and small or unsure regions are dropped.
-"""
+"""The search for metals in a training: when it looks, what it changes, and what it tells the user."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from torch import Tensor
 
 from polarguide.capture import Scene, View
 from polarguide.capture.view import listed
@@ -23,89 +18,13 @@ from polarguide.raster import Backend, Rasterize
 from polarguide.shading.gbuffer import render
 from polarguide.shading.model import Light, ShadingModel
 from polarguide.training.distributed import Ranks
-from polarguide.training.metals.evidence import Evidence, evidence
+from polarguide.training.metals.cut import decide
+from polarguide.training.metals.evidence import evidence
 from polarguide.training.metals.observations import contradicted, evenly
-from polarguide.training.recipe import Recipe
-from polarguide.training.rules import Limits, MetalRules
+from polarguide.training.recipe import Recipe, Schedule
+from polarguide.training.rules import MetalViews
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import TrainingState
-
-
-def decide(measured: Evidence, was: Tensor, allowed: Tensor, rules: MetalRules) -> Tensor:
-    """Which Gaussians are metals, [N] bool: hysteresis thresholding on the graph of neighbors.
-
-    Seeds have evidence above ``begin``, or above ``stay`` if they were metals before; the others of those have to join
-    again, or a metal would creep on over its surroundings. Regions grow to neighbors with evidence above ``proceed``.
-    Isolated Gaussians and regions with few seeds are dropped, and holes are filled. The user's labels override all.
-
-    Args:
-        was: [N] bool, metals until now. allowed: [N] bool, those that may be.
-    """
-    labeled = measured.labels.sum(dim=1) > rules.least_weight
-    labeled_metal = labeled & (measured.labels[:, 1] > measured.labels[:, 0])
-    allowed = allowed & ~labeled & (measured.tint > rules.least_tint)
-    able = allowed & (measured.misfit > rules.proceed_misfit) & (measured.support > rules.least_support)
-    no_dielectric = measured.misfit > rules.begin_misfit
-    surely = labeled_metal | (able & no_dielectric & (measured.ratio > rules.begin))
-    begun = surely | (able & was & (measured.ratio > rules.stay))
-    metal = _regions(measured, surely, begun, able & (measured.ratio > rules.proceed), rules)
-    surely = able & no_dielectric & _obliquely(measured, rules.begin_oblique)
-    likely = able & _obliquely(measured, rules.proceed_oblique)
-    metal |= _regions(measured, surely, surely | (was & likely), likely, rules)
-    # Nothing is known of what hardly any view shows, and its evidence is 0: among metals, it is one.
-    among = allowed & (measured.ratio > rules.among)
-    return labeled_metal | _grown(measured, metal, among, rules.majority, rules.filling, rules.nearest)
-
-
-def _obliquely(measured: Evidence, limits: Limits) -> Tensor:
-    """Whether so much is polarized at 45 degrees that it tells of metal, and explains the metal's misfit."""
-    much = (measured.oblique > limits.oblique) & (measured.oblique * measured.brightness > limits.light)
-    return (
-        much
-        & (measured.metal_misfit**2 < limits.times * measured.oblique**2)
-        & (measured.ratio > limits.ratio)
-    )
-
-
-def _regions(measured: Evidence, surely: Tensor, metal: Tensor, likely: Tensor, rules: MetalRules) -> Tensor:
-    """Metals [N]: ``metal`` grown over ``likely``, in connected regions with enough seeds that are sure."""
-    metal = _grown(measured, metal, likely, rules.crowd, rules.rounds, rules.nearest)
-    metal = metal & (_share_of_nearest(measured, metal, rules.nearest) > rules.alone)
-    touching = measured.alike[:, : rules.nearest] > rules.touching
-    return metal & _sure_enough(measured.near[:, : rules.nearest], touching, metal, surely, rules)
-
-
-def _share_of_nearest(measured: Evidence, metal: Tensor, nearest: int) -> Tensor:
-    """Share [N] of metals among the nearest of each, by how alike they are."""
-    counts = measured.alike[:, :nearest]
-    return (metal[measured.near[:, :nearest]] * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1e-6)
-
-
-def _grown(
-    measured: Evidence, metal: Tensor, likely: Tensor, share: float, rounds: int, nearest: int
-) -> Tensor:
-    """``metal`` [N], and what is ``likely`` and has more than this share of metals among its nearest, over and over."""
-    for _ in range(rounds):
-        grown = metal | (likely & (_share_of_nearest(measured, metal, nearest) > share))
-        if bool((grown == metal).all()):
-            break
-        metal = grown
-    return metal
-
-
-def _sure_enough(
-    nearest: Tensor, touching: Tensor, metal: Tensor, surely: Tensor, rules: MetalRules
-) -> Tensor:
-    """Which metals [N] lie in a connected region with enough seeds that are sure."""
-    near, inside, sure = nearest.cpu().numpy(), metal.cpu().numpy(), surely.cpu().numpy()
-    edges = touching.cpu().numpy() & inside[:, None] & inside[near]
-    rows, columns = np.nonzero(edges)
-    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, near[rows, columns])), shape=(len(inside),) * 2)
-    regions, region = connected_components(graph, directed=False)
-    counts = np.bincount(region, minlength=regions)
-    certain = np.bincount(region[sure & inside], minlength=regions)
-    enough = (certain >= rules.fewest_sure) & (certain >= rules.sure_share * counts)
-    return torch.from_numpy(enough[region]).to(metal.device)
 
 
 @torch.no_grad()
@@ -115,7 +34,7 @@ def light_gain(
     views: Sequence[View],
     rasterize: Rasterize,
     shading: ShadingModel,
-    rules: MetalRules,
+    limits: MetalViews,
     memory: MemoryBound = UNBOUNDED,
 ) -> float:
     """By how much the light should be brighter, as the first metals show it.
@@ -127,25 +46,25 @@ def light_gain(
         so little that strengths would have to exceed 1.
     """
     ratios, pixels = [], 0
-    for view in memory.between(evenly(views, rules.gain_views)):
+    for view in memory.between(evenly(views, limits.gain_views)):
         photograph = view.photograph().to(gaussians["means"].device).flatten(0, 1)
         metal = render(gaussians, view.camera, rasterize, shading=shading, light=light).metal
         pixels += len(photograph)
         if metal is None:
             continue
-        clear = (metal.share > rules.gain_share) & ~(view.saturated | view.invalid).to(
+        clear = (metal.share > limits.gain_share) & ~(view.saturated | view.invalid).to(
             photograph.device
         ).flatten()[metal.pixels]
         rendered = metal.specular[clear].mean(dim=1) / metal.share[clear]
         ratios.append(((photograph[metal.pixels[clear]].mean(dim=1) + 1e-3) / (rendered + 1e-3)).log())
     ratio = torch.cat(ratios) if ratios else gaussians["means"].new_zeros(0)
-    if not len(ratio) or len(ratio) < rules.gain_pixels * pixels:
+    if not len(ratio) or len(ratio) < limits.gain_pixels * pixels:
         return 1.0
     body = gaussians["metalness"] == 0
     least = (
         torch.quantile(shading.strength(gaussians)[body], 0.9) if bool(body.any()) else ratio.new_tensor(0.1)
     )
-    return float(ratio.median().exp().clamp(min=float(least), max=rules.most_gain))
+    return float(ratio.median().exp().clamp(min=float(least), max=limits.most_gain))
 
 
 class MetalSearch:
@@ -170,26 +89,25 @@ class MetalSearch:
         memory: MemoryBound,
     ) -> None:
         self._scene, self._shading = scene, shading
-        self._between, self._rules = recipe.metals, recipe.metal_rules
+        self._between, self._rules, self._limits = recipe.metals, recipe.metal_rules, recipe.metal_views
         self._index, self._backend, self._ranks, self._warn = settings.refractive_index, backend, ranks, warn
         self._memory = memory
         self._on = shading.knows_metals and settings.materials == "auto"
-        self._told = False
+        self._told, self._steps = False, settings.steps
+        self._refreshes, self._looks = refreshes(recipe, settings.steps), looks(recipe, settings)
 
-    def is_due(self, share: float) -> bool:
-        """Whether a refresh after this share of the steps looks for metals."""
-        first, last = self._between
-        return self._on and first <= share < last
+    def is_due(self, step: int) -> bool:
+        """Whether a refresh at this step looks for metals."""
+        return self._on and _within(self._between, step, self._steps)
 
-    def warn_if_never(self, refreshes: Iterable[float]) -> None:
-        """Say so where the user names materials and no refresh is due, of those after these shares of the steps.
+    def warn_if_never(self) -> None:
+        """Say so where the user names materials and no refresh is due.
 
         Recipes that never refresh their priors, such as controls, do not look for metals and get no warning.
         """
         if not self._on or not any(_names_metals(view) for view in self._scene.train_views):
             return
-        shares = list(refreshes)
-        if shares and not any(map(self.is_due, shares)):
+        if self._refreshes and not self._looks:
             first, last = (100 * share for share in self._between)
             self._warn(
                 f"materials/ is read at refreshes of the priors between {first:.0f} and {last:.0f} % of the steps. "
@@ -202,9 +120,9 @@ class MetalSearch:
         if not any(view.is_determined or view.materials is not None for view in views):
             return
         gaussians, rasterize = state.gaussians, self._backend.rasterize
-        measured = evidence(gaussians, views, rasterize, self._index, self._rules, self._memory)
+        measured = evidence(gaussians, views, rasterize, self._index, self._rules, self._limits, self._memory)
         if not self._told and (
-            wrong := contradicted(gaussians, views, rasterize, measured.labels, self._rules, self._memory)
+            wrong := contradicted(gaussians, views, rasterize, measured.labels, self._limits, self._memory)
         ):
             self._told = True
             names = listed([f"materials/{name}.png" for name in wrong])
@@ -213,9 +131,11 @@ class MetalSearch:
                 "dielectric in one view, metal in another. The larger part counts; look at these files."
             )
         centers = torch.stack([view.camera.center for view in self._scene.train_views])
-        near = ~far_away(gaussians["means"].detach().cpu(), self._scene.points, centers, self._rules.reach)
-        was = gaussians["metalness"] > 0
-        metal = decide(measured, was, near.to(was.device), self._rules).float()
+        near = ~far_away(gaussians["means"].detach().cpu(), self._scene.points, centers, self._limits.reach)
+        if not any(view.is_determined for view in views):  # then nothing tells how far a label reaches
+            near = torch.zeros_like(near)
+        rules = replace(self._rules, prior=self._share_of_prior(state.step) * self._rules.prior)
+        metal = decide(measured, gaussians, near.to(measured.ratio.device), rules).float()
         reflectance = measured.reflectance
         for values in (metal, reflectance):
             self._ranks.broadcast(values)
@@ -227,12 +147,38 @@ class MetalSearch:
             determined,
             rasterize,
             self._shading,
-            self._rules,
+            self._limits,
             self._memory,
         )
         self._shading.become_metal(gaussians, state.light, metal > 0, reflectance, gain)
         del measured
         self._memory.clear()
+
+    def _share_of_prior(self, step: int) -> float:
+        """The prior grows from look to look, and counts whole at the last.
+
+        Normals of a metal that is shaded as a dielectric are wrong, and its evidence with them. What is likely is
+        therefore shaded as a metal first, and is a dielectric again where its own normals do not confirm it.
+        """
+        return max(1, bisect_right(self._looks, step)) / max(1, len(self._looks))
+
+
+def refreshes(recipe: Recipe, steps: int) -> list[int]:
+    """The steps of a training that refresh its priors."""
+    schedule = Schedule(recipe, steps)
+    return [step for step in range(steps) if "refresh_priors" in schedule.at(step).actions]
+
+
+def looks(recipe: Recipe, settings: ResolvedSettings) -> list[int]:
+    """The steps at which a training decides what is metal; none: it takes everything for dielectric."""
+    if not recipe.shading.knows_metals or settings.materials != "auto":
+        return []
+    steps = settings.steps
+    return [step for step in refreshes(recipe, steps) if _within(recipe.metals, step, steps)]
+
+
+def _within(shares: tuple[float, float], step: int, steps: int) -> bool:
+    return shares[0] <= step / steps < shares[1]
 
 
 def _names_metals(view: View) -> bool:

@@ -48,8 +48,8 @@ class Baked:
     Attributes:
         color: [M, 3] linear. roughness: [M] as glTF has it. metalness: [M]. strength: [M] of the reflection.
         reflectance: [M, 3] of metals at normal incidence. index: [M] refractive index.
-        seen: [M] bool, whether a view shows the texel. nearest: [U] for each of the others the nearest texel in space
-            that one does, whose values it has.
+        normal: [M, 3] learned, not unit. seen: [M] bool, whether a view shows the texel.
+        nearest: [U] for each of the others the nearest texel in space that one does, whose values it has.
     """
 
     color: NDArray[np.float32]
@@ -58,6 +58,7 @@ class Baked:
     strength: NDArray[np.float32]
     reflectance: NDArray[np.float32]
     index: NDArray[np.float32]
+    normal: NDArray[np.float32]
     seen: NDArray[np.bool_]
     nearest: NDArray[np.int64]
 
@@ -68,7 +69,15 @@ class Baked:
         return values
 
 
-CHANNELS = {"color": 3, "roughness": 1, "metalness": 1, "strength": 1, "reflectance": 3, "index": 1}
+CHANNELS = {
+    "color": 3,
+    "roughness": 1,
+    "metalness": 1,
+    "strength": 1,
+    "reflectance": 3,
+    "index": 1,
+    "normal": 3,
+}
 CONSTANTS = {"roughness": 1.0, "metalness": 0.0, "strength": 0.0}
 """Of recipes that learn nothing of the kind: a matte dielectric."""
 
@@ -136,6 +145,8 @@ def _layers(model: GaussianModel, result: RenderResult, view: View, color: Color
     layers["reflectance"] = _reflectance(model, view.camera)
     index = torch.full(size, model.shading.refractive_index) if result.index is None else result.index
     layers["index"] = index[..., None]
+    assert result.normal is not None
+    layers["normal"] = result.normal
     return layers
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +17,13 @@ from polarguide.core.progress import Reporter
 from polarguide.core.system import free_memory
 from polarguide.results.export.model.bake import Baked, ColorSource, bake
 from polarguide.results.export.model.gltf import Textured, color_pixels, linear_pixels
-from polarguide.results.export.model.irradiance import WHAT, Surroundings, delit, irradiance
+from polarguide.results.export.model.irradiance import WHAT, Surroundings, arriving_light, delit, irradiance
 from polarguide.results.export.model.subject import Inside, SurfaceView, counted, subject_of, subject_surface
 from polarguide.results.export.model.texels import Texels, texels_of
 from polarguide.results.export.model.unwrap import Unwrapped, unwrap
 from polarguide.results.export.placement import Placement
 from polarguide.results.rendering.mesh import ColoredMesh, Surface, fused_surface, painted
-from polarguide.results.rendering.relight import needs_radiance
+from polarguide.results.rendering.relight import mirrored_light, needs_radiance
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.deferred import DeferredShading
@@ -47,7 +47,9 @@ BRIGHT_SHARE = 0.01
 """Of the surface may be brighter before all of it is darkened: highlights that are left, and noise."""
 SURROUNDINGS_RESOLUTION = 128
 """Voxels along the longest side of what lies outside the crop box: it only shades, and shadows are soft."""
-BYTES_PER_TEXEL = 160
+_TOGETHER = 1 << 18
+"""Texels whose irradiance is found together: about 100 MB."""
+BYTES_PER_TEXEL = 190
 """Most that a texel takes while textures are baked and filled: the sum of the arrays that are held together."""
 
 
@@ -67,21 +69,36 @@ def require_room(texture: int) -> None:
         )
 
 
-def textured_model(
+@dataclass(frozen=True, eq=False)
+class Charted:
+    """The subject of a run as a mesh with texture coordinates.
+
+    Attributes:
+        mesh: with colors of the diffuse layer. inside: what belongs to it. voxel: side of those it was fused in.
+        unwrapped: the mesh, split along the borders of charts. texels: of the texture.
+    """
+
+    mesh: ColoredMesh
+    inside: Inside | None
+    voxel: float
+    unwrapped: Unwrapped
+    texels: Texels
+
+
+def charted_subject(
     run: OpenedRun,
     surface_view: SurfaceView,
     presentation: Presentation,
-    placement: Placement,
     options: ModelOptions,
     resolution: int,
     folder: Path,
     reporter: Reporter,
-) -> Textured:
-    """The subject of a run as a textured mesh, upright (+y) as glTF has it.
+) -> Charted:
+    """The surface of what is to be exported, with texture coordinates.
 
     Args:
         run: of Gaussians; its scene is read. surface_view: renders a view of what lies in the crop box.
-        presentation, placement: how it is presented. options: of the model. resolution: voxels along its longest side.
+        presentation: how it is presented. options: of the model. resolution: voxels along its longest side.
         folder: for temporary files. reporter: receives progress, counts and warnings.
 
     Raises:
@@ -89,8 +106,7 @@ def textured_model(
             is asked of a recipe that learns no radiance.
     """
     require_room(options.texture)
-    kind = options.resolved_base_color
-    if kind == "delit":
+    if options.resolved_base_color == "delit":
         needs_radiance(run.model.shading, what=WHAT)
         require_package("embreex", WHAT, extra="model")
     with reporter.track("fusing the surface"):
@@ -99,21 +115,38 @@ def textured_model(
         mesh = painted(surface, views, box)
     reporter.say(counted(mesh.surface))
     unwrapped = unwrap(mesh.surface.vertices, mesh.surface.faces, options.texture, folder, reporter)
-    texels = texels_of(unwrapped, options.texture)
+    return Charted(mesh, inside, box.size, unwrapped, texels_of(unwrapped, options.texture))
+
+
+def textured_model(
+    run: OpenedRun,
+    subject: Charted,
+    presentation: Presentation,
+    placement: Placement,
+    options: ModelOptions,
+    reporter: Reporter,
+) -> Textured:
+    """The subject of a run as a textured mesh, upright (+y) as glTF has it.
+
+    Args:
+        run: of Gaussians; its scene is read. subject: its surface. presentation, placement: how it is presented.
+        options: of the model. reporter: receives progress and counts.
+    """
+    mesh, unwrapped, texels = subject.mesh, subject.unwrapped, subject.texels
+    kind = options.resolved_base_color
     vertices, normals = (values[unwrapped.source] for values in (mesh.surface.vertices, mesh.surface.normals))
     facing = texels.interpolated(unwrapped.faces, normals)
     facing /= np.maximum(np.linalg.norm(facing, axis=1, keepdims=True), 1e-9)
     places = texels.interpolated(unwrapped.faces, vertices)
-    baked = bake(run, run.scene.train_views, places, facing, SOURCES[kind], box.size, reporter)
+    baked = bake(run, run.scene.train_views, places, facing, SOURCES[kind], subject.voxel, reporter)
     reporter.say(
         f"{unwrapped.charts:,} charts, {len(texels.index) / options.texture**2:.0%} of the texture used; "
         f"{1 - baked.seen.mean():.1%} of the surface is in no view and has the nearest color"
     )
     light = None
     if kind == "delit":
-        light = texels.interpolated(
-            unwrapped.faces, _irradiance(run, mesh, inside, reporter)[unwrapped.source]
-        )
+        arriving = _arriving(run, mesh, subject.inside, reporter)[unwrapped.source]
+        light = _irradiance(texels, unwrapped.faces, arriving, _learned(baked.normal, facing), _index(run))
     color, baked = _presented(baked, light, presentation.color, _index(run), reporter)
     axes = run.frame.panorama_axes().numpy()
     textures = _textures(run, baked, texels, options.albedo_scale * color, lit=not options.unlit)
@@ -171,12 +204,38 @@ def _index(run: OpenedRun) -> float:
     return float(run.model.shading.refractive_index)
 
 
+def _learned(normals: NDArray[np.float32], facing: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Unit normals [M, 3] as they were learned; that of the mesh where none was, or one that looks away."""
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    agrees = (length > 1e-3) & ((normals * facing).sum(axis=1, keepdims=True) > 0)
+    return np.where(agrees, normals / np.maximum(length, np.float32(1e-3)), facing)
+
+
 def _irradiance(
+    texels: Texels,
+    faces: NDArray[np.int64],
+    arriving: NDArray[np.float64],
+    normals: NDArray[np.float32],
+    index: float,
+) -> NDArray[np.float32]:
+    """Irradiance [M, 3] at the texels, of the light [V, K, 3] that arrives at the vertices."""
+    count = arriving.shape[1]
+    light = np.empty_like(normals)
+    for begin in range(0, len(normals), _TOGETHER):
+        part = slice(begin, begin + _TOGETHER)
+        some = replace(texels, index=texels.index[part], face=texels.face[part], weights=texels.weights[part])
+        between = some.interpolated(faces, arriving.reshape(len(arriving), -1)).reshape(-1, count, 3)
+        light[part] = irradiance(between, normals[part], index)
+    return light
+
+
+def _arriving(
     run: OpenedRun, mesh: ColoredMesh, inside: Inside | None, reporter: Reporter
 ) -> NDArray[np.float64]:
-    """Irradiance [V, 3] at the vertices of the subject."""
+    """Harmonics [V, K, 3] of the light that arrives at the vertices of the subject."""
     cubemap = needs_radiance(run.model.shading, what=WHAT)
-    texels = run.light[cubemap.name].cpu()
+    with reporter.track("light that is mirrored", len(run.scene.train_views)) as progress:
+        texels = mirrored_light(run, cubemap, progress)
 
     def radiance(directions: NDArray[np.float64]) -> NDArray[np.float64]:
         found = cubemap.radiance(cubemap_lookup(texels, torch.from_numpy(directions).float()))
@@ -185,7 +244,7 @@ def _irradiance(
     around = Surroundings(radiance, mesh if inside is None else _joined(mesh, _outside(run, inside)))
     surface = mesh.surface
     with reporter.track("light on the surface", len(surface.vertices)) as progress:
-        return irradiance(surface.vertices, surface.normals, around, _index(run), progress)
+        return arriving_light(surface.vertices, surface.normals, around, progress)
 
 
 def _outside(run: OpenedRun, inside: Inside) -> ColoredMesh:

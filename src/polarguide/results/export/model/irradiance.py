@@ -5,7 +5,8 @@ A smooth dielectric with a diffuse base of albedo a has, seen at normal incidenc
     D = a T(0) E,   E = (1 / pi) integral of T(i) L(w) cos(i) dw
 
 with T the share of light that passes its surface. L is the environment's radiance where nothing is in the way, else the
-diffuse layer of what is hit: one bounce, of light that the run has measured with all bounces before it.
+diffuse layer of what is hit: one bounce, of light that the run has measured with all bounces before it. Rays begin at
+the vertices, where light is kept as spherical harmonics; normals are those of the texels, so that edges are sharp.
 """
 
 from __future__ import annotations
@@ -18,15 +19,23 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from polarguide.core.errors import optional_import
 from polarguide.core.progress import Advance
+from polarguide.gaussians.harmonics import sh_basis
+from polarguide.geometry.vectors import spread_directions
 from polarguide.optics import reflectances_from_cosine
 from polarguide.results.export.model.topology import Places
 from polarguide.results.rendering.mesh import ColoredMesh
 
-RAYS = 192
-"""Rays from each vertex: the noise of their mean is a few percent, and textures smooth it between vertices."""
+RAYS = 384
+"""Rays from each vertex to all sides: the noise of their mean is a few percent, and textures smooth it between
+vertices."""
+DEGREE = 2
+"""Of the harmonics that light is kept in: a cosine lobe passes hardly any of the others.
+
+Ramamoorthi and Hanrahan 2001 have shown it."""
 _TOGETHER = 1 << 19
 """Rays traced together: about 100 MB."""
 OFFSET = 2.5e-3
@@ -51,10 +60,8 @@ class Surroundings:
     occluder: ColoredMesh
 
 
-def irradiance(
-    points: Places, normals: Places, around: Surroundings, index: float, advance: Advance
-) -> Places:
-    """E [V, 3] at points [V, 3] with unit normals [V, 3], floored, for surfaces of a refractive index.
+def arriving_light(points: Places, normals: Places, around: Surroundings, advance: Advance) -> Places:
+    """Harmonics [V, K, 3] of the light that arrives at points [V, 3] of a surface with unit normals [V, 3].
 
     Raises:
         PolarguideError: embreex is not installed.
@@ -62,48 +69,48 @@ def irradiance(
     rays = _Rays(around.occluder)
     offset = OFFSET * float(np.linalg.norm(np.ptp(around.occluder.surface.vertices, axis=0)))
     random = np.random.default_rng(0)
-    local = _cosine_directions(random)
-    transmitted = 1 - _reflectance(local[:, 2], index)
-    total = np.zeros((len(points), 3))
+    spread = spread_directions(RAYS).numpy()
+    total = np.zeros((len(points), (DEGREE + 1) ** 2, 3))
     step = max(1, _TOGETHER // RAYS)
     for begin in range(0, len(points), step):
         part = slice(begin, begin + step)
-        frames = _frames(normals[part], random)
-        directions = np.einsum("vij,rj->vri", frames, local).reshape(-1, 3)
+        # Each turned at random: else all would share a pattern.
+        turns = Rotation.random(len(points[part]), random).as_matrix()
+        directions = spread @ turns
         origins = np.repeat(points[part] + offset * normals[part], RAYS, axis=0)
-        light = rays.arriving(origins, directions, around.radiance).reshape(-1, RAYS, 3)
-        total[part] = (transmitted[None, :, None] * light).mean(axis=1)
+        light = rays.arriving(origins, directions.reshape(-1, 3), around.radiance).reshape(-1, RAYS, 3)
+        total[part] = 4 * math.pi / RAYS * _basis(directions).swapaxes(1, 2) @ light
         advance(min(begin + step, len(points)))
-    return np.maximum(total, FLOOR * total.mean())
+    return total
+
+
+def irradiance(light: NDArray[Any], normals: NDArray[Any], index: float) -> NDArray[np.float32]:
+    """E [M, 3] on surfaces of a refractive index with unit normals [M, 3], of light in harmonics [M, K, 3]."""
+    cosines, weights = np.polynomial.legendre.leggauss(64)
+    cosines, weights = (cosines + 1) / 2, weights / 2
+    passed = 2 * weights * cosines * (1 - _reflectance(cosines, index))
+    lobe = [
+        (passed * legendre(cosines)).sum()
+        for legendre in map(np.polynomial.Legendre.basis, range(DEGREE + 1))
+    ]
+    each = np.repeat(lobe, 2 * np.arange(DEGREE + 1) + 1)  # a harmonic of degree l has 2 l + 1 orders
+    return np.asarray(np.einsum("mk,mkc->mc", each * _basis(normals), light), np.float32)
+
+
+def _basis(directions: NDArray[Any]) -> Places:
+    return np.asarray(sh_basis(torch.from_numpy(directions).double(), DEGREE).numpy())
 
 
 def delit(diffuse: NDArray[np.float32], light: NDArray[np.float32], index: float) -> NDArray[np.float32]:
     """Base color [..., 3] of the diffuse layer and irradiance; see the module's text."""
-    return diffuse / (light * np.float32(1 - _reflectance(np.ones(1), index)[0]))
+    floored = np.maximum(light, np.float32(FLOOR * light.mean()))
+    passed = np.float32(1 - _reflectance(np.ones(1), index)[0])
+    return np.asarray(diffuse / (floored * passed), np.float32)
 
 
 def _reflectance(cosine: NDArray[np.float64], index: float) -> NDArray[np.float64]:
     s, p = reflectances_from_cosine(torch.from_numpy(cosine), index)
     return np.asarray((0.5 * (s + p)).numpy())
-
-
-def _cosine_directions(random: np.random.Generator) -> Places:
-    """Directions [RAYS, 3] about +z, as many as the cosine of their angle to it: a spiral, so that they lie evenly."""
-    golden = math.pi * (3 - math.sqrt(5))
-    share = (np.arange(RAYS) + random.random(RAYS)) / RAYS
-    radius, turn = np.sqrt(share), golden * np.arange(RAYS)
-    return np.stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1 - share)], axis=1)
-
-
-def _frames(normals: Places, random: np.random.Generator) -> NDArray[np.float64]:
-    """Rotations [V, 3, 3] from +z to the normals, each turned by a random angle: else all would share a pattern."""
-    helper = np.where(np.abs(normals[:, :1]) > 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
-    first = np.cross(helper, normals)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    second = np.cross(normals, first)
-    angle = 2 * math.pi * random.random(len(normals))[:, None]
-    turned = np.cos(angle) * first + np.sin(angle) * second
-    return np.stack([turned, np.cross(normals, turned), normals], axis=2)
 
 
 class _Rays:

@@ -76,7 +76,7 @@ def subject_surface(
 
 
 def counted(surface: Surface) -> str:
-    """The counts of a mesh, for people."""
+    """A mesh's numbers of vertices, triangles, pieces and edges, as text."""
     counts = topology(surface.faces)
     return (
         f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, {counts.pieces} pieces; "

@@ -1,0 +1,284 @@
+"""Verbs of scene folders: prepare, inspect, present, synth."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from polarguide.cli.console import ConsoleReporter, console, say, use_threads
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import ComputeOptions, ThreadOptions
+from polarguide.inspection.settings import InspectSettings
+from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
+from polarguide.synth.settings import LONG_SECONDS, Overrides, SynthSettings, find_scene, rough_time
+
+
+def prepare(
+    source: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    out: Path,
+    settings: Annotated[PrepareSettings, tyro.conf.arg(name="")],
+    angles: Annotated[CalibrationOptions, tyro.conf.arg(name="")],
+    compute: Annotated[ThreadOptions, tyro.conf.arg(name="")],
+) -> None:
+    """Camera files to a scene folder: raw mosaics, shots through a rotating filter, published datasets.
+
+    A preparation that was stopped goes on with the same command. docs/reference/formats.md describes the files.
+
+    Args:
+        source: Folder of raw mosaics (one file a view), of filter shots (four folders or suffixes), or of a dataset.
+        out: Scene folder to write.
+    """
+    use_threads(compute.threads)
+    preparation = importlib.import_module("polarguide.preparation.prepare")
+    with_angles = replace(settings, calibration=angles.read(), analyzers=angles.analyzers())
+    prepared = preparation.prepare_scene(source, out, with_angles, ConsoleReporter())
+    without = f", {len(prepared.left_out)} left out" if prepared.left_out else ""
+    say(f"scene: {prepared.folder} ({len(prepared.views)} views{without})")
+    if prepared.posed:
+        say(f"next: polarguide inspect {prepared.folder}")
+        say(f"then: polarguide train {prepared.folder} --out runs/{prepared.folder.name}")
+    else:
+        say("it has no poses: repeat the command with --poses sfm or --poses PATH")
+        say(
+            f"each view alone: polarguide priors {prepared.folder} --out {prepared.folder.name}-priors",
+        )
+
+
+COLORS = {"ok": "green", "warning": "yellow", "wrong": "bold red", "n/a": "dim", "not verified": "magenta"}
+
+
+def inspect(
+    scene: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    out: Path | None = None,
+    fix: Path | None = None,
+    settings: Annotated[InspectSettings, tyro.conf.arg(name="")],
+    compute: Annotated[ComputeOptions, tyro.conf.arg(name="")],
+) -> None:
+    """Check a capture: a page, a JSON file, and the order of its angles by geometry.
+
+    Each check ends in ok, warning, wrong or n/a, and says what to do. Works without poses; order, sense and zero of the
+    angles take poses. docs/how-to/inspect.md describes the checks and what they cannot decide.
+
+    Args:
+        scene: Scene folder.
+        out: Folder to write; without it SCENE-inspection beside the scene.
+        fix: New folder for a corrected copy of the scene, if order, sense or zero are wrong and decided.
+    """
+    if fix is not None and settings.calibration is not None:
+        raise PolarguideError(
+            "--fix",
+            expected="no --calibration beside it: the copy would be without it",
+            found="both",
+            remedy="Prepare the mosaics anew with --calibration, and fix that scene.",
+        )
+    use_threads(compute.threads)
+    reporter = ConsoleReporter()
+    inspection = importlib.import_module("polarguide.inspection.inspect")
+    folder = inspection.inspection_folder(scene, out)
+    backend = importlib.import_module("polarguide.raster").choose_backend(compute.device, say=reporter.say)
+    inspected = inspection.inspect_scene(scene, folder, settings, backend, reporter)
+    page, record = importlib.import_module("polarguide.inspection.report").write_inspection(
+        inspected, folder, reporter
+    )
+    _print_checks(inspected.checks)
+    if inspected.capture.four:
+        _print_angles(inspected.angles)
+    _print_verdict(inspected)
+    say(f"page: {page}   figures: {record}")
+    if fix is not None:
+        _fix(inspected, fix, reporter)
+
+
+def _fix(inspected: Any, out: Path, reporter: ConsoleReporter) -> None:
+    """Write the corrected copy, or say that there is nothing to correct."""
+    fixing = importlib.import_module("polarguide.inspection.corrections")
+    if not inspected.capture.four:
+        raise PolarguideError(
+            "--fix",
+            expected="a scene with four pictures of each view",
+            found="a scene whose angles stand in a table",
+            remedy="Correct SCENE/angles.csv as the report says, or repeat prepare.",
+        )
+    change = fixing.correction(inspected.capture, inspected.angles)
+    if change is None:
+        say("fix: order, sense and zero are right; nothing was written.")
+        return
+    copy = fixing.fix_scene(inspected.capture, change, out, reporter)
+    say(f"fixed: {out}: {copy}. {inspected.capture.root} is as it was.")
+
+
+def _print_checks(checks: Any) -> None:
+    previous = ""
+    for check in checks:
+        console.print(f"[{COLORS[check.verdict]}]{check.verdict:>12}[/]  ", end="")
+        say(f"{check.title}: {check.finding}")
+        if check.remedy not in ("", previous) and check.verdict != "ok":
+            previous = check.remedy
+            say(f"{'':14}{check.remedy}")
+
+
+def _print_verdict(inspected: Any) -> None:
+    """The worst of all checks, and what nobody has verified."""
+    open_ = [check.title.lower() for check in inspected.checks if check.verdict == "not verified"]
+    beside = f"; not verified: {', '.join(open_)}" if open_ and inspected.verdict != "not verified" else ""
+    beside = f": {', '.join(open_)}" if inspected.verdict == "not verified" else beside
+    console.print(f"verdict: [{COLORS[inspected.verdict]}]{inspected.verdict}[/]{beside}")
+
+
+def _print_angles(angles: Any) -> None:
+    """The odds of the orders, and what they come from."""
+    if angles.hypotheses:
+        say("order of the pictures called 0, 45, 90, 135: probability (log-odds to the best)")
+    for row in sorted(angles.hypotheses, key=lambda row: -row.probability):
+        files = ", ".join(f"{angle:3d}" for angle in row.files)
+        say(
+            f"  {files}   {row.probability:7.2%}  ({0.0 - row.log_odds:.1f})  {row.order.label}",
+        )
+    for evidence in angles.sources:
+        used = "" if evidence.usable else " (not used)"
+        say(f"  {evidence.source}{used}: {evidence.note}")
+
+
+def present(
+    folder: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    white_balance: str = "",
+    chart: str = "",
+    exposure: str = "",
+    up_axis: str = "",
+    points: tuple[str, ...] = (),
+    distance: str = "",
+    meters_per_unit: str = "",
+    crop: str = "",
+    title: str = "",
+    author: str = "",
+    license: str = "",
+    provenance: str = "",
+    compute: ComputeOptions = ComputeOptions(),
+) -> None:
+    """Set how a scene or a run is shown and exported: color, up, scale, crop box, credit. Data and scores stay.
+
+    What is set stands in presentation.json in the folder. A scene's holds for all its runs; a run's goes before it.
+    What is not given stays as it is, "none" removes it, and without an option it is printed. `polarguide view RUN` lets
+    you pick the same with the mouse. A VIEW,X,Y is a pixel of a photograph, counted from its top left corner.
+
+    Args:
+        folder: Folder of a scene or a run.
+        white_balance: gray (the photographs' mean becomes gray), gains such as 1.9,1,1.6, or VIEW,X,Y where something
+            white or gray is.
+        chart: VIEW,X,Y,X,Y,X,Y,X,Y: the centers of the corner patches of a 24-patch color chart in a photograph, around
+            it; or the folder of another scene, whose chart it takes. It replaces a white balance.
+        exposure: Stops by which all is shown brighter, such as 0.5.
+        up_axis: An axis such as z or --up-axis=-y, three numbers, or VIEW,X,Y where a level surface is. Without it, up
+            is as the cameras say.
+        points: Two points of known distance: X,Y,Z in the scene, VIEW,X,Y on a surface, or VIEW for a camera's place.
+        distance: Of the two points, such as 85mm.
+        meters_per_unit: How long a unit of the scene is, in place of points and distance.
+        crop: Box as --crop=left,right,down,up,front,back in percent of the cameras' distance.
+        title: One line.
+        author: Whom the capture is owed to.
+        license: Such as CC-BY-4.0.
+        provenance: Where, when and with what it was captured, or its number in an inventory.
+    """
+    use_threads(compute.threads)
+    presenting = importlib.import_module("polarguide.results.rendering.present")
+    presented = presenting.present(
+        folder,
+        white_balance=white_balance or None,
+        chart=chart or None,
+        exposure=exposure or None,
+        up_axis=up_axis or None,
+        points=points,
+        distance=distance or None,
+        meters_per_unit=meters_per_unit or None,
+        crop=crop or None,
+        title=title or None,
+        author=author or None,
+        license=license or None,
+        provenance=provenance or None,
+        device=compute.device,
+        reporter=ConsoleReporter(),
+    )
+    for line in presenting.described(presented):
+        say(line)
+
+
+def synth(
+    scene: Annotated[str, tyro.conf.Positional],
+    /,
+    *,
+    out: Path,
+    sweep: str | None = None,
+    yes: bool = False,
+    settings: Annotated[SynthSettings, tyro.conf.arg(name="")],
+    overrides: Annotated[Overrides, tyro.conf.arg(name="")],
+    compute: Annotated[ThreadOptions, tyro.conf.arg(name="")],
+) -> None:
+    """Render a polarized scene with ground truth: a preset (figure, kit, car, cup, water, proof, ...) or a scene file.
+
+    Needs Mitsuba (pip install '.[synth]' in polarguide's source folder). A rendering that was stopped goes on with the
+    same command. docs/reference/scene-files.md describes scene files and what is written.
+
+    Args:
+        scene: Name of a preset (docs/how-to/synthesize.md lists them), or path of a scene file in JSON.
+        out: Scene folder to write.
+        sweep: A family of scenes, such as views=9,18,36,63 or noise=0,1,2,4; also roughness, index and spacing.
+        yes: Start a rendering of more than an hour without a question. Without a terminal there is no question.
+    """
+    use_threads(compute.threads)
+    spec, reporter = find_scene(scene), ConsoleReporter()
+    render = importlib.import_module("polarguide.synth.render")
+    if sweep is not None:
+        family = render.parse_sweep(sweep)
+        plans = render.sweep_plans(spec, out, settings, overrides, family)
+        _confirm(render.expected_time(plans, reporter, threads=compute.threads), yes)
+        folders = render.sweep_scenes(
+            spec, out, settings, overrides, family, reporter, threads=compute.threads
+        )
+        say(f"scenes: {' '.join(str(folder) for folder in folders)}")
+        return
+    plan = render.Plan(overrides.apply(spec), settings, out)
+    _confirm(render.expected_time([plan], reporter, threads=compute.threads), yes)
+    folder = importlib.import_module("polarguide.synth.folder")
+    rendered = render.synthesize(plan.spec, out, settings, reporter, threads=compute.threads)
+    say(f"scene: {rendered}   SHA-256 of its {folder.MANIFEST}: {folder.scene_digest(rendered)}")
+    if settings.sensor == "ideal":
+        say(f"next: polarguide train {rendered} --out runs/{rendered.name}")
+    elif settings.sensor == "filter":
+        say(f"next: polarguide prepare {rendered / 'raw'} --out {rendered}-prepared --poses {rendered}")
+    else:
+        say(
+            f"next: polarguide prepare {rendered / 'raw'} --out {rendered}-prepared --sensor {settings.sensor.upper()} "
+            f"--bits 12 --black-level 64 --calibration {rendered / 'calibration.json'} --poses {rendered}",
+        )
+
+
+def _confirm(seconds: float, yes: bool) -> None:
+    """Ask before a rendering that takes long, if somebody sits at a terminal.
+
+    Raises:
+        PolarguideError: it is not wanted.
+    """
+    if seconds <= LONG_SECONDS or yes or not (sys.stdin.isatty() and console.is_terminal):
+        return
+    try:
+        answer = console.input("Start it? (y/N) ", markup=False)
+    except EOFError:
+        answer = ""
+    if answer.strip().lower() not in ("y", "yes"):
+        raise PolarguideError(
+            "the rendering",
+            expected=f"yes to {rough_time(seconds)}",
+            found="no",
+            remedy="Nothing was written. Fewer --views or --samples or a smaller --size take less.",
+        )

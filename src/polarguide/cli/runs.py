@@ -1,0 +1,384 @@
+"""Verbs of runs: demo, train, eval, render, view, share, export."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.table import Table
+from rich.text import Text
+
+import polarguide
+from polarguide.cli.console import ConsoleReporter, RunFolder, console, opened, say, size_text, warn
+from polarguide.core.errors import PolarguideError, require_package
+from polarguide.core.options import (
+    EXPORT_EXTRAS,
+    EXPORT_PACKAGES,
+    LOOPBACK,
+    ComputeOptions,
+    ExportFormat,
+    ModelOptions,
+    PictureFormat,
+    SceneOptions,
+    SessionOptions,
+    ThreadOptions,
+    VisitorOptions,
+    check_finite,
+)
+from polarguide.core.system import StopSignals
+from polarguide.core.text import printable
+from polarguide.training.settings import TrainSettings
+
+
+def train(
+    scene: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    out: Path,
+    recipe: str = "polarguide-stokes",
+    settings: TrainSettings = TrainSettings(),
+    reading: SceneOptions = SceneOptions(),
+    session: SessionOptions = SessionOptions(),
+    resume: bool = False,
+) -> None:
+    """Train a recipe on a scene.
+
+    Can be stopped with Ctrl-C at any time: the state is saved, and --resume goes on to the same result. Several
+    processes share the views of each step: torchrun --nproc-per-node N --no-python polarguide train ...
+
+    Args:
+        scene: Scene folder: polar/<view>_000|_045|_090|_135.png or four folders I-00 I-45 I-90 I-135, and a COLMAP
+            model in sparse/0.
+        out: Run folder to write (configuration, checkpoint, log, PLY).
+        recipe: Which method: polarguide-stokes (renders the measured polarization, too), polarguide (PolarGuide-GSDR's
+            stages with repaired physics), polarguide-paper; 3dgs, 3dgs-dr and ref-gs, which ignore polarization; gnerp,
+            a field in place of Gaussians; an ablation of one, such as polarguide:without-normals; or a recipe of an
+            installed package.
+        resume: Go on with the run in --out.
+    """
+    with StopSignals() as should_stop:
+        try:
+            polarguide.train(
+                scene,
+                out,
+                recipe=recipe,
+                settings=settings,
+                session=session,
+                reading=reading,
+                resume=resume,
+                reporter=ConsoleReporter(),
+                should_stop=should_stop,
+            )
+        except KeyboardInterrupt as stopped:
+            if str(stopped):  # it was asked to stop, and says after which step it did
+                say(f"{stopped}; go on with the same command and --resume")
+            raise
+    say(f"trained: {out}   next: polarguide eval {out}   polarguide view {out}")
+
+
+_MOST_OBJECTS = 100
+"""Lines of the table: a terminal takes minutes to lay out the most that a scene may have."""
+
+
+def evaluate(
+    run: RunFolder,
+    /,
+    *,
+    speed: bool = True,
+    compute: ComputeOptions = ComputeOptions(),
+) -> None:
+    """Score a run on its test views and write RUN/metrics.json, and RUN/errors.png, where the errors are.
+
+    Args:
+        run: Run folder.
+        speed: Measure frames a second; --speed makes sense only while nothing else runs.
+    """
+    trained, reporter = opened(run, compute)
+    record = trained.evaluate(speed=speed, reporter=reporter)
+    title = (
+        f"{trained.configuration.recipe} on {trained.scene.name}: mean of {len(record['views'])} test views"
+    )
+    print_scores(record, title)
+    health = trained.health
+    for warning in () if health is None else health.warnings:
+        warn(warning)
+    say(f"polarization: {trained.polarization}")
+    say("health: not recorded, the training was not checked" if health is None else health.summary)
+    sheet = importlib.import_module("polarguide.results.evaluation.evaluate").ERRORS_FILE
+    say(f"metrics: {run / 'metrics.json'}")
+    say(f"where the errors are: {run / sheet}")
+
+
+def print_scores(record: dict[str, Any], title: str) -> None:
+    """Print a run's record as tables: its metrics, and its errors by object and material."""
+    metrics = importlib.import_module("polarguide.results.evaluation.table")
+    table = Table(title=Text(printable(title)))
+    table.add_column("metric")
+    table.add_column("value", justify="right", overflow="fold")
+    for label, text in metrics.shown_metrics(record):
+        table.add_row(label, Text(printable(text)))
+    console.print(table)
+    if absent := metrics.absent_metrics(record):
+        say(f"no ground truth, or no such layer, for: {', '.join(absent)}")
+    if record["objects"]:
+        columns = [metric for metric in metrics.METRICS if metric.key in metrics.OBJECT_METRICS]
+        console.print(_errors(record, columns))
+        if len(record["objects"]) > _MOST_OBJECTS:
+            say(
+                f"the {_MOST_OBJECTS} largest of {len(record['objects']):,} objects; metrics.json has all of them"
+            )
+
+
+def _errors(record: dict[str, Any], columns: list[Any]) -> Table:
+    """Errors by object and by material, over the pixels of all test views; ``columns``: metrics."""
+    table = Table(title="by object and material, over the pixels of all test views")
+    table.add_column("object", no_wrap=True)
+    table.add_column("pixels", justify="right", no_wrap=True)
+    for metric in columns:
+        table.add_column(metric.heading, justify="right", min_width=8)
+    has_metals = any(errors.get("metal_share") is not None for errors in record["objects"].values())
+    if has_metals:
+        table.add_column("metal", justify="right", no_wrap=True)
+
+    def add(name: str, errors: dict[str, Any]) -> None:
+        values = [errors[metric.key] for metric in columns]
+        texts = ["n/a" if v is None else f"{v:.{m.digits}f}" for m, v in zip(columns, values, strict=True)]
+        share = errors.get("metal_share")
+        texts += ["n/a" if share is None else f"{100 * share:.1f} %"] if has_metals else []
+        table.add_row(Text(printable(name)), f"{errors['pixels']:,}", *texts)
+
+    largest = sorted(record["objects"], key=lambda name: -record["objects"][name]["pixels"])[:_MOST_OBJECTS]
+    for name in filter(set(largest).__contains__, record["objects"]):
+        add(name, record["objects"][name])
+    table.add_section()
+    for kind, errors in record["materials"].items():
+        add(f"all {kind}", errors)
+    return table
+
+
+FRAMES = 120
+
+
+def render(
+    run: RunFolder,
+    /,
+    *,
+    views: str = "test",
+    layers: str = "final,base,reflection,specular,diffuse,strength,roughness,metalness,normal,depth,dolp,aolp",
+    path: str = "",
+    frames: int = FRAMES,
+    video: Path | None = None,
+    format: PictureFormat = "png",
+    transparent: bool = False,
+    environment: Path | None = None,
+    rotate_environment: float = 0.0,
+    out: Path | None = None,
+    compute: ComputeOptions = ComputeOptions(),
+) -> None:
+    """Render a run's layers to PNG, with a contact sheet beside the ground truth; or along a path, as a video.
+
+    specular and diffuse are the contributions that add up to final; normals are in camera space, blue facing the
+    camera.
+
+    Args:
+        run: Run folder.
+        views: test, train, all, or names separated by commas.
+        layers: Any of final, base, reflection, specular, diffuse, strength, roughness, metalness, normal, depth,
+            alpha, and the predicted polarization: stokes, dolp, aolp.
+        path: In place of views: orbit, spiral, interpolate (through the photographs), or a JSON file of cameras.
+        frames: Pictures along the path (a file has its own).
+        video: MP4 file to write of the path, layers side by side; PNG files if not given.
+        format: Of the layers of views: png as a display shows them, or exr and npy with the linear numbers, whose units
+            layers.json states. The contact sheet is PNG.
+        transparent: PNG files of views are transparent where nothing is, without a dark rim around the subject.
+        environment: Panorama of linear radiance (.hdr, .exr) to be reflected in place of the learned environment.
+        rotate_environment: Degrees by which to turn the environment, counter-clockwise seen from above.
+        out: Folder to write; RUN/render by default.
+    """
+    if video is not None and (not path or video.suffix.lower() != ".mp4"):
+        raise PolarguideError(
+            "video",
+            expected="a name that ends in .mp4, and a --path",
+            found=f"{video} and {path or 'no path'}",
+            remedy="Write for example --path orbit --video film.mp4.",
+        )
+    if not path and frames != FRAMES:
+        raise PolarguideError(
+            "frames",
+            expected="a --path",
+            found="none",
+            remedy="Give for example --path orbit, or leave it out.",
+        )
+    check_finite("rotate_environment", rotate_environment, -3600.0, 3600.0)
+    if video is not None:
+        require_package("imageio_ffmpeg", "--video")
+    if environment is not None and environment.suffix.lower() == ".exr":
+        require_package("OpenEXR", str(environment))
+    if format == "exr":
+        require_package("OpenEXR", "--format exr")
+    if path and format != "png":
+        raise PolarguideError(
+            "format", expected="png along a --path", found=format, remedy="Name views in place of a path."
+        )
+    if transparent and (path or format != "png"):
+        raise PolarguideError(
+            "transparent",
+            expected="PNG files of views",
+            found=f"--path {path}" if path else f"--format {format}",
+            remedy="Leave one of the two out.",
+        )
+    names = [name.strip() for name in layers.split(",") if name.strip()]
+    trained, reporter = opened(run, compute)
+    trained.relight(environment, rotate_environment, reporter=reporter)
+    if path:
+        trained.write_film(
+            video or out or run / "render", path=path, layers=names, frames=frames, reporter=reporter
+        )
+        return
+    sheet = trained.write_pictures(
+        out, views=views, layers=names, format=format, transparent=transparent, reporter=reporter
+    )
+    say(f"pictures: {sheet.parent}   contact sheet: {sheet}")
+
+
+DEMO_STEPS = 2000
+FIRST_VIEW = "v022"
+FIRST_LAYERS = ("final", "specular", "diffuse", "normal")
+FINER = 3
+"""How many times finer than the photographs the first picture is."""
+
+
+def demo(
+    *,
+    out: Path = Path("runs/demo"),
+    steps: int = DEMO_STEPS,
+    seed: int = 0,
+    machine: ThreadOptions = ThreadOptions(),
+) -> None:
+    """Train, evaluate and render the small scene that ships with the program.
+
+    Args:
+        out: Run folder to write; a finished or interrupted demo there is gone on with.
+        steps: Optimizer steps.
+        seed: Seed of every random draw.
+    """
+    scene = polarguide.demo_scene()
+    say(f"scene: {scene} (50 views of glossy objects, four polarizer angles each)")
+    settings = TrainSettings(steps, seed)
+    session = SessionOptions(threads=machine.threads)
+    train(scene, out=out, settings=settings, session=session, resume=(out / "run.json").exists())
+    evaluate(out, compute=ComputeOptions(machine.threads))
+    render(out)
+    picture = _first_picture(out)
+    say(f"look at {picture}: {FIRST_VIEW}, which training has not seen, and its layers")
+    say(
+        f"then at {out / 'render' / 'contact_sheet.png'}: rows are views, columns are layers, each beside the true "
+        "one if it is known"
+    )
+    say(f"look around: polarguide view {out}")
+
+
+def _first_picture(out: Path) -> Path:
+    """A test view larger than its photograph, with its layers: what somebody is shown first."""
+    layers = importlib.import_module("polarguide.visualization.layers")
+    figures = importlib.import_module("polarguide.visualization.figures")
+    run = polarguide.open_run(out)
+    camera = run.scene.view(FIRST_VIEW).camera
+    camera = camera.scaled(FINER, FINER * camera.width, FINER * camera.height)
+    result = run.result(camera).to("cpu")
+    tiles = [layers.layer_picture(result, name, camera) for name in FIRST_LAYERS]
+    path = out / "first_picture.png"
+    figures.write_png(path, figures.contact_sheet([tiles], [FIRST_VIEW], FIRST_LAYERS))
+    return path
+
+
+def view(
+    run: RunFolder,
+    /,
+    *,
+    host: str = LOOPBACK[0],
+    port: int = 8080,
+    beside: Path | None = None,
+    visitors: VisitorOptions = VisitorOptions(),
+    compute: ComputeOptions = ComputeOptions(),
+) -> None:
+    """Look at a run in a browser: its layers from any side, beside the photographs. Ctrl-C ends it.
+
+    Args:
+        run: Run folder.
+        host: Address to listen at. Others can reach it only if you give one of theirs (0.0.0.0: anyone's).
+        port: To listen at; the next free one is taken if it is in use.
+        beside: Another run of the same scene, such as one without polarization, for the wipe between the two.
+    """
+    if run.is_file():
+        raise PolarguideError(
+            run,
+            expected="a run folder: what train wrote under --out, with run.json in it",
+            found=f"a file ({run.suffix or 'without a suffix'})",
+            remedy=f"polarguide view {run.parent} if it lies in one. Files of Gaussians alone, without the light that "
+            "they reflect, are for other viewers (SuperSplat).",
+        )
+    require_package("viser", "the viewer")
+    trained, reporter = opened(run, compute)
+    other = None if beside is None else opened(beside, compute)[0]
+    trained.view(host=host, port=port, visitors=visitors, reporter=reporter, beside=other)
+
+
+def share(
+    run: RunFolder,
+    /,
+    *,
+    out: Path | None = None,
+    title: str = "",
+    caption: str = "",
+    machine: ThreadOptions = ThreadOptions(),
+) -> None:
+    """Write a run as one web page that renders it with its reflections, and needs nothing beside itself.
+
+    Args:
+        run: Run folder.
+        out: File to write; RUN/share.html by default.
+        title: Heading of the page; the scene's name by default.
+        caption: Text below it; the recipe and its steps by default.
+    """
+    trained, _ = opened(run, machine)
+    path = trained.share(out, title=title, caption=caption)
+    say(f"page: {path} ({size_text(path.stat().st_size)})")
+
+
+def export(
+    run: RunFolder,
+    /,
+    *,
+    format: ExportFormat,
+    out: Path | None = None,
+    resolution: int = 192,
+    spz_version: Literal[3, 4] = 3,
+    model: Annotated[ModelOptions, tyro.conf.arg(name="")] = ModelOptions(),
+    machine: ThreadOptions = ThreadOptions(),
+) -> None:
+    """Write a run as the files of other programs.
+
+    ply, spz, sog, splat-glb and splat-usdz are ordinary splats, with reflections baked as far as harmonics carry them;
+    mesh (GLB and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb (or obj, usdz) is a
+    textured model for Blender, game engines and viewers, whose base color has neither highlights nor shading; stl is
+    its closed surface for 3D printing; points are opaque Gaussians with normals; environment is the learned light as a
+    panorama (EXR, HDR and PNG); cameras are a COLMAP model and transforms.json; all is a package of most of these.
+
+    Args:
+        run: Run folder.
+        format: ply, spz, sog, splat-glb, splat-usdz, mesh, glb, obj, usdz, stl, points, environment, cameras or all.
+        out: Folder to write; RUN/export by default.
+        resolution: Voxels of the mesh along its longest side.
+        spz_version: Version of the SPZ file; readers are split between the two.
+    """
+    for package in EXPORT_PACKAGES.get(format, ()):
+        require_package(package, f"--format {format}", extra=EXPORT_EXTRAS.get(package, ""))
+    trained, reporter = opened(run, machine)
+    for path in trained.export(
+        format, out, resolution=resolution, spz_version=spz_version, model=model, reporter=reporter
+    ):
+        size = f" ({size_text(path.stat().st_size)})" if path.is_file() else ""
+        say(f"{format}: {path}{size}")

@@ -1,0 +1,96 @@
+"""Materials that were painted over a run: RUN/materials/<view>.png, numbered as those of a scene.
+
+They have the size of the views that were trained on, and count before those of the scene.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from polarguide.capture import Scene
+from polarguide.capture.formats.pictures import SUFFIXES, decode_materials
+from polarguide.capture.layout import index_files
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import atomic_folder, read_file
+
+FOLDER = "materials"
+LARGEST = 1 << 26  # bytes of a picture
+REMEDY = "Paint and save again in polarguide view RUN, or remove the folder."
+
+
+@dataclass(frozen=True, eq=False)
+class PaintedMaterials:
+    """Pictures of materials.
+
+    Attributes:
+        numbers: [H, W] uint8 of each view: 0 nothing, 1 dielectric, 2 metal, from 3 on those of ``scene.json``.
+        digest: SHA-256 of the files.
+    """
+
+    numbers: Mapping[str, Tensor]
+    digest: str
+
+    def over(self, scene: Scene) -> Scene:
+        """A scene whose views have these materials where they say anything."""
+        views = []
+        for view in scene.views:
+            own, painted = view.materials, self.numbers.get(view.name)
+            if painted is not None:
+                own = painted if own is None else torch.where(painted > 0, painted, own)
+            views.append(replace(view, materials=own))
+        return replace(scene, views=tuple(views))
+
+
+def read_painted(run: Path, scene: Scene) -> PaintedMaterials | None:
+    """Materials that were painted over a run of a scene; None: there are no pictures, or they say nothing.
+
+    Raises:
+        PolarguideError: a picture belongs to no view, or is damaged, of another size, or has a number that
+            ``scene.json`` does not explain.
+    """
+    if not (run / FOLDER).exists():
+        return None
+    digest, numbers = hashlib.sha256(), dict[str, Tensor]()
+    known = {0, 1, 2, *scene.indices}
+    for name, path in sorted(index_files(run / FOLDER, SUFFIXES).items()):
+        camera = scene.view(name).camera
+        data = read_file(path, largest=LARGEST, remedy=REMEDY)
+        picture = torch.from_numpy(decode_materials(path, data))
+        size, found = (camera.height, camera.width), tuple(picture.shape)
+        if found != size:
+            raise PolarguideError(
+                path,
+                expected=f"{camera.width}x{camera.height} pixels, as the view was trained",
+                found=f"{found[1]}x{found[0]}",
+                remedy=REMEDY,
+            )
+        if unknown := set(picture.unique().tolist()) - known:
+            listed = ", ".join(map(str, sorted(known)))
+            raise PolarguideError(
+                path, expected=f"the numbers {listed}", found=str(min(unknown)), remedy=REMEDY
+            )
+        digest.update(name.encode() + b"\0" + picture.numpy().tobytes())
+        numbers[name] = picture
+    says = any(bool(picture.any()) for picture in numbers.values())
+    return PaintedMaterials(numbers, digest.hexdigest()) if says else None
+
+
+def write_painted(run: Path, numbers: Mapping[str, Tensor]) -> None:
+    """Write materials of a run over those that it has.
+
+    Args:
+        numbers: [H, W] uint8 of every training view.
+
+    Raises:
+        PolarguideError: they cannot be written; those of before stay.
+    """
+    with atomic_folder(run / FOLDER) as folder:
+        for name, picture in numbers.items():
+            Image.fromarray(picture.numpy()).save(folder / f"{name}.png")

@@ -1,0 +1,330 @@
+"""Painting what is metal: Gaussians around a click, or a whole surface that hangs together; with undo."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from polarguide.capture import View
+from polarguide.gaussians.gaussians import Gaussians
+from polarguide.gaussians.geometry import shortest_axis_normals
+from polarguide.gaussians.harmonics import SH_C0
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
+from polarguide.raster import Rasterize
+from polarguide.shading.gbuffer import splats
+from polarguide.training.metals.observations import shares
+from polarguide.viewer.messages import Accepts, choice, number, push
+from polarguide.visualization.figures import Picture
+
+OFF, SURFACE, BRUSH = TOOLS = ("off", "surface", "brush")
+NOTHING, DIELECTRIC, METAL = KINDS = ("not painted", "dielectric", "metal")
+SIZE, REACH = (0.5, 20.0), (0.5, 30.0)
+ASK = "Click on a surface"
+TINTS = np.array([(0, 0, 0), (40, 120, 255), (255, 190, 0), (0, 200, 120)], np.float32)
+"""Colors of nothing, dielectrics, metals, and dielectrics with an index of their own."""
+TINTED = 0.5
+LOOKED_AT = 360
+"""Rows of the pictures in which is looked up what a click hits."""
+SMALLEST, SHARE = 0.01, 0.25
+"""Pixels of such a picture that a Gaussian fills at least: what is hidden fills none. Surfaces grow from Gaussians that
+fill at least this share of what the largest fills of a disc.
+"""
+NEIGHBORS, LINKS = 16, 8
+"""Gaussians over which normals and colors are averaged, and those to which a path leads on."""
+CHUNK = 1 << 16  # Gaussians at a time
+TURN, COLOR = 0.25, 0.3
+"""How far neighbors are apart: standard deviations of their normals' angle, in radians, and of the logarithm of their
+color. The reach of a click is in these units, squared, halved and summed along the surface.
+"""
+DARK = 0.02  # radiance that is added before logarithms
+MOST_UNDONE = 50
+
+
+class Materials:
+    """What is painted of a model's Gaussians.
+
+    Attributes:
+        kinds: [N] uint8: 0 nothing, 1 dielectric, 2 metal, from 3 on the dielectrics of ``scene.json``.
+
+    Args:
+        gaussians: of the model. rasterize: of its backend.
+        kinds: what was painted before, as ``kinds_of`` reads it; called once.
+    """
+
+    def __init__(
+        self, gaussians: Gaussians, rasterize: Rasterize, kinds: Callable[[], Tensor] | None = None
+    ) -> None:
+        self._gaussians = {name: gaussians[name].detach() for name in gaussians.names}
+        self._rasterize = rasterize
+        count = len(self._gaussians["means"])
+        self.kinds = torch.zeros(count, dtype=torch.uint8) if kinds is None else kinds()
+        self._before: list[Tensor] = []
+
+    def brush(self, camera: Camera, place: Sequence[float], size: float, kind: int) -> int:
+        """Paint what is seen in a disc of a picture; returns the number of Gaussians.
+
+        Args:
+            camera: of the picture. place: its middle, in shares of width and height. size: radius in percent of the
+                height. kind: the number of the material.
+        """
+        inside, all_of_it = self._seen(camera, place, size)
+        return self._paint((all_of_it > SMALLEST) & (inside >= 0.5 * all_of_it), kind)
+
+    def surface(self, camera: Camera, place: Sequence[float], size: float, reach: float, kind: int) -> int:
+        """Paint the surface that hangs together with what is seen in a disc, see ``brush``.
+
+        A path leads from Gaussian to neighbor; each step is as long as they differ in normal and color.
+
+        Args:
+            reach: the longest path.
+        """
+        inside, _ = self._seen(camera, place, size)
+        hit = (inside > SHARE * inside.max()).nonzero()[:, 0].numpy()
+        if not len(hit):
+            return 0
+        lengths = dijkstra(self._graph, directed=False, indices=hit, min_only=True, limit=reach)
+        return self._paint(torch.from_numpy(np.isfinite(lengths)), kind)
+
+    def undo(self) -> bool:
+        """Take the last stroke back; False: there is none."""
+        if self._before:
+            self.kinds = self._before.pop()
+            return True
+        return False
+
+    def picture(self, camera: Camera) -> Tensor:
+        """The number of the material that fills most of each pixel, if that is half of it: [H, W] uint8."""
+        numbers = [number for number in self.kinds.unique().tolist() if number]
+        if not numbers:
+            return torch.zeros(camera.height, camera.width, dtype=torch.uint8)
+        device = self._gaussians["means"].device
+        features = torch.stack([self.kinds == number for number in numbers], dim=-1).float().to(device)
+        with torch.no_grad():
+            blended = self._rasterize(splats(self._gaussians, features), camera).features.cpu()
+        share, most = blended.max(dim=-1)
+        return torch.where(share >= 0.5, torch.tensor(numbers, dtype=torch.uint8)[most], 0).to(torch.uint8)
+
+    def _paint(self, which: Tensor, kind: int) -> int:
+        self._before = [*self._before[1 - MOST_UNDONE :], self.kinds]
+        self.kinds = torch.where(which, torch.tensor(kind, dtype=torch.uint8), self.kinds)
+        return int(which.sum())
+
+    def _seen(self, camera: Camera, place: Sequence[float], size: float) -> tuple[Tensor, Tensor]:
+        """Pixels that each Gaussian fills in a disc of a picture, and in the whole picture: [N] both."""
+        scale = min(1.0, LOOKED_AT / camera.height)
+        small = camera.scaled(
+            scale, max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
+        )
+        x, y = place[0] * small.width, place[1] * small.height
+        columns, rows = torch.arange(small.width) + 0.5, torch.arange(small.height) + 0.5
+        radius = max(0.75, 0.01 * size * small.height)
+        disc = (columns[None] - x) ** 2 + (rows[:, None] - y) ** 2 <= radius**2
+        target = torch.stack((disc, torch.ones_like(disc)), dim=-1).float()
+        device = self._gaussians["means"].device
+        inside, all_of_it = shares(self._gaussians, small, target.to(device), self._rasterize).cpu().unbind(1)
+        return inside, all_of_it
+
+    @cached_property
+    def _graph(self) -> csr_matrix:
+        """How far each Gaussian is from its neighbors, in normal and color, both averaged over neighborhoods: those of
+        single Gaussians are noise.
+        """
+        gaussians = {name: values.cpu() for name, values in self._gaussians.items()}
+        means = gaussians["means"]
+        axes = shortest_axis_normals(
+            means, gaussians["quaternions"], gaussians["log_scales"], means.new_zeros(3), None
+        )
+        colors = ((gaussians["sh_dc"] * SH_C0 + 0.5).clamp(min=0) + DARK).log()
+        places = means.double().numpy()
+        count = min(NEIGHBORS + 1, len(places))
+        near = torch.from_numpy(cKDTree(places).query(places, k=count, workers=-1)[1].reshape(-1, count))
+        weights = gaussians["opacity_logits"].sigmoid().view(-1)
+        axes, colors = _averaged(axes, colors, weights, near)
+        first = torch.arange(len(near)).repeat_interleave(min(LINKS, count - 1))
+        second = near[:, 1 : LINKS + 1].reshape(-1)
+        cosine = dot(axes[first], axes[second]).abs().clamp(max=1)
+        color = (colors[first] - colors[second]).square().mean(dim=-1)
+        length = 0.5 * (cosine.acos() / TURN) ** 2 + 0.5 * color / COLOR**2
+        pairs = first.numpy(), second.numpy()
+        return csr_matrix((length.double().numpy() + 1e-6, pairs), shape=(len(places),) * 2)
+
+
+def _averaged(axes: Tensor, colors: Tensor, weights: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+    """Unit axes of either sign [N, 3] and colors [N, 3], averaged over neighbors [N, K] by weight [N]."""
+    parts = []
+    for some in near.split(CHUNK):
+        counts = weights[some][..., None]
+        turned = axes[some] * dot(axes[some], axes[some[:, :1]]).sign()[..., None]
+        axis = unit((turned * counts).sum(dim=1), 1e-9)
+        parts.append((axis, (colors[some] * counts).sum(dim=1) / counts.sum(dim=1).clamp(min=1e-9)))
+    first, second = zip(*parts, strict=True)
+    return torch.cat(first), torch.cat(second)
+
+
+def kinds_of(
+    gaussians: Gaussians, rasterize: Rasterize, views: Sequence[View], numbers: Mapping[str, Tensor]
+) -> Tensor:
+    """What pictures of materials say of each Gaussian, [N] uint8: what fills most of its pixels.
+
+    Args:
+        numbers: [H, W] uint8 by view.
+    """
+    parameters = {name: gaussians[name].detach() for name in gaussians.names}
+    named = sorted({0}.union(*(picture.unique().tolist() for picture in numbers.values())))
+    weights = parameters["means"].new_zeros(len(parameters["means"]), len(named))
+    for view in views:
+        if view.name in numbers:
+            target = torch.stack([numbers[view.name] == k for k in named], dim=-1).float().to(weights.device)
+            weights += shares(parameters, view.camera, target, rasterize)
+    return torch.tensor(named, dtype=torch.uint8)[weights.argmax(dim=1).cpu()]
+
+
+class PaintingControls:
+    """The controls of one session.
+
+    Attributes:
+        accepts: what a browser may set each control to, as of ``Panel``.
+
+    Args:
+        gui: viser's handle of the session's controls. kinds: of materials by name, with their numbers.
+    """
+
+    def __init__(self, gui: Any, kinds: Mapping[str, int]) -> None:
+        with gui.add_folder("Materials", expand_by_default=False):
+            hint = "A click paints a surface that hangs together, or what is in a disc"
+            self.tool = gui.add_dropdown("Paint", TOOLS, initial_value=OFF, hint=hint)
+            self.kind = gui.add_dropdown("As", tuple(kinds), initial_value=METAL)
+            self.size = gui.add_slider("Size", *SIZE, 0.5, 1.0, hint="Of the disc, in percent of the height")
+            hint = "How unlike neighbors a surface goes on over"
+            self.reach = gui.add_slider("Reach", *REACH, 0.5, 4.0, hint=hint)
+            self.undo = gui.add_button("Undo")
+            hint = "polarguide train --resume then goes on with them"
+            self.save = gui.add_button("Save materials to the run", hint=hint)
+        controls: list[tuple[Any, Accepts]] = [
+            (self.tool, choice(TOOLS)),
+            (self.kind, choice(tuple(kinds))),
+            (self.size, number(*SIZE)),
+            (self.reach, number(*REACH)),
+            (self.undo, push),
+            (self.save, push),
+        ]
+        self.accepts = {control._impl.uuid: accepts for control, accepts in controls}
+
+
+@dataclass(frozen=True, eq=False)
+class Paintable:
+    """What a viewer needs to let its visitors paint.
+
+    Attributes:
+        materials: makes what a session paints. kinds: names of materials with their numbers.
+        save: writes it to the run, and returns a message.
+    """
+
+    materials: Callable[[], Materials]
+    kinds: Mapping[str, int]
+    save: Callable[[Materials], str]
+
+
+class Painting:
+    """One session's painting. Callbacks only record; the rendering thread calls ``act``.
+
+    Args:
+        client: viser's handle. controls: of its panel. paintable: of the run.
+        changed: called when there is something to do. noted: with a note for the visitor.
+        caught: makes callbacks whose faults cost only this browser. busy: whether another tool takes clicks.
+    """
+
+    def __init__(
+        self,
+        client: Any,
+        controls: PaintingControls,
+        paintable: Paintable,
+        *,
+        changed: Callable[[], None],
+        noted: Callable[[str], None],
+        caught: Callable[[Callable[[], None]], Callable[[Any], None]],
+        busy: Callable[[], bool],
+    ) -> None:
+        self._client, self._controls, self._paintable = client, controls, paintable
+        self._changed, self._noted, self._caught, self._busy = changed, noted, caught, busy
+        self._materials: Materials | None = None
+        self._listener: Callable[[Any], None] | None = None
+        self._todo: list[Callable[[Materials, Camera], str]] = []
+        controls.tool.on_update(caught(self._tool_chosen))
+        controls.undo.on_click(caught(lambda: self._later(lambda painted, _: self._undone(painted))))
+        controls.save.on_click(caught(lambda: self._later(lambda painted, _: paintable.save(painted))))
+
+    @property
+    def waits(self) -> bool:
+        """Whether there is something to do."""
+        return bool(self._todo)
+
+    def act(self, camera: Camera) -> None:
+        """Do what was asked for.
+
+        Args:
+            camera: of the picture that was clicked into.
+        """
+        todo, self._todo = self._todo, []
+        for each in todo:
+            if self._materials is None:
+                self._materials = self._paintable.materials()
+            self._noted(each(self._materials, camera))
+
+    def tinted(self, picture: Picture, camera: Camera) -> Picture:
+        """A picture with what is painted in it."""
+        if self._materials is None or not bool(self._materials.kinds.any()):
+            return picture
+        numbers = self._materials.picture(camera).numpy().clip(max=len(TINTS) - 1)
+        share = TINTED * (numbers > 0)[..., None]
+        mixed: Picture = ((1 - share) * picture + share * TINTS[numbers] + 0.5).astype(np.uint8)
+        return mixed
+
+    def _later(self, do: Callable[[Materials, Camera], str]) -> None:
+        if not self._todo:
+            self._todo.append(do)
+            self._changed()
+
+    @staticmethod
+    def _undone(materials: Materials) -> str:
+        return "Undone" if materials.undo() else "Nothing is left to undo"
+
+    def _tool_chosen(self) -> None:
+        paints = self._controls.tool.value != OFF
+        if paints and self._listener is None:
+
+            def clicked(event: Any) -> None:
+                self._caught(lambda: self._click(event.screen_pos))(None)
+
+            self._listener = clicked
+            self._client.scene.on_click()(clicked)
+        elif not paints and self._listener is not None:
+            self._client.scene.remove_click_callback(self._listener)
+            self._listener = None
+        self._noted(ASK if paints else "")
+
+    def _click(self, place: Sequence[float]) -> None:
+        tool, kind = self._controls.tool.value, self._controls.kind.value
+        if tool == OFF or self._busy():
+            return
+        size, reach = float(self._controls.size.value), float(self._controls.reach.value)
+        number, at = self._paintable.kinds[kind], (float(place[0]), float(place[1]))
+
+        def paint(materials: Materials, camera: Camera) -> str:
+            if tool == BRUSH:
+                count = materials.brush(camera, at, size, number)
+            else:
+                count = materials.surface(camera, at, size, reach, number)
+            return f"{kind}: {count:,} Gaussians" if count else f"Nothing is there. {ASK}"
+
+        self._later(paint)
