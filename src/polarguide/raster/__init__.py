@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
 
@@ -15,7 +14,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.options import DeviceName
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.cuda import has_gsplat, load_gsplat, rasterize_cuda
-from polarguide.raster.interface import Rasterize, Rasterized, ScreenStatistic, Splats
+from polarguide.raster.interface import Backend, Rasterize, Rasterized, ScreenStatistic, Splats
 from polarguide.raster.reference import rasterize_reference
 
 __all__ = [
@@ -29,13 +28,6 @@ __all__ = [
     "rasterize_reference",
     "use_threads",
 ]
-
-
-class Backend(NamedTuple):
-    """A device and the rasterizer that runs on it."""
-
-    device: torch.device
-    rasterize: Rasterize
 
 
 def choose_backend(

@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+import torch
 from torch import Tensor
 
 from polarguide.core.errors import PolarguideError
@@ -103,6 +104,13 @@ class Rasterize(Protocol):
         statistic: ScreenStatistic | None = None,
         still: tuple[int, ...] = (),
     ) -> Rasterized: ...
+
+
+class Backend(NamedTuple):
+    """A device and the rasterizer that runs on it."""
+
+    device: torch.device
+    rasterize: Rasterize
 
 
 def check_shapes(splats: Splats, statistic: ScreenStatistic | None, still: tuple[int, ...] = ()) -> None:
