@@ -54,7 +54,9 @@ def test_what_it_does_not_fit_is_refused(tmp_path: Path) -> None:
     Fault(expected="a calibration of the sensor IMX250MYR").raised_by(
         read_shot, tmp_path / "v.png", replace(options, sensor="IMX250MYR")
     )
-    Fault(expected="a calibration of").raised_by(read_shot, tmp_path / "v.png", replace(options, offset_x=2))
+    Fault(expected="a calibration that covers").raised_by(
+        read_shot, tmp_path / "v.png", replace(options, offset_x=2)
+    )
     for angle in (0, 45, 90, 135):
         write_codes(tmp_path / f"w_{angle:03d}.png", np.full(SIZE, 0.5))
     shots = [tmp_path / f"w_{angle:03d}.png" for angle in (0, 45, 90, 135)]

@@ -237,15 +237,14 @@ class GaussianFamily(Family):
         self, state: Any, method: Recipe, settings: ResolvedSettings, out: Path, reporter: Reporter
     ) -> None:
         """See ``Family``: to the last step at which metals are looked for."""
-        steps = looks(method, settings)
-        step = steps[-1] if steps else None
-        if step is None:
+        last = max(looks(method, settings), default=None)
+        if last is None:
             super().go_back(state, method, settings, out, reporter)
-        elif state is not None and state.step > step:
+        elif state is not None and state.step > last:
             reporter.say(
-                f"{out / FOLDER} has changed: training goes on from step {step}, which decides on metals"
+                f"{out / FOLDER} has changed: training goes on from step {last}, which decides on metals"
             )
-            state.step, state.frozen, state.footprints = step, None, None
+            state.step, state.frozen, state.footprints = last, None, None
 
     def trainer(
         self,
