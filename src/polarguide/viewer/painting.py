@@ -24,6 +24,7 @@ from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import splats
 from polarguide.training.metals.observations import shares
 from polarguide.viewer.messages import Accepts, choice, number, push
+from polarguide.viewer.presenting import Clicks
 from polarguide.visualization.figures import Picture
 
 OFF, SURFACE, BRUSH = TOOLS = ("off", "surface", "brush")
@@ -255,10 +256,10 @@ class Painting:
         caught: Callable[[Callable[[], None]], Callable[[Any], None]],
         busy: Callable[[], bool],
     ) -> None:
-        self._client, self._controls, self._paintable = client, controls, paintable
-        self._changed, self._noted, self._caught, self._busy = changed, noted, caught, busy
+        self._controls, self._paintable = controls, paintable
+        self._changed, self._noted, self._busy = changed, noted, busy
         self._materials: Materials | None = None
-        self._listener: Callable[[Any], None] | None = None
+        self._clicks = Clicks(client, caught, self._click)
         self._todo: list[Callable[[Materials, Camera], str]] = []
         controls.tool.on_update(caught(self._tool_chosen))
         controls.undo.on_click(caught(lambda: self._later(lambda painted, _: self._undone(painted))))
@@ -301,16 +302,7 @@ class Painting:
 
     def _tool_chosen(self) -> None:
         paints = self._controls.tool.value != OFF
-        if paints and self._listener is None:
-
-            def clicked(event: Any) -> None:
-                self._caught(lambda: self._click(event.screen_pos))(None)
-
-            self._listener = clicked
-            self._client.scene.on_click()(clicked)
-        elif not paints and self._listener is not None:
-            self._client.scene.remove_click_callback(self._listener)
-            self._listener = None
+        self._clicks.want(paints)
         self._noted(ASK if paints else "")
 
     def _click(self, place: Sequence[float]) -> None:

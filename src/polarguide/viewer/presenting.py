@@ -29,6 +29,41 @@ PICKS = tuple(ASKS)
 AS_SHOWN, OF_CAMERAS = UPS = ("as shown", "of cameras")
 
 
+class Clicks:
+    """Clicks into the picture of one browser, taken while a tool wants them.
+
+    Args:
+        client: viser's handle. caught: makes callbacks whose faults cost only this browser.
+        clicked: called with the place, in shares of the picture's width and height.
+    """
+
+    def __init__(
+        self,
+        client: Any,
+        caught: Callable[[Callable[[], None]], Callable[[Any], None]],
+        clicked: Callable[[Sequence[float]], None],
+    ) -> None:
+        self._client, self._wanted = client, False
+
+        def heard(event: Any) -> None:
+            caught(lambda: clicked(event.screen_pos))(None)
+
+        self._heard = heard
+
+    @property
+    def wanted(self) -> bool:
+        """Whether clicks are taken."""
+        return self._wanted
+
+    def want(self, wanted: bool) -> None:
+        """Take clicks, or no more."""
+        if wanted and not self._wanted:
+            self._client.scene.on_click()(self._heard)
+        elif self._wanted and not wanted:
+            self._client.scene.remove_click_callback(self._heard)
+        self._wanted = wanted
+
+
 class PresentingControls:
     """The controls of one session.
 
@@ -104,11 +139,11 @@ class Presenting:
         caught: Callable[[Callable[[], None]], Callable[[Any], None]],
     ) -> None:
         self._client, self._controls, self._gray_world = client, controls, gray_world
-        self._changed, self._caught, self._distance = changed, caught, distance
+        self._changed, self._distance = changed, distance
         self.chosen, self.note, self._noted = presentation, "", noted
         self._picked_white, self._chart = presentation.white_balance, presentation.chart
         self._picking = ""
-        self._listener: Callable[[Any], None] | None = None
+        self._clicks = Clicks(client, caught, self._click)
         self._clicked: tuple[str, float, float] | None = None
         self._ends: list[Tensor] = []
         self._line: Any = None
@@ -126,7 +161,7 @@ class Presenting:
     @property
     def picks(self) -> bool:
         """Whether the next click is a pick."""
-        return self._listener is not None
+        return self._clicks.wanted
 
     def take_click(self) -> tuple[float, float] | None:
         """Where was clicked, in shares of the picture's width and height; None: nowhere."""
@@ -165,16 +200,7 @@ class Presenting:
     def _listen(self, what: str) -> None:
         """Take clicks for something, or no more."""
         self._picking = what
-        if what and self._listener is None:
-
-            def clicked(event: Any) -> None:
-                self._caught(lambda: self._click(event.screen_pos))(None)
-
-            self._listener = clicked
-            self._client.scene.on_click()(clicked)
-        elif not what and self._listener is not None:
-            self._client.scene.remove_click_callback(self._listener)
-            self._listener = None
+        self._clicks.want(bool(what))
 
     def _click(self, place: Sequence[float]) -> None:
         if self._picking and self._clicked is None:
