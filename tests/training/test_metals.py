@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,9 @@ from polarguide.recipes import RECIPES
 from polarguide.runs.folder import load_checkpoint, resolve, save_checkpoint
 from polarguide.shading.metal import any_nonzero
 from polarguide.training.metals.cut import INFINITE, Graph, decide, minimum_cut, surfaces, unary
-from polarguide.training.metals.evidence import GOLD, Evidence, _tint_cost, errors, evidence
+from polarguide.training.metals.evidence import Evidence, errors, evidence
 from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights, shares
-from polarguide.training.metals.search import looks
+from polarguide.training.metals.search import SOFT_PRIORS, looks
 from polarguide.training.rules import MetalRules, MetalViews
 from polarguide.training.settings import TrainSettings
 from polarguide.training.trainer import Trainer, warn_of_unused_materials
@@ -32,7 +33,7 @@ def found(
     gaussians: dict[str, Tensor], views: list[View], *, allowed: bool = True, light: float = 1.5
 ) -> Tensor:
     """What becomes metal [N] where all may, or nothing."""
-    measured_there = evidence(gaussians, views, rasterize_cpu, light, RULES, LIMITS)
+    measured_there = evidence(gaussians, views, rasterize_cpu, light, LIMITS)
     return decide(measured_there, gaussians, torch.full((len(gaussians["means"]),), allowed), RULES)
 
 
@@ -153,13 +154,21 @@ def test_evidence_is_trusted_up_to_a_limit_and_the_user_without() -> None:
     )
 
 
-@pytest.mark.parametrize(("weakest", "costs"), [(0.9, False), (GOLD + 0.01, False), (0.1, True)])
-def test_no_metal_is_more_deeply_colored_than_gold(weakest: float, costs: bool) -> None:
-    colors, weight = torch.full((100, 3), 0.5), torch.ones(100)
-    colors[0, 2] = 0.5 * weakest
-    cost = _tint_cost(colors, weight, RULES)
-    assert (float(cost[0]) > 0.5) == costs
-    assert not bool(cost[1:].any())
+def test_what_priors_decide_differently_is_a_mixture() -> None:
+    """Two clusters of unlike color: one is worth the whole prior, the other a half of it."""
+    gaussians = gaussians_of_the_ball()
+    means, count = gaussians["means"], len(gaussians["means"])
+    upper = means[:, 2] > 0
+    measured = said(
+        count,
+        ratio=torch.where(upper, 3.0, 0.9) * RULES.prior,
+        color=torch.where(upper, 0.9, 0.02)[:, None].expand(count, 3),
+    )
+    allowed = torch.ones(count, dtype=torch.bool)
+    soft = decide(measured, gaussians, allowed, RULES, (1 / 3, 2 / 3, 1.0))
+    hard = decide(measured, gaussians, allowed, RULES)
+    torch.testing.assert_close(hard, upper.float())
+    torch.testing.assert_close(soft, torch.where(upper, 1.0, 2 / 3))
 
 
 RECIPE = RECIPES["polarguide-stokes"]
@@ -284,21 +293,20 @@ def test_the_users_words_need_no_polarization(tiny_scene: Scene) -> None:
     assert not bool(found(ball, views).any())
 
 
-def test_the_prior_grows_from_look_to_look(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is likely is shaded as a metal at first; at the last look the whole prior counts."""
+def test_only_the_last_look_decides_hard(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is likely is shaded as a mixture at first; at the last look the whole prior alone counts."""
     trainer = trainer_of(tiny_scene, TrainSettings(60, 3), [])
     steps = looks(trainer.recipe, trainer.settings)
     assert len(steps) >= 3
-    priors: list[float] = []
+    priors: list[Sequence[float]] = []
 
     def decided_with(*given: object) -> Tensor:
-        priors.append(given[-1].prior)  # type: ignore[attr-defined]
-        return torch.zeros(len(trainer.state.gaussians), dtype=torch.bool)
+        priors.append(given[-1])  # type: ignore[arg-type]
+        return torch.zeros(len(trainer.state.gaussians))
 
     monkeypatch.setattr("polarguide.training.metals.search.decide", decided_with)
     trainer.run(lambda _: None)
-    expected = [RULES.prior * (k + 1) / len(steps) for k in range(len(steps))]
-    assert priors == pytest.approx(expected)
+    assert priors == [SOFT_PRIORS] * (len(steps) - 1) + [(1.0,)]
 
 
 def test_what_is_beside_a_label_has_none() -> None:

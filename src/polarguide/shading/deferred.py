@@ -274,13 +274,13 @@ class DeferredShading(ShadingModel):
         self,
         gaussians: Gaussians,
         light: Light,
-        metal: Tensor,
+        metalness: Tensor,
         reflectance: Tensor,
         gain: Callable[[], float],
     ) -> None:
         """See ``ShadingModel`` and ``shading.metal``."""
         first = not any_nonzero(gaussians["metalness"])
-        fresh = convert(gaussians, metal, reflectance)
+        fresh = convert(gaussians, metalness, reflectance)
         if not any_nonzero(gaussians["metalness"]):
             return
         if first:
@@ -390,7 +390,7 @@ class DeferredShading(ShadingModel):
         if not self._has_metal(gaussians):
             return specular + diffuse
         mean, _ = optics.conductor(cosine, reflectance(gaussians["reflectance_logits"]))
-        return torch.where(gaussians["metalness"][:, None] > 0, mean * reflected, specular + diffuse)
+        return torch.lerp(specular + diffuse, mean * reflected, gaussians["metalness"][:, None])
 
     def diffuse_colors(self, gaussians: Parameters, rays: Tensor) -> Tensor:
         """Linear colors [N, 3] without reflections: none of metals."""

@@ -1,6 +1,7 @@
 """Metals beside dielectrics in the deferred shading model.
 
-A Gaussian is a metal or a dielectric (``metalness`` 1 or 0, decided by ``training.metals`` or by masks, never learned).
+A Gaussian is a metal or a dielectric (``metalness`` 1 or 0, decided by ``training.metals`` or by masks, never learned);
+before the last decision it can be a mixture of both.
 A metal has no diffuse reflection: its base color and its strength do not count. What it reflects is
 
     specular = R(r, i) L
@@ -150,23 +151,22 @@ DIRECTIONS, CHUNK = 128, 4096
 
 
 @torch.no_grad()
-def convert(gaussians: Gaussians, metal: Tensor, reflectances: Tensor) -> Tensor:
-    """Set which Gaussians are metals. Those that change have no light of their own at first; what is a dielectric again
-    has the base color and the strength that it had before. Nothing is changed of the others.
+def convert(gaussians: Gaussians, metalness: Tensor, reflectances: Tensor) -> Tensor:
+    """Set the metalness of Gaussians. What begins or ends to be a metal has no light of its own at first; what is a
+    dielectric again has the base color and the strength that it had before. Nothing else is changed.
 
     Args:
-        metal: [N] bool. reflectances: [N, 3] at normal incidence, of new ones.
+        metalness: [N], 0 to 1. reflectances: [N, 3] at normal incidence, of new ones.
 
     Returns:
         [N] bool, the new ones.
     """
-    changed = metal != (gaussians["metalness"] > 0)
-    fresh = metal & changed
-    if bool(changed.any()):
-        gaussians.overwrite("metalness", metal.float())
-        gaussians.overwrite("reflectance_logits", reflectance_logits(reflectances), fresh)
-        for name, own in _local(gaussians):
-            gaussians.overwrite(name, torch.zeros_like(own), changed)
+    changed = (metalness > 0) != (gaussians["metalness"] > 0)
+    fresh = (metalness > 0) & changed
+    gaussians.overwrite("metalness", metalness)
+    gaussians.overwrite("reflectance_logits", reflectance_logits(reflectances), fresh)
+    for name, own in _local(gaussians):
+        gaussians.overwrite(name, torch.zeros_like(own), changed)
     return fresh
 
 

@@ -235,14 +235,14 @@ class ShadingModel(ABC):
         self,
         gaussians: Gaussians,
         light: Light,
-        metal: Tensor,
+        metalness: Tensor,
         reflectance: Tensor,
         gain: Callable[[], float],
     ) -> None:
         """Change which Gaussians are metals, of a model that knows them.
 
         Args:
-            metal: [N] bool. reflectance: [N, 3] at normal incidence that new ones begin with.
+            metalness: [N], 0 to 1. reflectance: [N, 3] at normal incidence that new ones begin with.
             gain: by how much all light should be brighter, called when the first metals appear.
         """
         raise NotImplementedError

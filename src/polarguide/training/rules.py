@@ -7,21 +7,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class MetalRules:
-    """The five constants of the energy whose minimum says what is metal (``training.metals.cut``).
+    """The four constants of the energy whose minimum says what is metal (``training.metals.cut``).
 
     Attributes:
         prior: nats per view by which a metal has to be likelier than a dielectric.
         trust: nats that a single Gaussian's evidence counts at most: of 20 one may be wrong, whatever its evidence.
         likeness: nats that it costs if one of two neighbors that look alike is a metal and the other is none.
-        like_color: standard deviation of the logarithm of the color of one material, from Gaussian to Gaussian.
         surface: nats that a metal surface that hangs together has to be worth.
     """
 
     prior: float = 0.45
     trust: float = 3.0
     likeness: float = 8.0
-    like_color: float = 0.3
-    surface: float = 40.0
+    surface: float = 20.0
 
 
 @dataclass(frozen=True)

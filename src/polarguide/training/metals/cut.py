@@ -7,6 +7,8 @@ and infinite where the user says what a Gaussian is. Each piece of metal that ha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -40,11 +42,10 @@ class Graph(NamedTuple):
     cost: NDArray[np.float64]
 
 
-def neighbor_graph(gaussians: Parameters, color: Tensor, rules: MetalRules) -> Graph:
+def neighbor_graph(gaussians: Parameters, measured: Evidence, rules: MetalRules) -> Graph:
     """The nearest neighbors of each Gaussian, tied by how alike they are turned and how alike their color is.
 
-    Args:
-        color: [N, 3] mean radiance.
+    The scene tells which colors are alike: the mean square of what neighbors differ by is 1.
     """
     means = gaussians["means"].detach()
     axes = shortest_axis_normals(
@@ -54,9 +55,11 @@ def neighbor_graph(gaussians: Parameters, color: Tensor, rules: MetalRules) -> G
     count = min(NEIGHBORS + 1, len(places))
     near = torch.from_numpy(cKDTree(places).query(places, k=count)[1]).reshape(len(places), count)[:, 1:]
     near = near.to(means.device)
-    logarithms = (color + DARK).log()
-    apart = ((logarithms[near] - logarithms[:, None]) / rules.like_color).square().mean(dim=-1)
-    alike = dot(axes[:, None], axes[near]) ** 4 * torch.exp(-0.5 * apart)
+    logarithms = (measured.color + DARK).log()
+    apart = (logarithms[near] - logarithms[:, None]).square().mean(dim=-1)
+    seen = measured.views > 0
+    typical = (apart.mean(dim=1) * seen).sum() / seen.sum().clamp(min=1)
+    alike = dot(axes[:, None], axes[near]) ** 4 * torch.exp(-0.5 * apart / typical.clamp(min=1e-6))
     first = np.repeat(np.arange(len(places)), count - 1)
     # A pair that is near from both sides is there twice.
     return Graph(
@@ -108,13 +111,23 @@ def surfaces(
     return metal & (gains > least)[piece]
 
 
-def decide(measured: Evidence, gaussians: Parameters, allowed: Tensor, rules: MetalRules) -> Tensor:
-    """Which Gaussians are metals [N] bool: the minimum of the energy; see the module's text.
+def decide(
+    measured: Evidence,
+    gaussians: Parameters,
+    allowed: Tensor,
+    rules: MetalRules,
+    priors: Sequence[float] = (1.0,),
+) -> Tensor:
+    """Metalness [N] of the Gaussians, the mean over several priors of the minimum of the energy; see the module's text.
 
     Args:
         allowed: [N] bool, those that may be metals unless the user says so.
+        priors: shares of the prior. With one, a Gaussian is a metal (1) or a dielectric (0); with more it is between
+            them where the priors decide differently.
     """
-    nats = unary(measured, allowed, rules).cpu().double().numpy()
-    graph = neighbor_graph(gaussians, measured.color, rules)
-    metal = surfaces(minimum_cut(nats, graph), nats, graph, rules.surface)
-    return torch.from_numpy(metal).to(allowed.device)
+    graph = neighbor_graph(gaussians, measured, rules)
+    metalness = np.zeros(len(allowed), dtype=np.float32)
+    for share in priors:
+        nats = unary(measured, allowed, replace(rules, prior=share * rules.prior)).cpu().double().numpy()
+        metalness += surfaces(minimum_cut(nats, graph), nats, graph, rules.surface)
+    return torch.from_numpy(metalness / len(priors)).to(allowed.device)

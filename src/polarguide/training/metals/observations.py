@@ -202,7 +202,7 @@ def index_offsets(
     most, chosen = weights.max(dim=1)
     specified = torch.where(most > LEAST_SEEN, offsets[chosen], torch.zeros_like(most))
     metalness = gaussians.get("metalness")
-    return specified if metalness is None else specified * (metalness == 0)
+    return specified if metalness is None else specified * (metalness < 1)
 
 
 def numbers_in(view: View) -> set[int]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 
 import torch
@@ -25,6 +23,9 @@ from polarguide.training.recipe import Recipe, Schedule
 from polarguide.training.rules import MetalViews
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import TrainingState
+
+# Shares of the prior that decide before the last look; metalness is the share of these decisions that say metal.
+SOFT_PRIORS = (1 / 3, 2 / 3, 1.0)
 
 
 @torch.no_grad()
@@ -120,7 +121,7 @@ class MetalSearch:
         if not any(view.is_determined or view.materials is not None for view in views):
             return
         gaussians, rasterize = state.gaussians, self._backend.rasterize
-        measured = evidence(gaussians, views, rasterize, self._index, self._rules, self._limits, self._memory)
+        measured = evidence(gaussians, views, rasterize, self._index, self._limits, self._memory)
         if not self._told and (
             wrong := contradicted(gaussians, views, rasterize, measured.labels, self._limits, self._memory)
         ):
@@ -134,8 +135,8 @@ class MetalSearch:
         near = ~far_away(gaussians["means"].detach().cpu(), self._scene.points, centers, self._limits.reach)
         if not any(view.is_determined for view in views):  # then nothing tells how far a label reaches
             near = torch.zeros_like(near)
-        rules = replace(self._rules, prior=self._share_of_prior(state.step) * self._rules.prior)
-        metal = decide(measured, gaussians, near.to(measured.ratio.device), rules).float()
+        near = near.to(measured.ratio.device)
+        metal = decide(measured, gaussians, near, self._rules, self._priors(state.step))
         reflectance = measured.reflectance
         for values in (metal, reflectance):
             self._ranks.broadcast(values)
@@ -150,17 +151,17 @@ class MetalSearch:
             self._limits,
             self._memory,
         )
-        self._shading.become_metal(gaussians, state.light, metal > 0, reflectance, gain)
+        self._shading.become_metal(gaussians, state.light, metal, reflectance, gain)
         del measured
         self._memory.clear()
 
-    def _share_of_prior(self, step: int) -> float:
-        """The prior grows from look to look, and counts whole at the last.
+    def _priors(self, step: int) -> tuple[float, ...]:
+        """Shares of the prior that decide at a step: several before the last look, so that metalness is soft first.
 
         Normals of a metal that is shaded as a dielectric are wrong, and its evidence with them. What is likely is
-        therefore shaded as a metal first, and is a dielectric again where its own normals do not confirm it.
+        therefore shaded as a mixture first, and is a dielectric again where its own normals do not confirm it.
         """
-        return max(1, bisect_right(self._looks, step)) / max(1, len(self._looks))
+        return SOFT_PRIORS if step < max(self._looks, default=step) else (1.0,)
 
 
 def refreshes(recipe: Recipe, steps: int) -> list[int]:
