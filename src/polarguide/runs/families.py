@@ -30,11 +30,15 @@ from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers, 
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.distributed import Ranks
 from polarguide.training.feed import ViewStore
+from polarguide.training.metals.observations import blended, evenly
 from polarguide.training.metals.search import looks
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.trainer import warn_of_unused_materials
+from polarguide.visualization.figures import contact_sheet, radiance_to_rgb, scalar_to_rgb, write_png
 
+METALS, METAL_VIEWS = "metals.png", 6
+"""The picture of a run that shows what is metal, and how many training views it has at most."""
 ANY = 90.0
 """Degrees: as far as two angles can be apart."""
 
@@ -107,6 +111,36 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
             f"{first.specified.words} degrees and looks as if at {first.angle:.0f}. polarguide inspect {scene.root} "
             "compares all angles by themselves; correct the names of the files or angles.csv where it agrees."
         )
+
+
+def report_metals(out: Path, trainer: AngleTrainer, model: GaussianModel, reporter: Reporter) -> None:
+    """Say what is metal and of what polarization cannot tell, and write ``metals.png`` with both."""
+    undecided = trainer.undecided()
+    if undecided is None:
+        return
+    gaussians, rasterize = model.state.gaussians, model.backend.rasterize
+    views = evenly(trainer.scene.train_views, METAL_VIEWS)
+    kinds = [
+        [blended(gaussians, values, view.camera, rasterize).cpu() for view in views]
+        for values in (gaussians["metalness"], undecided.float())
+    ]
+    metal, open_ = (
+        100 * float(torch.stack([(k > 0.5).float().mean() for k in kind]).mean()) for kind in kinds
+    )
+    if not metal and not open_:
+        (out / METALS).unlink(missing_ok=True)
+        return
+    rows = [
+        [radiance_to_rgb(view.photograph()), *(scalar_to_rgb(kind[row], 0.0, 1.0) for kind in kinds)]
+        for row, view in enumerate(views)
+    ]
+    labels = ["photograph", "metal", "undecided"]
+    write_png(out / METALS, contact_sheet(rows, [view.name for view in views], labels))
+    advice = "click on what is metal in the viewer (Materials) and resume" if open_ else ""
+    reporter.say(
+        f"metals: {metal:.1f} % of the pixels; undecided, as polarization cannot tell: {open_:.1f} %"
+        f"{advice and f'; {advice}'}: {out / METALS}"
+    )
 
 
 def picture_names(scene: Scene) -> dict[str, list[str]]:
@@ -280,6 +314,7 @@ class GaussianFamily(Family):
     def finish(self, out: Path, trainer: AngleTrainer, model: GaussianModel, reporter: Reporter) -> None:
         """See ``Family``: what was found out of polarizers, and the PLY."""
         report_polarizers(out, trainer.scene, trainer.polarizers, reporter)
+        report_metals(out, trainer, model, reporter)
         centers = torch.stack([view.camera.center for view in trainer.scene.views])
         write_run_ply(out / PLY, model.state, model.shading, centers)
 

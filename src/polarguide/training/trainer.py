@@ -104,6 +104,10 @@ class Trainer:
         metals = "refresh_priors" in actions and self._metals.is_due(step)
         return metals, "orient_normals" in actions, stage.densify and not self._densifies(step + 1)
 
+    def undecided(self) -> Tensor | None:
+        """Gaussians [N] bool of which polarization cannot tell whether they are metals; see ``MetalSearch``."""
+        return self._metals.undecided(self.state, self._views)
+
     def set_exposures(self, exposures: Mapping[str, tuple[Exposure, ...]]) -> None:
         """Take views, by name, for captured with these exposures from now on; their targets are made anew."""
         self._exposures.update(exposures)

@@ -106,6 +106,10 @@ class AngleTrainer:
         """As of ``Trainer``."""
         return self._trainer.flat
 
+    def undecided(self) -> Tensor | None:
+        """As of ``Trainer``."""
+        return self._trainer.undecided()
+
     @property
     def shading(self) -> ShadingModel:
         """The recipe's, for the run's refractive index."""

@@ -96,13 +96,18 @@ def samples_of(looks: Sequence[Tensor], which: slice, limits: MetalViews) -> Vie
     return ViewSamples(weight * counts, means[..., :3], means[..., 3:6], means[..., 6:9], cosine)
 
 
+@torch.no_grad()
+def blended(gaussians: Parameters, values: Tensor, camera: Camera, rasterize: Rasterize) -> Tensor:
+    """A value of each Gaussian [N] as blended in a view, [H, W]."""
+    return rasterize(splats(gaussians, values[:, None]), camera).features[..., 0]
+
+
 def metalness_share(gaussians: Parameters, camera: Camera, rasterize: Rasterize) -> Tensor | None:
     """Blended metalness [H, W]; None where no Gaussian is a metal, or none can be."""
     metalness = gaussians.get("metalness")
     if metalness is None or not any_nonzero(metalness):
         return None
-    with torch.no_grad():
-        return rasterize(splats(gaussians, metalness[:, None]), camera).features[..., 0]
+    return blended(gaussians, metalness, camera, rasterize)
 
 
 def labeled_views(views: Iterable[View]) -> list[View]:
@@ -218,4 +223,4 @@ def index_picture(
     offsets = gaussians.get("index_offset")
     if offsets is None or not any_nonzero(offsets):
         return None
-    return refractive_index + rasterize(splats(gaussians, offsets[:, None]), camera).features[..., 0]
+    return refractive_index + blended(gaussians, offsets, camera, rasterize)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
+from torch import Tensor
 
 from polarguide.capture import Scene, View
 from polarguide.capture.view import listed
@@ -131,12 +132,9 @@ class MetalSearch:
                 f"other views contradict {names} on {100 * max(wrong.values()):.0f} % of what is said there, at most: "
                 "dielectric in one view, metal in another. The larger part counts; look at these files."
             )
-        centers = torch.stack([view.camera.center for view in self._scene.train_views])
-        near = ~far_away(gaussians["means"].detach().cpu(), self._scene.points, centers, self._limits.reach)
-        if not any(view.is_determined for view in views):  # then nothing tells how far a label reaches
-            near = torch.zeros_like(near)
-        near = near.to(measured.ratio.device)
-        metal = decide(measured, gaussians, near, self._rules, self._priors(state.step))
+        metal = decide(
+            measured, gaussians, self._allowed(state, views), self._rules, self._priors(state.step)
+        )
         reflectance = measured.reflectance
         for values in (metal, reflectance):
             self._ranks.broadcast(values)
@@ -154,6 +152,30 @@ class MetalSearch:
         self._shading.become_metal(gaussians, state.light, metal, reflectance, gain)
         del measured
         self._memory.clear()
+
+    @torch.no_grad()
+    def undecided(self, state: TrainingState, views: Sequence[View]) -> Tensor | None:
+        """Gaussians [N] bool that are dielectrics by the prior alone: what was measured of them would make them metals.
+
+        None where a training does not look for metals, or no view determines the Stokes vector.
+        """
+        if not self._looks or not any(view.is_determined for view in views):
+            return None
+        gaussians = state.gaussians
+        measured = evidence(
+            gaussians, views, self._backend.rasterize, self._index, self._limits, self._memory
+        )
+        without = decide(measured, gaussians, self._allowed(state, views), self._rules, (0.0,))
+        return (without > 0) & (gaussians["metalness"] == 0)
+
+    def _allowed(self, state: TrainingState, views: Sequence[View]) -> Tensor:
+        """Gaussians [N] bool that may be metals unless the user says so: none where nothing tells how far a label
+        reaches.
+        """
+        means = state.gaussians["means"].detach()
+        centers = torch.stack([view.camera.center for view in self._scene.train_views])
+        far = far_away(means.cpu(), self._scene.points, centers, self._limits.reach).to(means.device)
+        return ~far & any(view.is_determined for view in views)
 
     def _priors(self, step: int) -> tuple[float, ...]:
         """Shares of the prior that decide at a step: several before the last look, so that metalness is soft first.
