@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from heard import Heard
 from metal_balls import BODIES, METALS, gaussians_of_the_ball, measured, views_of
 from torch import Tensor
 from trainings import CPU, different, run
@@ -16,8 +17,11 @@ from polarguide.capture import Scene, View
 from polarguide.optics.fresnel import reflectances_from_cosine
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.recipes import RECIPES
+from polarguide.runs.families import METALS_PICTURE, report_metals
 from polarguide.runs.folder import load_checkpoint, resolve, save_checkpoint
+from polarguide.runs.model import GaussianModel
 from polarguide.shading.metal import any_nonzero
+from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.metals.cut import INFINITE, Graph, decide, minimum_cut, surfaces, unary
 from polarguide.training.metals.evidence import Evidence, errors, evidence
 from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights, shares
@@ -307,6 +311,34 @@ def test_only_the_last_look_decides_hard(tiny_scene: Scene, monkeypatch: pytest.
     monkeypatch.setattr("polarguide.training.metals.search.decide", decided_with)
     trainer.run(lambda _: None)
     assert priors == [SOFT_PRIORS] * (len(steps) - 1) + [(1.0,)]
+
+
+def test_what_the_prior_alone_decides_is_undecided(
+    tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A half of the Gaussians has evidence, but less than the prior; it is said, and drawn, until the user decides."""
+    recipe, heard = RECIPE, Heard()
+    trainer = AngleTrainer(tiny_scene, recipe, resolve(TrainSettings(1500, 3), tiny_scene, recipe), CPU)
+    gaussians = trainer.state.gaussians
+    first = gaussians["means"][:, 0] > gaussians["means"][:, 0].median()
+    values = {
+        "ratio": torch.where(first, 0.9, -2.0) * RULES.prior,
+        "color": torch.where(first, 0.9, 0.02)[:, None].expand(-1, 3),
+    }
+    monkeypatch.setattr("polarguide.training.metals.search.evidence", lambda *_: said(len(first), **values))
+    monkeypatch.setattr("polarguide.training.metals.search.far_away", lambda *_: torch.zeros_like(first))
+    model = GaussianModel(trainer.state, trainer.shading, CPU)
+    undecided = trainer.undecided()
+    assert undecided is not None
+    torch.testing.assert_close(undecided, first)
+    report_metals(tmp_path, trainer, model, heard)
+    assert "undecided" in heard.said[0]
+    assert (tmp_path / METALS_PICTURE).exists()
+    labels = torch.zeros(len(first), 2)
+    labels[:, 0] = 1.0
+    values["labels"] = labels
+    report_metals(tmp_path, trainer, model, heard)
+    assert not (tmp_path / METALS_PICTURE).exists()
 
 
 def test_what_is_beside_a_label_has_none() -> None:

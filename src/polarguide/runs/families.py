@@ -37,7 +37,7 @@ from polarguide.training.settings import ResolvedSettings
 from polarguide.training.trainer import warn_of_unused_materials
 from polarguide.visualization.figures import contact_sheet, radiance_to_rgb, scalar_to_rgb, write_png
 
-METALS, METAL_VIEWS = "metals.png", 6
+METALS_PICTURE, METAL_VIEWS = "metals.png", 6
 """The picture of a run that shows what is metal, and how many training views it has at most."""
 ANY = 90.0
 """Degrees: as far as two angles can be apart."""
@@ -128,18 +128,18 @@ def report_metals(out: Path, trainer: AngleTrainer, model: GaussianModel, report
         100 * float(torch.stack([(k > 0.5).float().mean() for k in kind]).mean()) for kind in kinds
     )
     if not metal and not open_:
-        (out / METALS).unlink(missing_ok=True)
+        (out / METALS_PICTURE).unlink(missing_ok=True)
         return
     rows = [
         [radiance_to_rgb(view.photograph()), *(scalar_to_rgb(kind[row], 0.0, 1.0) for kind in kinds)]
         for row, view in enumerate(views)
     ]
     labels = ["photograph", "metal", "undecided"]
-    write_png(out / METALS, contact_sheet(rows, [view.name for view in views], labels))
+    write_png(out / METALS_PICTURE, contact_sheet(rows, [view.name for view in views], labels))
     advice = "click on what is metal in the viewer (Materials) and resume" if open_ else ""
     reporter.say(
         f"metals: {metal:.1f} % of the pixels; undecided, as polarization cannot tell: {open_:.1f} %"
-        f"{advice and f'; {advice}'}: {out / METALS}"
+        f"{advice and f'; {advice}'}: {out / METALS_PICTURE}"
     )
 
 
