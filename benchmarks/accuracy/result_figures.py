@@ -10,6 +10,7 @@ mean of its seeds. No record varies the noise of the pictures.
 from __future__ import annotations
 
 import argparse
+import json
 import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -176,6 +177,33 @@ def draw_angles(scenes: Scenes) -> None:
     save(figure, "angles")
 
 
+METALS = {"metals-a": ("jug", "jug_handle", "pot"), "kit": ("lid_blue", "ruler"), "car": ("chrome",)}
+
+
+def draw_constants(scenes: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
+    """What is found of each metal, and of the dielectric that is taken for metal most, by the constants of metals."""
+    settings = list(next(iter(scenes.values())))
+    figure, axes = pyplot.subplots(figsize=(7, 2.8), layout="constrained")
+    for scene, names in METALS.items():
+        for name in names:
+            shares = [scenes[scene][setting][name] for setting in settings]
+            axes.plot(settings, shares, "o", markersize=5, label=name.replace("_", " "), alpha=0.8)
+    wrong = [
+        max(
+            share
+            for scene, at in scenes.items()
+            for name, share in at[setting].items()
+            if name not in METALS[scene]
+        )
+        for setting in settings
+    ]
+    axes.plot(settings, wrong, "x", color=COLORS[0], label="most of a dielectric")
+    axes.set_ylabel("taken for metal (%)")
+    axes.tick_params(axis="x", rotation=30)
+    axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
+    save(figure, "metals")
+
+
 def tables(bench: Scenes, angles: Scenes) -> Iterator[str]:
     """The values that the figures by recipe, material and angles show, as Markdown."""
     keys = (*PICTURE, *NORMALS, *DIELECTRIC)
@@ -219,6 +247,7 @@ def main() -> None:
     draw_materials(bench)
     draw_views(views, list(next(iter(views.values()))))
     draw_angles(angles)
+    draw_constants(json.loads((RECORDS.parent / "records" / "metal-constants.json").read_text())["scenes"])
 
 
 if __name__ == "__main__":
