@@ -19,7 +19,7 @@ class MetalRules:
     prior: float = 0.45
     trust: float = 3.0
     likeness: float = 8.0
-    surface: float = 20.0
+    surface: float = 40.0
 
 
 @dataclass(frozen=True)
