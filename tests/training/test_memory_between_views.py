@@ -15,9 +15,9 @@ from polarguide.training import flat
 from polarguide.training.actions import outward_directions
 from polarguide.training.metals.evidence import evidence
 from polarguide.training.metals.observations import contradicted, label_weights
-from polarguide.training.rules import MetalViews
+from polarguide.training.rules import MetalRules, MetalViews
 
-LIMITS = MetalViews()
+RULES, LIMITS = MetalRules(), MetalViews()
 GAUSSIANS = gaussians_of_the_ball()
 VIEWS = [
     dataclasses.replace(view, materials=torch.where(view.invalid, 0, 2).to(torch.uint8))
@@ -46,7 +46,7 @@ class Held(MemoryBound):
 
 def of_metals(views: list[View], memory: Held) -> None:
     without = [dataclasses.replace(view, materials=None) for view in views]
-    evidence(GAUSSIANS, without, memory.works(rasterize_cpu), 1.5, LIMITS, memory)
+    evidence(GAUSSIANS, without, memory.works(rasterize_cpu), 1.5, RULES, LIMITS, memory)
 
 
 def of_words(views: list[View], memory: Held) -> None:

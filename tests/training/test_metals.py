@@ -23,7 +23,7 @@ from polarguide.runs.model import GaussianModel
 from polarguide.shading.metal import any_nonzero
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.metals.cut import INFINITE, Graph, decide, minimum_cut, surfaces, unary
-from polarguide.training.metals.evidence import Evidence, errors, evidence
+from polarguide.training.metals.evidence import GOLD, Evidence, _tint_cost, errors, evidence
 from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights, shares
 from polarguide.training.metals.search import SOFT_PRIORS, looks
 from polarguide.training.rules import MetalRules, MetalViews
@@ -37,7 +37,7 @@ def found(
     gaussians: dict[str, Tensor], views: list[View], *, allowed: bool = True, light: float = 1.5
 ) -> Tensor:
     """What becomes metal [N] where all may, or nothing."""
-    measured_there = evidence(gaussians, views, rasterize_cpu, light, LIMITS)
+    measured_there = evidence(gaussians, views, rasterize_cpu, light, RULES, LIMITS)
     return decide(measured_there, gaussians, torch.full((len(gaussians["means"]),), allowed), RULES)
 
 
@@ -156,6 +156,15 @@ def test_evidence_is_trusted_up_to_a_limit_and_the_user_without() -> None:
     assert nats == pytest.approx(
         [RULES.trust, -RULES.trust, -RULES.prior, -INFINITE, INFINITE, -INFINITE], rel=1e-4
     )
+
+
+@pytest.mark.parametrize(("weakest", "costs"), [(0.9, False), (GOLD + 0.01, False), (0.1, True)])
+def test_no_metal_is_more_deeply_colored_than_gold(weakest: float, costs: bool) -> None:
+    colors, weight = torch.full((100, 3), 0.5), torch.ones(100)
+    colors[0, 2] = 0.5 * weakest
+    cost = _tint_cost(colors, weight, RULES)
+    assert (float(cost[0]) > 0.5) == costs
+    assert not bool(cost[1:].any())
 
 
 def test_what_priors_decide_differently_is_a_mixture() -> None:

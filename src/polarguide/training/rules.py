@@ -7,18 +7,21 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class MetalRules:
-    """The four constants of the energy whose minimum says what is metal (``training.metals.cut``).
+    """The five constants of the energy whose minimum says what is metal (``training.metals.cut``).
 
     Attributes:
         prior: nats per view by which a metal has to be likelier than a dielectric.
         trust: nats that a single Gaussian's evidence counts at most: of 20 one may be wrong, whatever its evidence.
         likeness: nats that it costs if one of two neighbors that look alike is a metal and the other is none.
+        tint: standard deviation of the logarithm of a surface's tint in the light that it mirrors, of which the mean
+            light of the scene is known: a metal is hardly more deeply colored than gold.
         surface: nats that a metal surface that hangs together has to be worth.
     """
 
     prior: float = 0.45
     trust: float = 3.0
     likeness: float = 8.0
+    tint: float = 0.3
     surface: float = 40.0
 
 

@@ -18,6 +18,7 @@ error e, give the log likelihood ratio ``n log((e^2 + E_dielectric) / (e^2 + E_m
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -39,12 +40,14 @@ from polarguide.training.metals.observations import (
     samples_of,
     view_sums,
 )
-from polarguide.training.rules import MetalViews
+from polarguide.training.rules import MetalRules, MetalViews
 
 # Shares of its specular polarization that a dielectric's roughness may leave.
 ROUGH = (1.0, 0.85, 0.7, 0.55)
 # Reflectances that are tried: a level times a power of the observed color.
 LEVELS, POWERS = (0.5, 0.6, 0.7, 0.8, 0.88, 0.95), (0.5, 0.75, 1.0)
+# Weakest over strongest reflectance of the most deeply colored metal, gold.
+GOLD = 0.38
 # Unknowns of either explanation, for which as many views tell nothing.
 UNKNOWNS = 2
 # Mean square of the noise of the views, relative to the light: the scene's typical error is no less.
@@ -121,6 +124,7 @@ def evidence(
     views: Sequence[View],
     rasterize: Rasterize,
     refractive_index: float,
+    rules: MetalRules,
     limits: MetalViews,
     memory: MemoryBound = UNBOUNDED,
 ) -> Evidence:
@@ -135,14 +139,14 @@ def evidence(
         gray = labels.new_full((len(labels), 3), FIRST_REFLECTANCE)
         return Evidence(none, none, gray, torch.zeros_like(gray), labels)
     looks = view_sums(gaussians, memory.between(measured), rasterize, limits)
-    result = of_views(looks, labels, refractive_index, limits)
+    result = of_views(looks, labels, refractive_index, rules, limits)
     del looks
     memory.clear()
     return result
 
 
 def of_views(
-    looks: Sequence[Tensor], labels: Tensor, refractive_index: float, limits: MetalViews
+    looks: Sequence[Tensor], labels: Tensor, refractive_index: float, rules: MetalRules, limits: MetalViews
 ) -> Evidence:
     """Evidence of what views measured, as of ``view_sums``, and of the user's labels."""
     sums = torch.stack([look.sum(dim=0) for look in looks]).sum(dim=0)
@@ -153,9 +157,19 @@ def of_views(
         total = samples.weight.sum(dim=0)
         count = total * total / (samples.weight**2).sum(dim=0).clamp(min=1e-9) * (total > LEAST_PIXELS)
         color = (samples.weight[..., None] * samples.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
-        parts.append((*errors(samples, refractive_index, light, limits.dark), count, color))
-    dielectric, metal, reflectance, count, color = (torch.cat(values) for values in zip(*parts, strict=True))
+        parts.append((*errors(samples, refractive_index, light, limits.dark), count, color, total))
+    dielectric, metal, reflectance, count, color, total = (
+        torch.cat(values) for values in zip(*parts, strict=True)
+    )
     typical = torch.minimum(dielectric, metal)[count > UNKNOWNS]
     error = typical.median().clamp(min=NOISE) if len(typical) else dielectric.new_tensor(1.0)
-    ratio = ((error + dielectric) / (error + metal)).log()
+    ratio = ((error + dielectric) / (error + metal)).log() - _tint_cost(color, total, rules)
     return Evidence(ratio, (count - UNKNOWNS).clamp(min=0), reflectance, color.clamp(min=0), labels)
+
+
+def _tint_cost(color: Tensor, weight: Tensor, rules: MetalRules) -> Tensor:
+    """What it costs a metal [N] to be more deeply colored than gold in the mean light of the scene, in nats a view."""
+    mean = (color * weight[:, None]).sum(dim=0) / weight.sum().clamp(min=1e-6)
+    tints = (color / mean.clamp(min=1e-6)).clamp(min=1e-3)
+    tint = (tints.amin(dim=1) / tints.amax(dim=1)).log()
+    return 0.5 * ((math.log(GOLD) - tint).clamp(min=0) / rules.tint) ** 2

@@ -18,7 +18,7 @@ from polarguide.shading.gbuffer import render
 from polarguide.shading.model import Light, ShadingModel
 from polarguide.training.distributed import Ranks
 from polarguide.training.metals.cut import decide
-from polarguide.training.metals.evidence import evidence
+from polarguide.training.metals.evidence import Evidence, evidence
 from polarguide.training.metals.observations import contradicted, evenly
 from polarguide.training.recipe import Recipe, Schedule
 from polarguide.training.rules import MetalViews
@@ -122,7 +122,7 @@ class MetalSearch:
         if not any(view.is_determined or view.materials is not None for view in views):
             return
         gaussians, rasterize = state.gaussians, self._backend.rasterize
-        measured = evidence(gaussians, views, rasterize, self._index, self._limits, self._memory)
+        measured = self._measure(state, views)
         if not self._told and (
             wrong := contradicted(gaussians, views, rasterize, measured.labels, self._limits, self._memory)
         ):
@@ -162,11 +162,15 @@ class MetalSearch:
         if not self._looks or not any(view.is_determined for view in views):
             return None
         gaussians = state.gaussians
-        measured = evidence(
-            gaussians, views, self._backend.rasterize, self._index, self._limits, self._memory
-        )
+        measured = self._measure(state, views)
         without = decide(measured, gaussians, self._allowed(state, views), self._rules, (0.0,))
         return (without > 0) & (gaussians["metalness"] == 0)
+
+    def _measure(self, state: TrainingState, views: Sequence[View]) -> Evidence:
+        rasterize = self._backend.rasterize
+        return evidence(
+            state.gaussians, views, rasterize, self._index, self._rules, self._limits, self._memory
+        )
 
     def _allowed(self, state: TrainingState, views: Sequence[View]) -> Tensor:
         """Gaussians [N] bool that may be metals unless the user says so: none where nothing tells how far a label
