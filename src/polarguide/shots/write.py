@@ -285,7 +285,7 @@ def shot_page(maps: ShotMaps, surface: SurfaceMaps) -> str:
         summary=f"{w} x {h} pixels" + (f"; every {step}. pixel each way is on this page" if step > 1 else ""),
         shown=list(zip(shown, stretches, strict=True)),
         gradient=figures.color_gradient,
-        wheel=figures.aolp_wheel(),
+        wheel=data_uri(figures.angle_wheel(), "aolp", SIDE),
         reasons={code.name.lower(): color for code, color in REASON_COLORS.items()},
         width=width,
         height=height,

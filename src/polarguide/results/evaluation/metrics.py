@@ -16,6 +16,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from polarguide.optics.color import shown
+from polarguide.training.photometric import SSIM_WINDOW, gaussian_window, structural_similarity
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +44,6 @@ class Selection:
 
 
 Keep = Tensor | Selection | None
-SSIM_WINDOW = 11
-SSIM_SIGMA = 1.5
-SSIM_C1 = 0.01**2
-SSIM_C2 = 0.03**2
 REFLECTIVE_SHARE = 0.3
 CLOSE_NORMAL_DEG = 11.25
 SHORTEST = 1e-12
@@ -112,13 +109,7 @@ def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: K
         for picture in (pred_linear, true_linear)
     )
     weight = _blur(selected.to(torch.float64)[None]).clamp(min=torch.finfo(torch.float64).tiny)
-    mean_x, mean_y = _blur(x) / weight, _blur(y) / weight
-    variance_x = _blur(x * x) / weight - mean_x**2
-    variance_y = _blur(y * y) / weight - mean_y**2
-    covariance = _blur(x * y) / weight - mean_x * mean_y
-    similarity = ((2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)) / (
-        (mean_x**2 + mean_y**2 + SSIM_C1) * (variance_x + variance_y + SSIM_C2)
-    )
+    similarity = structural_similarity(*(_blur(plane) / weight for plane in (x, y, x * x, y * y, x * y)))
     counted = _selected(window_centers(selected) if windows is None else windows, similarity[0])
     return similarity.flatten(1).index_select(1, counted.places).mean()
 
@@ -251,9 +242,7 @@ def _check_pair(pred: Tensor, true: Tensor) -> None:
 
 def _blur(channels: Tensor) -> Tensor:
     """[C, H, W] averaged under the Gaussian window, where it lies inside the picture: [C, H - 10, W - 10]."""
-    offset = torch.arange(SSIM_WINDOW, dtype=torch.float64, device=channels.device) - SSIM_WINDOW // 2
-    kernel = torch.exp(-(offset**2) / (2 * SSIM_SIGMA**2))
-    kernel = kernel / kernel.sum()
+    kernel = gaussian_window(channels.dtype, channels.device)
     rows = functional.conv2d(channels[:, None], kernel.view(1, 1, -1, 1))
     return functional.conv2d(rows, kernel.view(1, 1, 1, -1))[:, 0]
 
