@@ -190,7 +190,9 @@ def test_png_cut_anywhere(length: int) -> None:
 
 @given(at=st.integers(8, len(PNG) - 1), bit=st.integers(0, 7))
 def test_png_with_one_flipped_bit(at: int, bit: int) -> None:
-    bytearray(PNG)[at] ^= 1 << bit
+    data = bytearray(PNG)
+    data[at] ^= 1 << bit
+    assert find_damage(bytes(data)) is not None
 
 
 @pytest.mark.parametrize(

@@ -55,12 +55,12 @@ def angle_text(angle: Angle) -> str:
 
 def angle_labels(angles: Sequence[Angle]) -> list[str]:
     """Parts of file names that identify the pictures of a view: 045, 012.5, unknown, none, unknown-2, ..."""
-    found: list[str] = []
+    labels: list[str] = []
     for angle in angles:
         label = angle if isinstance(angle, str) else _angle_digits(angle)
-        same = sum(other == label or other.startswith(f"{label}-") for other in found)
-        found.append(label if not same else f"{label}-{same + 1}")
-    return found
+        same = sum(other == label or other.startswith(f"{label}-") for other in labels)
+        labels.append(label if not same else f"{label}-{same + 1}")
+    return labels
 
 
 def _angle_digits(angle: float) -> str:
@@ -108,13 +108,13 @@ PLAIN = (Exposure(filtered=False),)
 def nominal(exposures: Sequence[Exposure]) -> Tensor:
     """Analyzers [K, 2] float64 of known exposures on the optical axis; (0, 0) of one without a filter."""
     zero = torch.zeros(1, 3, dtype=torch.float64)
-    found = [
+    cosines = [
         torch.zeros(2, dtype=torch.float64)
         if e.angle is None
         else optics.analyzer(math.radians(e.angle), zero)
         for e in exposures
     ]
-    return torch.stack(found) if found else torch.zeros(0, 2, dtype=torch.float64)
+    return torch.stack(cosines) if cosines else torch.zeros(0, 2, dtype=torch.float64)
 
 
 def analyzers(exposures: Sequence[Exposure], rays: Tensor, mount: Mount) -> Tensor:
@@ -354,7 +354,7 @@ def angles_of_names(names: Sequence[str], *, folders: bool = False) -> list[tupl
     of a view are evenly spaced over half a turn or a whole one: 10, 40, ..., 160, or 0 to 175 by 5. ``folders``: names
     such as I_10 are angles alone, and no view I.
     """
-    found = [_stated(name, folders) for name in names]
+    stated = [_stated(name, folders) for name in names]
     numbered: dict[str, list[tuple[int, float]]] = {}
     for place, name in enumerate(names):
         match = _NUMBERED.fullmatch(name)
@@ -364,17 +364,17 @@ def angles_of_names(names: Sequence[str], *, folders: bool = False) -> list[tupl
     for view, places in numbered.items():
         if covers_turn([number for _, number in places]):
             for place, number in places:
-                if not folders or found[place] is None:
-                    found[place] = view, number
-    return found
+                if not folders or stated[place] is None:
+                    stated[place] = view, number
+    return stated
 
 
 def _stated(name: str, folder: bool) -> tuple[str, Angle] | None:
     """View and angle of a single name, of a picture or of a folder."""
-    found = None if folder else split_name(name)
-    if found is None and (alone := split_name(f"x_{name}")) is not None and alone[0] == "x":
+    parts = None if folder else split_name(name)
+    if parts is None and (alone := split_name(f"x_{name}")) is not None and alone[0] == "x":
         return "", alone[1]
-    return found
+    return parts
 
 
 def covers_turn(angles: Sequence[float]) -> bool:

@@ -179,8 +179,8 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
     def to_record(self) -> dict[str, Any]:
         """As the file holds it, without what is missing."""
-        found: dict[str, Any] = msgspec.to_builtins(self)
-        return found
+        record: dict[str, Any] = msgspec.to_builtins(self)
+        return record
 
 
 WHITE = ("white_balance", "chart")

@@ -126,10 +126,10 @@ def _middles(apart: NDArray[np.float64], count: int) -> list[int]:
         group = apart[:, middles].argmin(axis=1)
         group[middles] = np.arange(count)
         members = [np.flatnonzero(group == k) for k in range(count)]
-        found = [int(m[apart[np.ix_(m, m)].sum(axis=1).argmin()]) for m in members]
-        if found == middles:
+        medoids = [int(m[apart[np.ix_(m, m)].sum(axis=1).argmin()]) for m in members]
+        if medoids == middles:
             break
-        middles = found
+        middles = medoids
     taken = [middle for middle, m in zip(middles, members, strict=True) if len(m) > 2]
     while len(taken) < count:
         free = [int(k) for m in members if len(m) > 2 for k in m if k not in taken]
@@ -400,14 +400,14 @@ def _digest(
     data: Sequence[ViewData], cameras: Mapping[str, Camera], more: Sequence[NDArray[Any]], how: object
 ) -> str:
     """SHA-256 over all that a scene was made of."""
-    found = hashlib.sha256(repr(how).encode())
+    digest = hashlib.sha256(repr(how).encode())
     for item in data:
         camera = cameras[item.name]
         lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        found.update(repr((item.name, item.exposures, item.codes.shape, lens)).encode())
-        found.update(camera.world_to_camera.numpy().tobytes())
+        digest.update(repr((item.name, item.exposures, item.codes.shape, lens)).encode())
+        digest.update(camera.world_to_camera.numpy().tobytes())
         for array in (item.codes, item.invalid, item.mask):
-            found.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
+            digest.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
     for array in more:
-        found.update(array.tobytes())
-    return found.hexdigest()
+        digest.update(array.tobytes())
+    return digest.hexdigest()

@@ -155,16 +155,16 @@ def _fault(message: str, value: Any, kind: Any) -> tuple[str, str, str]:
         value = _at(value, name, index)
         form = _form_at(form, name, index)
     field = path.lstrip(".")
-    expected, found = _plain(what.removeprefix("Expected ")), shortened(value)
+    expected, value_found = _plain(what.removeprefix("Expected ")), shortened(value)
     if value is _UNKNOWN:
-        found = _plain(got) or "another"
+        value_found = _plain(got) or "another"
     if what.startswith("Object contains unknown field"):
         fields = [field for kind in _kinds(form) for field in getattr(kind, "fields", ())]
         expected = f"only {', '.join(field.encode_name for field in fields)}"
-        found = what.partition("`")[2].rstrip("`")
+        value_found = what.partition("`")[2].rstrip("`")
     elif what.startswith("Object missing required field"):
         expected = f"the field {what.partition('`')[2].rstrip('`')}"
-        found = f"only {', '.join(value)}" if isinstance(value, dict) and value else "none"
+        value_found = f"only {', '.join(value)}" if isinstance(value, dict) and value else "none"
     elif what.startswith("Number out of range"):
         expected = "a number of usual size"
     elif what.startswith("Invalid enum value"):
@@ -172,7 +172,7 @@ def _fault(message: str, value: Any, kind: Any) -> tuple[str, str, str]:
         expected = f"{', '.join(others)} or {last}" if others else last
     elif _limits(form) and not got:
         expected = _limits(form)
-    return field, expected, found
+    return field, expected, value_found
 
 
 def shortened(value: Any, most: int = 100) -> str:

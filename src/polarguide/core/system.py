@@ -72,7 +72,7 @@ class StopSignals:
     """
 
     def __init__(self) -> None:
-        self._asked = self._works = False
+        self._stopping = self._works = False
 
     def __enter__(self) -> StopSignals:
         self._old = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, *stop_signals())}
@@ -84,13 +84,13 @@ class StopSignals:
 
     def __call__(self) -> bool:
         self._works = True
-        return self._asked
+        return self._stopping
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         if self._works:
-            if self._asked and number == signal.SIGINT:
+            if self._stopping and number == signal.SIGINT:
                 interrupt(number, frame)
-            self._asked = True
+            self._stopping = True
         elif number == signal.SIGTERM and process_count() > 1:
             # torchrun ends the others when one process is lost: first one of them has to say what happened.
             timer = threading.Timer(LAST_WORDS_SECONDS, os._exit, (128 + number,))

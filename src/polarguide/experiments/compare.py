@@ -60,7 +60,7 @@ def compare(
     options: CompareOptions = CompareOptions(),
     seeds_of: Mapping[str, int] = MappingProxyType({}),
     steps_of: Mapping[str, int] = MappingProxyType({}),
-    asked: str = "",
+    command_line: str = "",
     reporter: Reporter = SILENT,
 ) -> Results:
     """Train and score every recipe on every scene with every seed, each run in processes of its own.
@@ -80,7 +80,7 @@ def compare(
         options: how runs are trained, timed and shown.
         seeds_of: by the name of a recipe, how many seeds where that is not ``options.seeds``.
         steps_of: by the name of a recipe, how many steps where that is not ``settings.steps``.
-        asked: the command line that asked, for the record, if not ``polarguide compare``.
+        command_line: for the record, if not ``polarguide compare``.
         reporter: receives messages and progress.
 
     Returns:
@@ -97,7 +97,7 @@ def compare(
         out=Path(out),
         seeds_of=dict(seeds_of),
         steps_of=dict(steps_of),
-        asked=asked,
+        command_line=command_line,
     )
     names = [recipe.name for recipe in comparison.recipes]
     for word, of, most in (("seeds_of", seeds_of, MOST_SEEDS), ("steps", steps_of, MOST)):

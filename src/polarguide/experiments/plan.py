@@ -75,7 +75,7 @@ class Comparison:
         out: folder to write.
         seeds_of: by the name of a recipe, how many seeds where that is not ``options.seeds``.
         steps_of: by the name of a recipe, how many steps where that is not ``settings.steps``.
-        asked: the command line that asked, if not ``polarguide compare``.
+        command_line: for the record, if not ``polarguide compare``.
     """
 
     scenes: tuple[Path, ...]
@@ -85,7 +85,7 @@ class Comparison:
     out: Path
     seeds_of: Mapping[str, int] = field(default_factory=dict)
     steps_of: Mapping[str, int] = field(default_factory=dict)
-    asked: str = ""
+    command_line: str = ""
 
     @property
     def steps(self) -> int:
@@ -136,7 +136,7 @@ class Comparison:
             "--exposures": options.exposures,
         }
         line = [word for option, values in arguments.items() if values for word in (option, *values)]
-        return self.asked or shlex.join(map(str, ["polarguide", "compare", *self.scenes, *line]))
+        return self.command_line or shlex.join(map(str, ["polarguide", "compare", *self.scenes, *line]))
 
 
 @dataclass(frozen=True)

@@ -119,8 +119,12 @@ class _Work:
     def _inspect(self) -> dict[str, Any]:
         out = self.folder / INSPECTION
         reading, settings = self.task.request.reading, self.task.request.settings
-        asked = InspectSettings(refractive_index=settings.refractive_index, transfer=reading.transfer)
-        inspected = inspect_scene(self._scene, out, asked, choose_backend(self.task.compute.device))
+        inspect_settings = InspectSettings(
+            refractive_index=settings.refractive_index, transfer=reading.transfer
+        )
+        inspected = inspect_scene(
+            self._scene, out, inspect_settings, choose_backend(self.task.compute.device)
+        )
         write_inspection(inspected, out)
         findings = tuple(
             f"{check.verdict}: {check.title}: {check.finding}"

@@ -171,14 +171,14 @@ class CalibrationOptions:
             PolarguideError: the file or the order is wrong.
         """
         if self.calibration is None or self.analyzers() is not None:
-            found = Calibration()
+            calibration = Calibration()
         else:
-            found = read_calibration(self.calibration)
+            calibration = read_calibration(self.calibration)
         if self.order is not None:
-            found = replace(found, order=_four_angles(self.order))
+            calibration = replace(calibration, order=_four_angles(self.order))
         if self.sense is not None:
-            found = replace(found, sense=self.sense)
-        return found if self.zero is None else replace(found, zero=self.zero)
+            calibration = replace(calibration, sense=self.sense)
+        return calibration if self.zero is None else replace(calibration, zero=self.zero)
 
     def analyzers(self) -> Path | None:
         """The file, if it is one of polarguide calibrate, which ``PrepareSettings.analyzers`` takes; else None."""

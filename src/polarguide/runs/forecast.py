@@ -73,12 +73,12 @@ class MemoryPlan:
 
     Attributes:
         hold: whether the pictures stay in memory; otherwise views decode theirs again.
-        kept: bytes of what is kept of the views in memory, the rest lies in a file; None: all stays in memory.
+        view_bytes: of what is computed of the views and stays in memory, the rest lies in a file; None: all stays.
         peak: bytes that the process takes at most.
     """
 
     hold: bool
-    kept: int | None
+    view_bytes: int | None
     peak: int
 
 

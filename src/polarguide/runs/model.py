@@ -134,14 +134,14 @@ def baked_harmonics(
     light: Light,
     shading: ShadingModel,
     *,
-    shown: Callable[[Tensor], Tensor],
+    present: Callable[[Tensor], Tensor],
     linear: bool,
 ) -> tuple[Tensor, Tensor]:
     """Harmonics, as of ``refit_sh``, of ``gaussian_colors``.
 
     Args:
         gaussians, light, shading: of the run.
-        shown: what becomes of linear colors. linear: whether they are still linear then.
+        present: what becomes of linear colors. linear: whether they are still linear then.
     """
     known = {
         name: values
@@ -155,7 +155,7 @@ def baked_harmonics(
 
     def colors(part: slice, directions: Tensor) -> Tensor:
         some = {name: values.detach()[part] for name, values in known.items()}
-        return shown(gaussian_colors(some, light, shading, directions))
+        return present(gaussian_colors(some, light, shading, directions))
 
     return refit_sh(colors, normals, srgb_slope if linear else None)
 
@@ -216,7 +216,7 @@ def write_run_ply(
         colors = colored(colors, color).clamp(0, 1)
         return colors if linear else srgb_encode(colors)
 
-    dc, rest = baked_harmonics(gaussians, state.light, shading, shown=shown, linear=linear)
+    dc, rest = baked_harmonics(gaussians, state.light, shading, present=shown, linear=linear)
     plain = {
         name: gaussians[name].detach().cpu()
         for name in ("means", "log_scales", "quaternions", "opacity_logits")

@@ -270,8 +270,8 @@ class OpenedRun:
             polarized: whether to predict Stokes vectors, where the model can.
         """
         chosen = self.scene.view(camera).camera if isinstance(camera, str) else camera
-        found = self.model.render(chosen, normals=normals, depth=depth, surface=surface)
-        return replace(found, predicted=self.model.stokes(found, chosen)) if polarized else found
+        result = self.model.render(chosen, normals=normals, depth=depth, surface=surface)
+        return replace(result, predicted=self.model.stokes(result, chosen)) if polarized else result
 
     def render(self, camera: Camera | str, layers: Iterable[str] = ("final",)) -> dict[str, Tensor]:
         """Layers of a picture.

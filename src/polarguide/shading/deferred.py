@@ -352,8 +352,8 @@ class DeferredShading(ShadingModel):
         if not (self.rough or self.metal):
             return {}
         blended = blended_roughness(splatted)
-        shown = torch.zeros_like(splatted.alpha) if blended is None else blended
-        return {"roughness": gltf_roughness(shown, self.environment_resolution)}
+        roughness = torch.zeros_like(splatted.alpha) if blended is None else blended
+        return {"roughness": gltf_roughness(roughness, self.environment_resolution)}
 
     def _index_picture(self, splatted: GBuffer) -> Tensor | None:
         """Refractive indices [H, W]; None: the run's everywhere."""

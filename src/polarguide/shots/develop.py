@@ -206,10 +206,10 @@ def _analyzers(shape: tuple[int, ...], options: ShotOptions) -> AnalyzerCalibrat
     path = options.analyzers
     if path is None:
         return None
-    found = calibration_of(path)
-    found.require_sensor(options.sensor, path)
-    found.require_region((options.offset_x, options.offset_y), (shape[1], shape[0]), path)
-    return found
+    calibration = calibration_of(path)
+    calibration.require_sensor(options.sensor, path)
+    calibration.require_region((options.offset_x, options.offset_y), (shape[1], shape[0]), path)
+    return calibration
 
 
 def calibration_of(path: Path) -> AnalyzerCalibration:

@@ -266,8 +266,8 @@ def _variances(sensor: str, x: int, y: int, mode: str) -> tuple[NDArray[np.float
         # Impulses of one position lie so far apart that no pixel sees two.
         squares += response**2
         summed += response[:, inner, inner].sum(axis=(1, 2)) ** 2  # by the only impulse in there
-    found = squares[:, inner, inner]
-    blocks = found.reshape(4, found.shape[1] // period, period, found.shape[2] // period, period)
+    variances = squares[:, inner, inner]
+    blocks = variances.reshape(4, variances.shape[1] // period, period, variances.shape[2] // period, period)
     mean = float(summed.mean()) * step**2 / cell**2
     return np.asarray(blocks.sum(axis=(1, 3)), np.float32), mean
 
@@ -316,11 +316,11 @@ def gains_of(
     if ratio is None:
         return UNIT_GAINS, ()
     deviation = f"I0 + I90 is {ratio - 1:+.2%} off I45 + I135"
-    found = balancing_gains(ratio)
-    if found is None:
+    gains = balancing_gains(ratio)
+    if gains is None:
         return UNIT_GAINS, (f"{deviation}: the angles or the encoding are probably wrong.",)
     if options.gains == "auto":
-        return found, (f"{deviation}; corrected.",)
+        return gains, (f"{deviation}; corrected.",)
     if abs(ratio - 1) > _LARGE_IMBALANCE:
         return UNIT_GAINS, (f"{deviation}; not corrected (--gains auto does, a calibration does better).",)
     return UNIT_GAINS, ()

@@ -287,9 +287,9 @@ def _text(picture: Picture, text: str, x: int, y: int, size: float, room: int) -
 
 def _quantile(values: NDArray[Any], where: NDArray[np.bool_], q: float = 0.995) -> float:
     step = max(1, math.isqrt(values.size // _SAMPLES))
-    found = values[::step, ::step][where[::step, ::step]]
-    found = found[np.isfinite(found)]
-    return float(np.quantile(found, q)) if found.size else 1.0
+    numbers = values[::step, ::step][where[::step, ::step]]
+    numbers = numbers[np.isfinite(numbers)]
+    return float(np.quantile(numbers, q)) if numbers.size else 1.0
 
 
 def _nice(value: float) -> float:

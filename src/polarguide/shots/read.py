@@ -134,13 +134,13 @@ def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> Sh
         why = reason[part]
         why[degree <= options.snr * spread.dolp] = Reason.NOISE
         why[s[0] <= DARK_SNR / 2 * variances.sum(dim=0).sqrt()] = Reason.DARK
-    found = reason.numpy()
+    codes = reason.numpy()
     for mask, kind in (
         (developed.dark, Reason.DARK),
         (developed.saturated, Reason.SATURATED),
         (developed.masked, Reason.MASKED),
     ):
-        found[mask] = kind
+        codes[mask] = kind
     return ShotMaps(
         name=shot.name,
         files=shot.paths,
@@ -151,7 +151,7 @@ def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> Sh
         aolp=aolp.numpy(),
         sigma_dolp=sigma_dolp.numpy(),
         sigma_aolp=sigma_aolp.numpy(),
-        reason=found,
+        reason=codes,
         noise=developed.noise,
         pair_ratio=developed.pair_ratio,
         notes=developed.notes,

@@ -78,8 +78,8 @@ class SetSamples:
 
     def gray(self, at: Any) -> NDArray[np.float32]:
         """The same of the luminance, the plain mean of the colors: [K, ...]."""
-        found = self.intensities(at)
-        return luminance(found)
+        colors = self.intensities(at)
+        return luminance(colors)
 
 
 def luminance(colors: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -128,8 +128,8 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
     read = Shots(values, code, lost, dark)
     angles = [_degrees(picture.angle) for picture in pictures]
     labels = tuple(picture.label for picture in pictures)
-    found = _samples(read, kind, labels, angles, gains, transfer, options)
-    return replace(found, notes=(note, *found.notes, *words, *_unused(unused)))
+    samples = _samples(read, kind, labels, angles, gains, transfer, options)
+    return replace(samples, notes=(note, *samples.notes, *words, *_unused(unused)))
 
 
 def samples_of_arrays(
@@ -149,9 +149,9 @@ def samples_of_arrays(
     transfer = "linear" if options.transfer == "auto" else options.transfer
     labels = tuple(f"picture {k + 1}" for k in places)
     known = [_degrees(angles[k]) for k in places]
-    found = _samples(read, stored.dtype, labels, known, [1.0] * len(places), transfer, options)
+    samples = _samples(read, stored.dtype, labels, known, [1.0] * len(places), transfer, options)
     note = f"Transfer {transfer}, {'as arrays are' if options.transfer == 'auto' else 'as given'}."
-    return replace(found, notes=(note, *found.notes, *_unused(len(angles) - len(places))))
+    return replace(samples, notes=(note, *samples.notes, *_unused(len(angles) - len(places))))
 
 
 def _samples(
@@ -278,7 +278,7 @@ def _video(path: Path, frames: Sequence[int | None]) -> Iterator[Shots]:
         yield Shots(picture[None], 1, clipped[None], ~lit)
 
 
-def _transfer(pictures: Sequence[SetPicture], asked: str) -> tuple[str, str]:
+def _transfer(pictures: Sequence[SetPicture], transfer: str) -> tuple[str, str]:
     """How the files are encoded, and why: as ``prepare`` takes photographs at any angles.
 
     Raises:
@@ -295,9 +295,9 @@ def _transfer(pictures: Sequence[SetPicture], asked: str) -> tuple[str, str]:
             found=" and ".join(f"{kind} ({path.name})" for kind, path in kinds.items()),
             remedy="Keep one kind: their brightness cannot be compared.",
         )
-    if asked == "auto" and "video" not in kinds:
+    if transfer == "auto" and "video" not in kinds:
         require_known_encoding(pictures[0].path)
-    return transfer_of_kind(next(iter(kinds)), asked)
+    return transfer_of_kind(next(iter(kinds)), transfer)
 
 
 def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:

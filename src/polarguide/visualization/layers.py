@@ -100,7 +100,9 @@ def layer_scale(name: str, depths: Depths | None = None) -> Picture | None:
         return figures.scale_bar(0.0, DOLP_HIGH, "inferno")
     if name == "stokes":
         return figures.color_patch(128, f"0; red S1, green S2, to {STOKES_HIGH:g} S0")
-    return {"aolp": figures.angle_wheel, "normal": figures.normal_ball}.get(name, lambda: None)()
+    if name == "aolp":
+        return figures.angle_wheel()
+    return figures.normal_ball() if name == "normal" else None
 
 
 def clipping_exposure(values: Tensor) -> float:

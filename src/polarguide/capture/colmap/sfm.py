@@ -372,7 +372,7 @@ def reconstruct(
         )
         others = _map(database, images, trial, len(sizes), seed, reporter, free, weak=True)
         models = max(models, others, key=_registered)
-    best = max(models.values(), key=lambda found: found.num_reg_images(), default=None)
+    best = max(models.values(), key=lambda candidate: candidate.num_reg_images(), default=None)
     registered = _registered(models)
     by_chance = best is not None and connected_views(database, sizes) < LEAST_VIEWS
     if best is None or registered < LEAST_VIEWS or by_chance:
@@ -400,7 +400,7 @@ def reconstruct(
 
 def _registered(models: dict[int, Any]) -> int:
     """Views of the largest model."""
-    return max((found.num_reg_images() for found in models.values()), default=0)
+    return max((model.num_reg_images() for model in models.values()), default=0)
 
 
 def _map(
@@ -429,8 +429,8 @@ def _map(
     options.ba_refine_focal_length = options.ba_refine_extra_params = free
     placed: list[None] = []
     step = functools.partial(placed.append, None)
-    found: dict[int, Any] = run_step(
+    models: dict[int, Any] = run_step(
         lambda: pycolmap.incremental_mapping(database, images, trial, options, next_image_callback=step),
         seed, reporter, "registering images", count, lambda: len(placed) + 2 if placed else 0,
     )  # fmt: skip
-    return found
+    return models

@@ -325,7 +325,7 @@ def find_single_shots(root: Path, angles: str | None = None) -> tuple[list[Singl
         path: None if name is None or not (name[0] or alone) else (name[0] or root.resolve().name, name[1])
         for path, name in zip(files, names, strict=True)
     }
-    without = [path.name for path, found in named.items() if found is None]
+    without = [path.name for path, shot in named.items() if shot is None]
     if without:
         raise PolarguideError(
             root,
@@ -333,14 +333,14 @@ def find_single_shots(root: Path, angles: str | None = None) -> tuple[list[Singl
             found=f"{len(without)} of {len(files)} without an angle in their names ({listed(without)})",
             remedy=NAMING,
         )
-    shots = [SingleShot(path, *found) for path, found in named.items() if found is not None]
+    shots = [SingleShot(path, *shot) for path, shot in named.items() if shot is not None]
     return _checked(root, shots), []
 
 
 def _all_alike(root: Path, angles: str) -> list[SingleShot]:
     """Photographs whose angles an option says: one word for all, or numbers that repeat."""
-    found = [parse_angle(part) for part in angles.split(",")]
-    if any(angle is None for angle in found):
+    repeating = [parse_angle(part) for part in angles.split(",")]
+    if any(angle is None for angle in repeating):
         raise PolarguideError(
             "--angles",
             expected="unknown, none, angles in the order of the files such as 0,60,120, or the path of a .csv table",
@@ -348,14 +348,14 @@ def _all_alike(root: Path, angles: str) -> list[SingleShot]:
             remedy="Correct the value.",
         )
     files = list(index_files(root, SHOT_SUFFIXES).values())
-    if len(files) % len(found):
+    if len(files) % len(repeating):
         raise PolarguideError(
             "--angles",
-            expected=f"a multiple of {len(found)} photographs, as these angles repeat",
+            expected=f"a multiple of {len(repeating)} photographs, as these angles repeat",
             found=f"{len(files)} in {root}",
             remedy=f"One is missing or too many: say each angle in {TABLE}.",
         )
-    repeated = [found[number % len(found)] for number in range(len(files))]
+    repeated = [repeating[number % len(repeating)] for number in range(len(files))]
     return [
         SingleShot(path, path.stem, angle)
         for path, angle in zip(files, repeated, strict=True)

@@ -169,18 +169,18 @@ def demosaic(
     step = 4 if mode == "quarter" else 2
     values = values[: values.shape[0] // step * step, : values.shape[1] // step * step]
     if mode == "quarter":
-        found = _superpixels(values, pattern)
+        picture = _superpixels(values, pattern)
     else:
         cells = _cells(values, pattern, interpolation)
         if mode == "full":
-            found = _full(cells, pattern, interpolation)
+            picture = _full(cells, pattern, interpolation)
         else:
-            found = _half_size(cells, pattern)
+            picture = _half_size(cells, pattern)
             if registered:
-                found = _registered(found, _full(cells, pattern, interpolation), interpolation)
-    if colored and found.shape[-1] == 1:
-        found = np.repeat(found, 3, axis=-1)
-    return DemosaicedPicture(found, invalid)
+                picture = _registered(picture, _full(cells, pattern, interpolation), interpolation)
+    if colored and picture.shape[-1] == 1:
+        picture = np.repeat(picture, 3, axis=-1)
+    return DemosaicedPicture(picture, invalid)
 
 
 def spoiled(bad: Mask, pattern: Pattern, *, mode: str, interpolation: str, registered: bool = True) -> Mask:

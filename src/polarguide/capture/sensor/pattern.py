@@ -355,8 +355,8 @@ def require_kind(sensor: str, blocks: NDArray[Any], levels: Levels) -> None:
     Raises:
         PolarguideError: the samples say that it is another one.
     """
-    found = color_filters(blocks, levels.saturation, levels.black)
-    if found is None or (found == "color") == SENSORS[sensor]:
+    filters = color_filters(blocks, levels.saturation, levels.black)
+    if filters is None or (filters == "color") == SENSORS[sensor]:
         return
     other = next(name for name, colored in SENSORS.items() if colored != SENSORS[sensor])
     raise PolarguideError(

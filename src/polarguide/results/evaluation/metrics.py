@@ -73,7 +73,7 @@ def squared_error(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None) -
     Raises:
         ValueError: shapes that do not fit.
     """
-    return _shown_error(*_kept(pred_linear, true_linear, keep))
+    return _shown_error(*_selected_values(pred_linear, true_linear, keep))
 
 
 def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: Keep = None) -> Tensor:
@@ -159,12 +159,12 @@ def normal_mae_deg(pred: Tensor, true: Tensor, keep: Keep = None) -> Tensor:
     Returns:
         [] degrees; NaN where no pixel counts.
     """
-    return _kept_angles(pred, true, keep).mean()
+    return _selected_angles(pred, true, keep).mean()
 
 
 def normal_within_11(pred: Tensor, true: Tensor, keep: Keep = None) -> Tensor:
     """Share in [0, 1] of the pixels whose normal is under 11.25 degrees off, else as ``normal_mae_deg``."""
-    return (_kept_angles(pred, true, keep) < CLOSE_NORMAL_DEG).to(torch.float64).mean()
+    return (_selected_angles(pred, true, keep) < CLOSE_NORMAL_DEG).to(torch.float64).mean()
 
 
 def layer_error(contribution: Tensor, true_s0: Tensor, keep: Keep, *, aligned: bool = False) -> Tensor:
@@ -180,7 +180,7 @@ def layer_error(contribution: Tensor, true_s0: Tensor, keep: Keep, *, aligned: b
     Returns:
         [], as ``squared_error``.
     """
-    pred, true = _kept(contribution, true_s0 / 2, keep)
+    pred, true = _selected_values(contribution, true_s0 / 2, keep)
     return _shown_error(pred * _channel_scales(pred, true) if aligned else pred, true)
 
 
@@ -209,14 +209,14 @@ def _shown_error(pred: Tensor, true: Tensor) -> Tensor:
     return ((shown(pred) - shown(true)) ** 2).mean()
 
 
-def _kept_angles(pred: Tensor, true: Tensor, keep: Keep) -> Tensor:
+def _selected_angles(pred: Tensor, true: Tensor, keep: Keep) -> Tensor:
     if not isinstance(keep, Selection):
         directed = has_direction(true)
         keep = directed if keep is None else directed & keep.to(directed.device)
     return _selected(keep, pred).pick(normal_angles_deg(pred, true))
 
 
-def _kept(pred: Tensor, true: Tensor, keep: Keep) -> tuple[Tensor, Tensor]:
+def _selected_values(pred: Tensor, true: Tensor, keep: Keep) -> tuple[Tensor, Tensor]:
     """The pixels that count as [P, C] float64, on the device of the prediction."""
     _check_pair(pred, true)
     selection = _selected(keep, pred)

@@ -193,7 +193,7 @@ def _ply(
         model = run.gaussian_model("format ply")
         color = presented.presentation.color
         write_run_ply(whole, model.state, model.shading, _camera_centers(run), color=color, linear=linear)
-        selected = None if presented.kept is None else presented.kept.cpu()
+        selected = None if presented.inside is None else presented.inside.cpu()
         rewrite_splats(path, whole, placement or presented.placement, selected, presented.comments)
     return path
 
@@ -263,8 +263,8 @@ def _mesh(
     if (crop := presented.presentation.crop) is not None:
         inside = crop.inside(torch.from_numpy(mesh.surface.vertices), run.camera_frame).numpy()
         mesh = mesh.within(inside)
-    shown = colored(torch.from_numpy(mesh.colors), presented.presentation.color).clamp(max=1)
-    mesh = replace(mesh, colors=shown.numpy())
+    colors = colored(torch.from_numpy(mesh.colors), presented.presentation.color).clamp(max=1)
+    mesh = replace(mesh, colors=colors.numpy())
     paths = [folder / "mesh.glb", folder / "mesh.ply"]
     for path in paths:
         write_mesh(path, mesh, run.frame, presented.placement, presented.origin)
@@ -370,8 +370,8 @@ def _all(
         if radiant:
             _environment(run, presented, parts, reporter)
         view = (run.scene.test_views + run.scene.train_views)[0]
-        shown = colored(run.result(view.camera).to("cpu").final, presented.presentation.color)
-        figures.write_png(parts / "preview.png", figures.radiance_to_rgb(shown))
+        picture = colored(run.result(view.camera).to("cpu").final, presented.presentation.color)
+        figures.write_png(parts / "preview.png", figures.radiance_to_rgb(picture))
         names = sorted(path.name for path in parts.iterdir())
         record = package_record(
             run, presented.upright(run), presented.origin, BASE_COLORS[lit.resolved_base_color]

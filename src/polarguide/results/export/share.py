@@ -141,14 +141,14 @@ def harmonics_steps(rest: Tensor) -> tuple[NDArray[np.int8], NDArray[np.float16]
     return steps.astype(np.int8), step
 
 
-def _axes(gaussians: Parameters, kept: Tensor) -> tuple[Tensor, Tensor]:
+def _axes(gaussians: Parameters, mask: Tensor) -> tuple[Tensor, Tensor]:
     """Normal axes [K, 3], and 1 [K] where they are turned outward, 0 where the camera alone decides."""
-    means, origin = gaussians["means"][kept], torch.zeros(3)
-    axes = shortest_axis_normals(means, gaussians["quaternions"][kept], gaussians["log_scales"][kept], origin)
+    means, origin = gaussians["means"][mask], torch.zeros(3)
+    axes = shortest_axis_normals(means, gaussians["quaternions"][mask], gaussians["log_scales"][mask], origin)
     outward = gaussians.get("outward")
     if outward is None:
-        return axes, torch.zeros(len(kept))
-    along = (axes * outward[kept]).sum(dim=1)
+        return axes, torch.zeros(len(mask))
+    along = (axes * outward[mask]).sum(dim=1)
     return torch.where(along < 0, -1.0, 1.0)[:, None] * axes, (along != 0).float()
 
 
@@ -287,7 +287,7 @@ def share_page(
 
 def baked_page(gaussians: Parameters, light: Light, shading: ShadingModel) -> PageShading:
     """The page of a model for which there are no shaders: linear harmonics of its Gaussians' own colors, and a note."""
-    dc, rest = baked_harmonics(gaussians, light, shading, shown=lambda colors: colors, linear=True)
+    dc, rest = baked_harmonics(gaussians, light, shading, present=lambda colors: colors, linear=True)
     return PageShading("plain", {"color": dc[:, 0], "harmonics": rest}, notes=[BAKED])
 
 

@@ -174,13 +174,13 @@ class ColoredMesh:
     surface: Surface
     colors: NDArray[np.float64]
 
-    def within(self, kept: NDArray[np.bool_]) -> ColoredMesh:
+    def within(self, vertices: NDArray[np.bool_]) -> ColoredMesh:
         """The faces all of whose vertices are kept, [V] bool.
 
         Raises:
             PolarguideError: there are none.
         """
-        faces = self.surface.faces[kept[self.surface.faces].all(axis=1)]
+        faces = self.surface.faces[vertices[self.surface.faces].all(axis=1)]
         if not len(faces):
             raise PolarguideError(
                 "the crop box", expected="a surface in it", found="none", remedy="Make it larger, or move it."
@@ -212,7 +212,7 @@ def fused_surface(
 ) -> tuple[Surface, list[tuple[Camera, DepthSamples]], Box]:
     """The surface of ``scene_mesh`` before it is painted, what each camera saw of it, and the grid it was fused in."""
     optional_import("skimage.measure", "a mesh")
-    views = [(camera, _kept(render(camera).to("cpu"), camera)) for camera in cameras.values()]
+    views = [(camera, _depth_samples(render(camera).to("cpu"), camera)) for camera in cameras.values()]
     around = scene_frame(list(cameras.values()))
     points = [
         _some(seen_points(camera, samples.depth, samples.mask), _BOX_POINTS // len(views))
@@ -283,7 +283,7 @@ class DepthSamples:
     normal: Tensor
 
 
-def _kept(result: RenderResult, camera: Camera) -> DepthSamples:
+def _depth_samples(result: RenderResult, camera: Camera) -> DepthSamples:
     assert result.depth is not None
     assert result.normal is not None
     normal = unit(result.normal, 1e-3)

@@ -109,8 +109,8 @@ def present(
         name: "" if (text := texts[name]) == "none" else text for name in CREDITS if texts[name] is not None
     }
     place.refuse_inherited(name for name, value in changes.items() if value in (None, ""))
-    kept = {name: value for name, value in own.to_record().items() if name not in _replaced(changes)}
-    record = {**kept, **{name: msgspec.to_builtins(value) for name, value in changes.items()}}
+    unchanged = {name: value for name, value in own.to_record().items() if name not in _replaced(changes)}
+    record = {**unchanged, **{name: msgspec.to_builtins(value) for name, value in changes.items()}}
     decoded = decode(record, Presentation, "presentation", remedy="Correct the value; nothing was written.")
     if changes:
         write_presentation(place.folder, decoded)

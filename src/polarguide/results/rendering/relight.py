@@ -99,12 +99,14 @@ def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -
         assert result.specular is not None
         assert result.reflection is not None
         assert result.normal is not None
-        seen = result.reflection
-        share = (result.specular.sum(-1) / seen.sum(-1).clamp(min=1e-6)).clamp(0, 1)[..., None].square()
+        light = result.reflection
+        share = (result.specular.sum(-1) / light.sum(-1).clamp(min=1e-6)).clamp(0, 1)[..., None].square()
         directions = mirrored(view.camera.world_rays(), unit(result.normal, 1e-3)).reshape(-1, 3)
         with torch.enable_grad():
             # The gradient of a look-up shares each pixel among the texels that it would read.
-            cubemap_lookup(sums, directions).backward(torch.cat([share * seen, share], dim=-1).reshape(-1, 4))
+            cubemap_lookup(sums, directions).backward(
+                torch.cat([share * light, share], dim=-1).reshape(-1, 4)
+            )
         advance(count)
     assert sums.grad is not None
     total, weight = sums.grad.split([3, 1], dim=-1)

@@ -112,13 +112,13 @@ class CalibrateSettings(MosaicOptions):
 
 
 def _angle_of(path: Path) -> float:
-    name, found = path.stem, _NUMBER.fullmatch(path.stem)
+    name, number = path.stem, _NUMBER.fullmatch(path.stem)
     why = ""
     if _SIGNED.fullmatch(name):
         why = ", a sign or a hyphen before the number"
-    elif found is not None and _IN_DEGREES.search(name[: found.start(1)]):
+    elif number is not None and _IN_DEGREES.search(name[: number.start(1)]):
         why = ", an angle in degrees before the last number"
-    if found is None or why:
+    if number is None or why:
         raise PolarguideError(
             path,
             expected="a name that ends in the angle of the polarizer from 0 on, after _ or a space, such as "
@@ -126,7 +126,7 @@ def _angle_of(path: Path) -> float:
             found=f"{name!r}{why}",
             remedy="Rename it (150 for -30), or list the angles: --angles 150,0,30,...",
         )
-    return float(found[1])
+    return float(number[1])
 
 
 def _numbers(text: str) -> list[float]:

@@ -91,7 +91,7 @@ def solve_shots(
     Raises:
         PolarguideError: the shots are not of a polarizer, not at different angles, contradict the angles given, ...
     """
-    start = _seen(means, nominal)
+    start = _pixel_stokes(means, nominal)
     folder = files[0].parent
     for path, stokes in zip(files, start, strict=True):
         dolp = float(np.hypot(stokes[1], stokes[2]) / stokes[0])
@@ -103,7 +103,7 @@ def solve_shots(
                 remedy="Take it through the polarizer, and the --flat without it. Check --sensor and offsets.",
             )
     if flat is not None:
-        s0, s1, s2 = _seen(flat[None], nominal)[0]
+        s0, s1, s2 = _pixel_stokes(flat[None], nominal)[0]
         if np.hypot(s1, s2) > FLAT_POLARIZED * s0:
             raise PolarguideError(
                 "--flat",
@@ -167,7 +167,7 @@ def _stokes(angles: Array, levels: Array, diattenuation: float) -> Array:
     return levels[:, None] * np.stack([one, *polarized], axis=1)
 
 
-def _seen(means: Array, nominal: Array) -> Array:
+def _pixel_stokes(means: Array, nominal: Array) -> Array:
     """Stokes vectors as a sensor with ideal analyzers would see them, [T, 3]; colors are brought to one level."""
     unit = np.eye(3)
     ideal = np.stack([malus(unit[:, k], nominal) for k in range(3)], axis=1)
@@ -220,8 +220,8 @@ def _refined(
     if free_levels:
         begin = np.append(begin, np.log(levels_at_first[1:] / levels_at_first[0]))
     if len(begin):
-        found: Any = least_squares(deviations, begin, xtol=1e-12, ftol=1e-14, gtol=1e-14, max_nfev=500)
-        begin = found.x
+        solution: Any = least_squares(deviations, begin, xtol=1e-12, ftol=1e-14, gtol=1e-14, max_nfev=500)
+        begin = solution.x
     angles, levels = unpacked(begin)
     return angles, levels[:count]
 

@@ -108,13 +108,13 @@ class Measurer:
         """
         regions = placed(self._regions, maps.whole or maps.size, shot.where)
         differences = None if self.reference is None else self.reference.differences(maps)
-        found = [self._region(maps, region, differences) for region in regions]
-        statuses = [str(figures["status"]) for _, figures, _ in found]
+        measured = [self._region(maps, region, differences) for region in regions]
+        statuses = [str(figures["status"]) for _, figures, _ in measured]
         status: Status = (
             "beyond" if "beyond" in statuses else "within" if "within" in statuses else "measured"
         )
-        beyond = [(region, which) for region, _, which in found] if status == "beyond" else []
-        return MeasuredShot(maps, differences, tuple(figures for _, figures, _ in found), status, beyond)
+        beyond = [(region, which) for region, _, which in measured] if status == "beyond" else []
+        return MeasuredShot(maps, differences, tuple(figures for _, figures, _ in measured), status, beyond)
 
     def entry(self, shot: ExposureSet) -> Entry:
         """The line of a shot, which says why where it cannot be measured."""
@@ -396,8 +396,8 @@ def _shots_of(
         raise PolarguideError("paths", expected="files, or arrays", found="both, or neither", remedy=remedy)
     if out is not None:
         require_elsewhere(files, Path(out))
-    found = find_shots(files, reading)
-    return found, len(found)
+    shots = find_shots(files, reading)
+    return shots, len(shots)
 
 
 def _array_set(shot: Source, number: int, reading: ShotOptions, angles: Sequence[Angle]) -> ExposureSet:

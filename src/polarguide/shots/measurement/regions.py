@@ -87,18 +87,18 @@ def parse_regions(texts: Sequence[str]) -> tuple[Region, ...]:
     Raises:
         PolarguideError: one has another form or no pixel, or two have one name.
     """
-    found: dict[str, Region] = {}
+    regions: dict[str, Region] = {}
     for number, text in enumerate(texts, 1):
         region = _parse(text, number)
-        if region.name in found:
+        if region.name in regions:
             raise PolarguideError(
                 "--roi",
                 expected="one region of each name",
                 found=f"{region.name} twice",
                 remedy="Rename one of them.",
             )
-        found[region.name] = region
-    return tuple(found.values())
+        regions[region.name] = region
+    return tuple(regions.values())
 
 
 def _parse(text: str, number: int) -> Region:
@@ -218,15 +218,15 @@ def _error_of_mean(maps: ShotMaps, deviations: Floats) -> float | None:
     if not deviations.size:
         return None
     shared = 1.0 if maps.mean_variance is None else maps.mean_variance / maps.pixel_variance
-    found = math.sqrt(shared * float(np.square(deviations, dtype=np.float64).mean()) / deviations.size)
-    return found if math.isfinite(found) else None
+    error = math.sqrt(shared * float(np.square(deviations, dtype=np.float64).mean()) / deviations.size)
+    return error if math.isfinite(error) else None
 
 
 def _distribution(key: str, values: Floats, error: float | None) -> dict[str, Value]:
     names = (f"{key}_mean", f"{key}_error", f"{key}_deviation", *(f"{key}_p{p}" for p in PERCENTILES))
     if not values.size:
         return dict.fromkeys(names)
-    mean, deviation = (float(found[0, 0]) for found in cv2.meanStdDev(values))  # one pass, in float64
+    mean, deviation = (float(moment[0, 0]) for moment in cv2.meanStdDev(values))  # one pass, in float64
     return dict(
         zip(names, (mean, error, deviation, *map(float, np.percentile(values, PERCENTILES))), strict=True)
     )

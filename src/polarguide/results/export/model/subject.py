@@ -52,10 +52,10 @@ def subject_of(run: OpenedRun, crop: Crop | None, *, masked: bool) -> Inside | N
             assert view.mask is not None
             pixel, _, in_picture = seen_at(points - view.camera.center, view.camera)
             votes += in_picture * torch.where(view.mask.cpu()[pixel], 1.0, -1.0)
-        kept = votes > 0 if views else torch.ones(len(points), dtype=torch.bool)
+        mask = votes > 0 if views else torch.ones(len(points), dtype=torch.bool)
         if crop is not None:
-            kept &= crop.inside(points, run.camera_frame)
-        return np.asarray(kept.numpy())
+            mask &= crop.inside(points, run.camera_frame)
+        return np.asarray(mask.numpy())
 
     return inside
 
