@@ -221,8 +221,8 @@ def read_table(path: Path) -> list[Line]:
     """The lines of a table, in their order. Empty cells at the end of a line may be left out.
 
     Raises:
-        PolarguideError: it cannot be read, a column is missing or unknown, a file is listed twice, or an angle or a
-            gain is not a number; the message has the line.
+        PolarguideError: the table cannot be read, a column is missing or unknown, a file is listed twice, or an angle
+            or gain is not a number; the message has the line.
     """
     rows = read_rows(path, _REMEDY)
     columns = _header(path, rows[0][1] if rows else [])
@@ -248,7 +248,7 @@ def read_rows(path: Path, remedy: str) -> list[tuple[int, list[str]]]:
     """The rows of a CSV file that are not empty: number of the line, from 1, and cells without blanks around them.
 
     Raises:
-        PolarguideError: it cannot be read, or is no such file; ``remedy`` is for messages.
+        PolarguideError: the file cannot be read, or is no CSV file; ``remedy`` is for messages.
     """
     data = read_file(path, largest=_LARGEST_TABLE, remedy=remedy)
     try:

@@ -212,5 +212,5 @@ def _check(path: Path, name: str, array: NDArray[Any], size: tuple[int, int]) ->
             f"{path} ({name})",
             expected=f"finite numbers up to {_LARGEST:g}",
             found=f"{broken} of {array.size} values that are NaN, infinite or larger",
-            remedy="Write zeros where the value is unknown and exclude those pixels from the mask.",
+            remedy="Write 0 where the value is unknown or too large, and set those pixels of the mask to 0.",
         )

@@ -124,7 +124,7 @@ def refuse_scene(out: Path) -> None:
             found = f"{folder.name}/ of a scene"
     if found:
         raise PolarguideError(
-            out, expected="a folder for what is written", found=found, remedy="Give another --out."
+            out, expected="an output folder", found=found, remedy="Choose another folder with --out."
         )
 
 
@@ -195,7 +195,7 @@ def _read_flat(
                 f"{table} (line {item.number})",
                 expected="a picture in polar/",
                 found=f"none called {item.file}",
-                remedy="Correct the name, or remove the line.",
+                remedy="Correct the file's name in the table, or remove its line.",
             )
     pictures: dict[str, dict[int, Path]] = {}
     strangers = []
@@ -303,7 +303,7 @@ def list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """The files of a folder with one of the suffixes, sorted; none if there is no such folder.
 
     Raises:
-        PolarguideError: it is no folder.
+        PolarguideError: ``folder`` is something else than a folder.
     """
     if not os.path.lexists(folder):
         return []
@@ -367,7 +367,7 @@ def require_memory_of_each(paths: Sequence[Path], pixel: int, what: str, *, reme
         pixel: bytes that one of their pixels takes, at least. what, remedy: for messages.
 
     Raises:
-        PolarguideError: it does not.
+        PolarguideError: the largest file does not fit.
     """
     sizes = {path: stated_size(path) or (0, 0) for path in paths}
     if sizes:

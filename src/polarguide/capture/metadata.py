@@ -158,7 +158,7 @@ def mount_of(path: Path, data: bytes) -> Mount:
         path: ``scene.json``, for messages. data: its content.
 
     Raises:
-        PolarguideError: it says something else than "sensor" or "filter".
+        PolarguideError: ``polarizer`` is something else than "sensor" or "filter".
     """
     remedy = 'Write "sensor" for polarizers behind the lens, "filter" for a sheet before it.'
     return decode(data, _Polarizer, path, remedy=remedy).polarizer

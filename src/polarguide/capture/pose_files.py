@@ -238,7 +238,7 @@ def _lens_of(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[str, tuple
     the same terms as a frame camera its tangent.
 
     Raises:
-        PolarguideError: it is a panorama or another lens that is not read, or has terms that COLMAP's does not have.
+        PolarguideError: the lens is a panorama or another that is not read, or has terms that COLMAP's has not.
     """
     calibrations = sensor.findall("calibration")
     adjusted = [c for c in calibrations if c.get("class") == "adjusted"]
@@ -271,7 +271,7 @@ def _require_terms(where: str, value: Mapping[str, float], height: float, others
     """Refuse a lens with terms that its model does not have: ``others``, and a skew that moves pixels.
 
     Raises:
-        PolarguideError: it has one.
+        PolarguideError: the lens has such a term.
     """
     skew = abs(value["b2"]) * height / 2 / value["f"]
     named = [name for name in others if value[name]] + ["b2"] * (skew > _LARGEST_SKEW)

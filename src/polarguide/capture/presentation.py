@@ -218,7 +218,7 @@ def write_presentation(folder: Path, presentation: Presentation) -> Path:
     """Write the file of a scene or a run as a whole.
 
     Raises:
-        PolarguideError: it cannot be written.
+        PolarguideError: the file cannot be written.
     """
     path = folder / PRESENTATION_FILE
     write_whole(path, to_json(presentation.to_record()))
@@ -239,7 +239,7 @@ def parse_length(text: str, where: str = "distance") -> float:
             where,
             expected=f"a length above 0 such as 85mm (units: {', '.join(LENGTHS)}; m without one)",
             found=repr(text),
-            remedy="Correct the length.",
+            remedy="Give a number above 0 and its unit.",
         )
     return meters
 

@@ -244,7 +244,7 @@ def _is_fisheye(where: str, lens: Mapping[str, Any]) -> bool:
     """Whether the lens is a fisheye of OpenCV.
 
     Raises:
-        PolarguideError: it is a panorama or another lens that is not read, or fields contradict one another.
+        PolarguideError: the lens is a panorama or another lens that is not read, or fields contradict one another.
     """
     model = lens["camera_model"]
     expected = f"a camera of {', '.join(_PERSPECTIVE)} or {_FISHEYE}"
@@ -296,7 +296,7 @@ def _stated_size(where: str, lens: Mapping[str, Any]) -> tuple[int, int] | None:
     """Width and height that the file states; None where it has neither.
 
     Raises:
-        PolarguideError: it has one of them, or a size that no picture has.
+        PolarguideError: the file has one of the two, or a size that no picture has.
     """
     width, height = lens["w"], lens["h"]
     if width is None and height is None:

@@ -154,9 +154,9 @@ def select_exposures(scene: Scene, exposures: Exposures) -> Scene:
     if others:
         raise PolarguideError(
             scene.root,
-            expected=f"pictures at 0, 45, 90 and 135 degrees of every view for --exposures {exposures}",
-            found=f"other pictures in {len(others)} views, {others[0]} first",
-            remedy="Give a scene with four pictures of each view.",
+            expected=f"four pictures of every view, at 0, 45, 90 and 135 degrees, for --exposures {exposures}",
+            found=f"{len(others)} views without them ({others[0]} first)",
+            remedy="Use a scene with these four pictures of every view.",
         )
     places = {view.name: place for place, view in enumerate(scene.train_views)}
     change = _CHANGES[exposures]

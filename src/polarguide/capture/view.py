@@ -148,7 +148,7 @@ class View:
         floats.
 
         Raises:
-            PolarguideError: they are loaded from files, and a file has changed or is gone.
+            PolarguideError: a file of the view has changed or was deleted.
         """
         codes = self.pictures() if isinstance(self.pictures, Loader) else self.pictures
         if not self.subject_only or self.mask is None:
@@ -160,7 +160,7 @@ class View:
         """Ground truth of the view, or None.
 
         Raises:
-            PolarguideError: it is loaded from a file, which has changed or is gone.
+            PolarguideError: the file has changed or was deleted.
         """
         return self.truth() if isinstance(self.truth, Loader) else self.truth
 

@@ -23,7 +23,7 @@ _WORDS = {
 }  # fmt: skip
 _DEEPEST = 50
 LARGEST_RECORD = 1 << 26
-"""Bytes of a JSON file; what they unfold to takes some twenty times as much."""
+"""Bytes of a JSON file; what they decode to takes some twenty times as much."""
 _STEP = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
 
 
@@ -35,7 +35,7 @@ def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
         remedy: what to do about a file that is wrong.
 
     Raises:
-        PolarguideError: the file cannot be read, or ``decode`` refuses it.
+        PolarguideError: the file cannot be read, or ``decode`` rejects it.
     """
     return decode(read_file(path, largest=LARGEST_RECORD, remedy=remedy), kind, path, remedy=remedy)
 
@@ -52,7 +52,7 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
         where: the file or flag, for messages. remedy: what to do about data that is wrong.
 
     Raises:
-        PolarguideError: it is not JSON, or not of this type; the message names the field and the value.
+        PolarguideError: the data are not JSON, or not of this type; the message names the field and the value.
     """
     try:
         value = json.loads(data, object_pairs_hook=_each_once) if isinstance(data, bytes) else data
@@ -93,7 +93,7 @@ def _require_shallow(value: Any) -> None:
     """Refuse lists in lists in lists, which take more of the stack than there is.
 
     Raises:
-        RecursionError: they are nested more deeply than any record of ours.
+        RecursionError: the lists are nested more deeply than any record of ours.
     """
     level = [value]
     for _ in range(_DEEPEST):

@@ -115,7 +115,7 @@ def exclusive_lock(path: Path) -> Iterator[None]:
 
     Raises:
         BlockingIOError: another process holds it.
-        OSError: it cannot be opened, or is a link: what that leads to is not ours to open.
+        OSError: the file cannot be opened, or is a link: what the link leads to is not ours to open.
     """
     fcntl = _posix("fcntl")
     handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
@@ -158,7 +158,10 @@ def only_writer(lock: Path, *, expected: str, found: str) -> Iterator[None]:
             stack.enter_context(exclusive_lock(lock))
         except BlockingIOError:
             raise PolarguideError(
-                lock.parent, expected=expected, found=found, remedy="Wait for it, or give another --out."
+                lock.parent,
+                expected=expected,
+                found=found,
+                remedy="Wait until the other command has ended, or choose another folder with --out.",
             ) from None
         yield
 

@@ -80,7 +80,7 @@ class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The record in a folder; None where there is none yet.
 
         Raises:
-            PolarguideError: it is no such record.
+            PolarguideError: the file is no such record.
         """
         if not os.path.lexists(folder / RECORD):
             return None
@@ -91,7 +91,7 @@ class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Refuse to go on with another request than it was begun with; one that is done may lose its source.
 
         Raises:
-            PolarguideError: they differ.
+            PolarguideError: the requests differ.
         """
         if request.stamp == NO_FILES and set(self.done) == set(STEPS):
             return

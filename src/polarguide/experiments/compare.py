@@ -162,9 +162,9 @@ def _folder(scene: object) -> Path:
         return Path(scene)
     raise PolarguideError(
         "scenes",
-        expected="folders of scenes, which other processes read",
+        expected="paths of scene folders",
         found=f"a {type(scene).__name__}",
-        remedy="Pass scene.root in place of a loaded scene.",
+        remedy="Pass scene.root: other processes read the scene from its folder.",
     )
 
 
@@ -198,7 +198,7 @@ def _checked_recipes(recipes: Sequence[str | Method]) -> tuple[Method, ...]:
                 "recipes",
                 expected=f"the registered recipe {own.name}",
                 found="a recipe of this name with other values",
-                remedy="Give it a name of its own, and register it under the entry points polarguide.recipes.",
+                remedy="Give it another name, and register it under the entry points polarguide.recipes.",
             )
     if not registered:
         remedy = "Name at least one recipe."
@@ -206,7 +206,9 @@ def _checked_recipes(recipes: Sequence[str | Method]) -> tuple[Method, ...]:
     names = [recipe.name for recipe in registered]
     if len(set(names)) < len(names):
         remedy = "Name each once."
-        raise PolarguideError("recipes", expected="every name once", found=" ".join(names), remedy=remedy)
+        raise PolarguideError(
+            "recipes", expected="no name more than once", found=" ".join(names), remedy=remedy
+        )
     return registered
 
 

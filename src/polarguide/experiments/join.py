@@ -56,7 +56,7 @@ def join_tables(parts: Sequence[PathLike], out: PathLike, *, against: str | None
     if len(paths) > 1 and written in map(os.path.realpath, paths):
         raise PolarguideError(
             out,
-            expected="a folder of its own",
+            expected="a folder that is none of the parts",
             found=f"that of a part, whose {RECORD} would be written over",
             remedy="Give another --out.",
         )

@@ -54,7 +54,10 @@ class Region:
         return cls((x, y, z), unit, max(1.0, MARGIN * farthest / unit))
 
     def first_radius(self, radius: float) -> float:
-        """Radius of the initial sphere, clamped so that it stays clear of all cameras."""
+        """Radius of the sphere that the field represents before training.
+
+        ``radius``, in the field's unit, is reduced where the sphere would come near a camera.
+        """
         return min(radius, 0.5 * self.radius)
 
     def inner(self, points: Tensor) -> Tensor:

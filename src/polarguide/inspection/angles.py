@@ -412,7 +412,7 @@ def handedness_check(angles: AngleFindings) -> Check:
 
 
 def zero_check(angles: AngleFindings) -> Check:
-    """Check whether the zero of the angles is the image's horizontal."""
+    """Check whether a polarizer angle of 0 degrees is the image's horizontal."""
     key, title = "zero_offset", "Zero of the angles"
     if angles.posterior is None:
         return Check(key, title, UNVERIFIED, _no_evidence(angles), _more_evidence(angles))

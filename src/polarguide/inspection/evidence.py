@@ -340,7 +340,10 @@ _AGREEMENT = 0.9
 
 
 def photograph_digest(scene: Scene) -> str:
-    """SHA-256 over what the short training sees: photographs, poses, points. No order of the pictures changes it."""
+    """SHA-256 of what the short training of an inspection reads: photographs, camera poses and points.
+
+    The order of the four pictures of a view does not affect the digest.
+    """
     digest = hashlib.sha256(scene.points.numpy().tobytes())
     for view in scene.train_views:
         camera = view.camera

@@ -67,7 +67,7 @@ GATE_SHARE = 0.02
 
 @dataclass(frozen=True)
 class PairError:
-    """Median distance of matches from their epipolar lines between two views, in stored pixels."""
+    """Median distance between the feature matches of two views and their epipolar lines, in pixels as stored."""
 
     first: str
     second: str

@@ -260,7 +260,7 @@ def write_inspection(inspection: Inspection, out: Path, reporter: Reporter = SIL
     """Write the page and ``inspection.json`` into a folder; returns their paths.
 
     Raises:
-        PolarguideError: they cannot be written.
+        PolarguideError: a file cannot be written.
     """
     make_folder(out)
     page, record = out / FILE, out / RECORD

@@ -123,12 +123,13 @@ def paper_intensities(
     polarizer: float | Tensor,
     refractive_index: float | Tensor = 1.5,
 ) -> tuple[Tensor, Tensor]:
-    """The reflection cue of PolarGuide-GSDR behind a polarizer: both layers as functions of its angle.
+    """Intensities of both layers behind a polarizer, by the reflection cue of PolarGuide-GSDR.
 
-    ``(Imax + Imin) / 2 + (Imax - Imin) / 2 * cos 2(polarizer - s_direction)`` with Imax, Imin = ``S0 / 2``
-    times Rs, Rp; for the diffuse layer the p-direction, the light left over, and Tp, Ts. (PolarGuide-GSDR has
-    ``cos 2 theta`` with the angle from the image's x axis, which would change when the camera rolls.) The
-    mean over the four polarizer angles is half of ``paper_separation``.
+    A layer's intensity is ``(Imax + Imin) / 2 + (Imax - Imin) / 2 * cos 2(polarizer - d)``. The specular layer has
+    ``Imax = S0 / 2 * Rs``, ``Imin = S0 / 2 * Rp`` and ``d = s_direction``. The diffuse layer has Tp and Ts of the light
+    that is left in place of Rs and Rp of S0, and d is perpendicular to ``s_direction``. (PolarGuide-GSDR has ``cos 2
+    theta`` with the angle from the image's x axis, which would change when the camera rolls.) The mean over the four
+    polarizer angles is half of what ``paper_separation`` returns.
 
     Args:
         stokes: [3, ..., C] with the colors last.

@@ -422,7 +422,7 @@ class SinglesSource(ShotsSource):
         """How the files are encoded, and why.
 
         Raises:
-            PolarguideError: they are of several kinds.
+            PolarguideError: the files are of several kinds.
         """
         kinds: dict[str, Path] = {}
         for path in self._shots:

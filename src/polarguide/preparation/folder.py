@@ -212,7 +212,7 @@ class SceneFolder:
                 self.root,
                 expected="a folder that nobody else writes",
                 found="another polarguide prepare at work on it",
-                remedy="Wait for it, or give another --out.",
+                remedy="Wait until it has ended, or choose another folder with --out.",
             ) from None
         try:
             yield
@@ -316,7 +316,7 @@ def _require_exposures(journal: Path, view: str, record: _View) -> None:
     """Refuse a journal that does not say what the pictures of a view are.
 
     Raises:
-        PolarguideError: it does not.
+        PolarguideError: the journal lacks it.
     """
     named = picture_names(view, [exposure.angle for exposure in record.exposures])
     pictures = sorted(name for name in record.files if name.startswith("polar/"))

@@ -93,7 +93,7 @@ class MosaicFiles:
         """The values of a whole mosaic in memory, [H, W] uint8 or uint16, as ``read`` gives those of a file.
 
         Raises:
-            PolarguideError: they are too few, or four pictures.
+            PolarguideError: the values are too few, or four pictures side by side.
         """
         require_mosaic(where, values, least=SMALLEST)
         return self._unmirrored(values)
@@ -371,9 +371,9 @@ class MosaicSource(Source):
             (height, width), kind = first
             raise PolarguideError(
                 path,
-                expected=f"{width}x{height} pixels of {kind} like the first file",
-                found=f"{values.shape[1]}x{values.shape[0]} of {values.dtype}",
-                remedy="Prepare captures of different size or depth one by one.",
+                expected=f"{width}x{height} pixels of {kind}, as in the first file",
+                found=f"{values.shape[1]}x{values.shape[0]} pixels of {values.dtype}",
+                remedy="Prepare captures that differ in size or bit depth separately, each with its own --out.",
             )
 
     def _gains(self, ratio: float | None) -> tuple[tuple[float, float, float, float], list[str]]:

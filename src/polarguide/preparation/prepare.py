@@ -69,7 +69,7 @@ def prepare_scene(
 ) -> Prepared:
     """Write a scene folder from camera files; see docs/reference/formats.md.
 
-    A call that was stopped is gone on with by the same call. Nothing but unfinished work of the same request
+    The same call resumes a stopped one. Nothing but unfinished work of the same request
     is ever replaced.
 
     Args:

@@ -147,7 +147,7 @@ class Family(ABC):
         """Refuse a checkpoint that does not belong to the settings of its run.
 
         Raises:
-            PolarguideError: it does not.
+            PolarguideError: the checkpoint does not belong to them.
         """
         if state.step > settings.steps:
             raise PolarguideError(

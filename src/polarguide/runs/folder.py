@@ -164,7 +164,7 @@ def save_checkpoint(run: Path, state: AnyState, *, optimizer: bool = True) -> No
             which nothing but a step reads.
 
     Raises:
-        PolarguideError: it cannot be written; the old one stays.
+        PolarguideError: the checkpoint cannot be written; the old one stays.
     """
     tensors = state.tensors()
     if not optimizer:
@@ -218,7 +218,10 @@ def load_checkpoint(run: Path, recipe: Method, device: torch.device | str = "cpu
 
 
 def trained_steps(run: Path) -> int | None:
-    """Number of steps of a run's checkpoint; None if no checkpoint states it."""
+    """Number of training steps completed at a run's checkpoint.
+
+    None if the run has no checkpoint, or if the checkpoint does not record the number.
+    """
     try:
         with safe_open(run / CHECKPOINT, framework="pt") as file:
             record = (file.metadata() or {}).get("polarguide", "")
@@ -243,7 +246,7 @@ def writing_to(run: Path) -> Iterator[None]:
             run,
             expected="a run folder that nobody is writing to",
             found="another training at work in it",
-            remedy="Wait for it, or name another folder.",
+            remedy="Wait until it has ended, or choose another folder.",
         ) from None
     except OSError as error:
         found = error.strerror or str(error)
@@ -265,7 +268,7 @@ class RunLog:
         """Write one line.
 
         Raises:
-            PolarguideError: it cannot be written.
+            PolarguideError: the log cannot be written.
         """
         with writing(self._path), open(self._path, "a", encoding="utf-8") as file:
             file.write(json.dumps(values) + "\n")
@@ -280,7 +283,7 @@ class RunLog:
         """The complete lines of the log; none without a log. A line can be incomplete where a process was killed.
 
         Raises:
-            PolarguideError: it cannot be read.
+            PolarguideError: the log cannot be read.
         """
         return [row for _, row in self._lines()]
 

@@ -155,7 +155,7 @@ def pixels_of(folder: Path, downscale: int) -> list[int]:
     """Pixels of each view of a scene at the size that is trained on, as the headers of its files state.
 
     Raises:
-        PolarguideError: it is no scene.
+        PolarguideError: the folder is no scene.
     """
     layout = find_layout(folder)
     return [count // downscale**2 for count in stated_pixels(layout, select_views(layout, None))]

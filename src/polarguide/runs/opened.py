@@ -88,7 +88,7 @@ class OpenedRun:
             reporter: receives the progress of long operations.
 
         Raises:
-            PolarguideError: it is no run folder, is damaged, or belongs to another version.
+            PolarguideError: the folder is no run, is damaged, or belongs to another version.
         """
         folder = Path(folder)
         configuration = RunConfiguration.load(folder)
@@ -170,7 +170,7 @@ class OpenedRun:
         """The scene it was trained on, read on first use. Warns if it has changed since.
 
         Raises:
-            PolarguideError: it is not there any more, cannot be read, or was read otherwise than for the training.
+            PolarguideError: the scene was moved or deleted, cannot be read, or was read otherwise for training.
         """
         configuration, scene = self.configuration, self._scene_source
         options = SceneOptions(configuration.downscale, configuration.transfer, split="every-8th")
@@ -338,7 +338,7 @@ def read_scene(
         test_views, hold: as for ``load_scene``.
 
     Raises:
-        PolarguideError: it cannot be read.
+        PolarguideError: the scene cannot be read.
     """
     scene = load_scene(
         folder,

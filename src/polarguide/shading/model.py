@@ -157,10 +157,10 @@ class ShadingModel(ABC):
     """Whether shading reads the normals, so that they are always splatted."""
 
     def bind(self: Model, refractive_index: float) -> Model:
-        """The same model for surfaces of a refractive index.
+        """A copy of the model with its refractive index set to ``refractive_index``.
 
         Raises:
-            ValueError: it is not over 1.
+            ValueError: the refractive index is 1 or less.
         """
         if not refractive_index > 1:
             raise ValueError(f"refractive index: expected more than 1, found {refractive_index}")

@@ -194,8 +194,10 @@ def reflect_arguments(
 def shade_native(
     splatted: GBuffer, textures: Sequence[Tensor], camera: Camera, given: ReflectArguments
 ) -> dict[str, Any]:
-    """The layers of ``reflect_native`` by name, [H, W, 3], those that are detached as ``detached specular`` and
-    ``detached diffuse``; and ``metal``, None where there is none.
+    """The layers of ``reflect_native`` by name, [H, W, 3] each.
+
+    If ``given.detached`` is set, ``detached specular`` and ``detached diffuse`` are among them: the same layers, whose
+    gradient does not reach the normals. ``metal`` is None if no Gaussian is a metal.
     """
     shaded = reflect_native(splatted.features.flatten(0, 1), world_rays_native(camera), textures, given)
     names = ["final", "specular", "diffuse", "reflection"]

@@ -256,10 +256,10 @@ def usable_name(name: str) -> bool:
 
 
 def require_name(shot: ExposureSet) -> None:
-    """Refuse a shot whose files would not be written into a folder of its own.
+    """Raise an error if a shot's name cannot name a folder: its files would be written elsewhere.
 
     Raises:
-        PolarguideError: a folder cannot have its name.
+        PolarguideError: no folder can have the shot's name.
     """
     if not usable_name(shot.name):
         raise PolarguideError(

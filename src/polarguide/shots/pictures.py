@@ -24,13 +24,19 @@ _OF_S0 = "linear radiance in units of S0 (2 is full scale of all four intensitie
 
 @dataclass(frozen=True)
 class MapKind:
-    """One map.
+    """A kind of map of a shot, such as the DoLP: how it is computed, written and drawn.
 
     Attributes:
-        key: its name in files. label: for people. unit: of the numbers in files.
-        look: how it is drawn. values: its numbers. color_map: of a scalar. fixed: its range, None for one that fits.
-        factor: from the file's unit to that of the picture, ``shown_unit``.
-        note: what to know before trusting it.
+        key: name in file names.
+        label: name for people.
+        unit: unit of the values in files.
+        look: way in which it is drawn.
+        values: function that computes it.
+        color_map: color map of a scalar.
+        fixed: range of the colors; None: it fits the values of each map.
+        factor: factor from ``unit`` to ``shown_unit``.
+        shown_unit: unit in the picture.
+        note: limitation that is written beside it.
     """
 
     key: str

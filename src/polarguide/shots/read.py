@@ -61,7 +61,7 @@ def read_shot(
         angles: of the K pictures of an array, degrees counter-clockwise as displayed; files state theirs.
 
     Raises:
-        PolarguideError: it is not one shot, a file is missing, cannot be read, or does not fit, or an array has
+        PolarguideError: the path is not one shot, a file is missing, cannot be read, or does not fit, or an array has
             another shape or type.
     """
     options = (options or ShotOptions()).checked()
@@ -200,7 +200,7 @@ def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
     """A camera of ``fx,fy,cx,cy`` in pixels of a picture of ``size`` (width, height).
 
     Raises:
-        PolarguideError: it is something else.
+        PolarguideError: the text is something else.
     """
     numbers = decimals(text)
     # A center may lie outside of a cut picture; beyond these bounds it is a slip.
@@ -210,7 +210,7 @@ def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
             "--intrinsics",
             expected="fx,fy,cx,cy in pixels of the developed picture",
             found=repr(text),
-            remedy="Correct the value; the center of the first pixel is at 0.5.",
+            remedy="Give four numbers; the center of the first pixel is at 0.5.",
         )
     return Camera(*size, *numbers, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
 
@@ -377,7 +377,7 @@ def stacked_array(shot: Array | Sequence[Array], name: str = NAME) -> Array:
     pictures = [as_numpy(picture) for picture in shot]
     kinds = list(dict.fromkeys(map(kind_of, pictures)))
     if len(kinds) > 1:
-        remedy = "Export the pictures of a shot alike."
+        remedy = "Export all pictures of a shot with the same settings."
         raise PolarguideError(
             name, expected="pictures of one shape and type", found=" and ".join(kinds), remedy=remedy
         )

@@ -233,7 +233,7 @@ def require_no_order(calibration: Calibration, name: str) -> None:
     """Refuse what a calibration says of pictures called 0, 45, 90 and 135 for pictures at other angles.
 
     Raises:
-        PolarguideError: it has gains or another order.
+        PolarguideError: the calibration has gains or another order.
     """
     for field, given in (("gains", calibration.gains is not None), ("order", calibration.order != ANGLES)):
         if given:
@@ -262,7 +262,7 @@ def _read_each(pictures: Sequence[SetPicture]) -> Iterator[Shots]:
                     path,
                     expected=f"EXIF orientation {first.orientation} like {pictures[0].path.name}",
                     found=str(shot.orientation),
-                    remedy="Keep the camera still between the pictures of a set, or export them all alike.",
+                    remedy="Keep the camera still within a set, or export all with the same orientation.",
                 )
             yield shot
 
@@ -282,7 +282,7 @@ def _transfer(pictures: Sequence[SetPicture], transfer: str) -> tuple[str, str]:
     """How the files are encoded, and why: as ``prepare`` takes photographs at any angles.
 
     Raises:
-        PolarguideError: they are of several kinds.
+        PolarguideError: the files are of several kinds.
     """
     kinds: dict[str, Path] = {}
     for picture in pictures:

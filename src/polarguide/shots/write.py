@@ -162,7 +162,7 @@ def check_formats(formats: Collection[str]) -> None:
             "formats",
             expected=f"some of {', '.join(FORMATS)}",
             found=", ".join(unknown) or "none",
-            remedy="Correct the name.",
+            remedy=f"Choose from {', '.join(FORMATS)}.",
         )
     if "exr" in formats:
         optional_import("OpenEXR", "EXR files")
@@ -232,7 +232,7 @@ def _write_exr(path: Path, values: NDArray[Any], unit: str, note: str) -> None:
     """One map as 32-bit floats, its unit in the header; one channel Y, or R, G, B (x, y, z of a normal).
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     exr = optional_import("OpenEXR", "EXR files")
     numbers = np.ascontiguousarray(

@@ -294,7 +294,7 @@ def parse_sweep(text: str) -> Sweep:
     """``noise=0,1,2`` -> Sweep.
 
     Raises:
-        PolarguideError: it has another form.
+        PolarguideError: the text has another form.
     """
     parameter, _, listed = text.partition("=")
     try:

@@ -106,13 +106,13 @@ _TURNS = (1, 1, 1, 6, 8, 3)
 
 @dataclass(frozen=True)
 class FilterShot:
-    """How a view is photographed.
+    """A simulated photograph of a view through a filter.
 
     Attributes:
-        angle: of the filter's axis, degrees counter-clockwise as displayed from the picture's horizontal.
-        stops: how much more light than the mean the automatic exposure lets in, as a power of two.
+        angle: transmission axis of the filter, degrees counter-clockwise from the horizontal of the displayed picture.
+        stops: exposure relative to the mean one, in stops: 1 is twice the light.
         orientation: EXIF orientation of the stored picture: 1, 3, 6 or 8.
-        noted: whether the file says the exposure time.
+        noted: whether the file records the exposure time.
     """
 
     angle: float

@@ -251,8 +251,8 @@ def find_scene(name: str) -> SceneSpec:
     if not Path(name).is_file():
         raise PolarguideError(
             name,
-            expected=f"a scene file, or one of {', '.join(PRESETS)}",
-            found="nothing of this name",
-            remedy="docs/reference/scene-files.md describes scene files.",
+            expected=f"a scene file, or the name of a preset ({', '.join(PRESETS)})",
+            found="neither",
+            remedy="Check the spelling or the path. docs/reference/scene-files.md describes scene files.",
         )
     return read_scene_file(Path(name))

@@ -77,9 +77,13 @@ def debiased_dolp(luminance: Tensor, noise: Tensor | float) -> Tensor:
 
 
 def guide_normals(normal: Tensor, rays: Tensor, least: float) -> tuple[Tensor, Tensor]:
-    """Unit normals facing the camera from blended ones [H, W, 3], and where they are longer than ``least`` [H, W].
+    """Unit normals [H, W, 3] that face the camera, and a mask [H, W] of the reliable ones.
 
-    A blended normal that faces away (by up to a pixel's slant) is brought to grazing.
+    Args:
+        normal: [H, W, 3] normals, blended over the Gaussians of each pixel. One that points away from the camera is
+            turned until it is perpendicular to the ray.
+        rays: [H, W, 3] unit directions from the camera.
+        least: length above which a blended normal is reliable.
     """
     reliable = dot(normal, normal) > least**2
     facing = unit(normal)

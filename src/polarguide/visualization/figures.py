@@ -359,7 +359,7 @@ def write_png(
 
     Raises:
         ValueError: not such a picture.
-        PolarguideError: it cannot be written.
+        PolarguideError: the file cannot be written.
     """
     check_picture(rgb8, "picture")
     write_whole(Path(path), with_texts(png_bytes(rgb8, alpha8), about))
@@ -369,7 +369,7 @@ def png_bytes(rgb8: Picture, alpha8: Picture | None = None) -> bytes:
     """A uint8 RGB [H, W, 3] picture as a PNG file, with how opaque it is [H, W] where that is given.
 
     Raises:
-        ValueError: it cannot be encoded.
+        ValueError: the picture cannot be encoded.
     """
     stored = rgb8[..., ::-1] if alpha8 is None else np.dstack((rgb8[..., ::-1], alpha8))
     encoded, data = cv2.imencode(".png", stored)

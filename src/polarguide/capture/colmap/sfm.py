@@ -171,7 +171,7 @@ def run_step(
         done: returns the number of finished units.
 
     Raises:
-        PolarguideError: it failed.
+        PolarguideError: the step failed.
     """
     outcome: dict[str, Any] = {}
 

@@ -27,9 +27,9 @@ StokesImage = tuple[NDArray[np.float32], NDArray[np.bool_]]
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """An object mask [H, W] from a picture: where it reaches half of its maximum.
+    """An object mask [H, W] from a picture: pixels of at least half its largest value.
 
-    Of a cut-out, a picture of the object that is transparent around it, the mask is where it is at least half opaque.
+    If the picture is transparent around the object, the mask has the pixels that are at least half opaque.
     """
     data = read_picture(path)
     pixels = decode_stored(path, data)
@@ -328,7 +328,7 @@ def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Mat
     """K, R and t of a 3x4 matrix s K [R | t] of any scale s.
 
     Raises:
-        PolarguideError: it is singular, or its pixels are skewed.
+        PolarguideError: the matrix is singular, or its pixels are skewed.
     """
     left = projection[:, :3]
     if not np.linalg.cond(left) < 1e10:
@@ -360,7 +360,7 @@ def checked_pose(where: object, matrix: Matrix) -> tuple[Matrix, Matrix]:
     """Rotation and translation of a rigid [3 or 4, 4] matrix; rounding errors of the rotation are removed.
 
     Raises:
-        PolarguideError: it is not rigid.
+        PolarguideError: the matrix is not rigid.
     """
     u, spread, vt = np.linalg.svd(matrix[:3, :3])
     if not (np.abs(spread - 1) < 1e-2).all() or np.linalg.det(u @ vt) < 0:

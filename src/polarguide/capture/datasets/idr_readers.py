@@ -145,7 +145,7 @@ def _read_archive(path: Path) -> NDArray[np.float32]:
     """Stokes vectors [3, H, W, 3] from the entries S0, S1 and S2 of an archive.
 
     Raises:
-        PolarguideError: it cannot be read, lacks one, or they are no pictures of one size.
+        PolarguideError: the file cannot be read, lacks an entry, or its entries are no pictures of one size.
     """
     data = read_file(path)
     try:

@@ -35,10 +35,10 @@ class Shift:
     """How a shot lies relative to the first.
 
     Attributes:
-        x, y: shift in pixels right and down; of the middle of the picture where there is a ``warp``.
+        x, y: shift in pixels, right and down; with a ``warp``, that of the picture's center.
         trusted: whether the estimate is reliable.
-        warp: where the camera was turned between the shots: the matrix [2, 3] from pixels of the first shot to those of
-            this one (the middle of the first pixel is 0), row by row.
+        warp: affine matrix [2, 3], row by row, that maps pixels of the first shot to this one; None: the camera did not
+            turn between them. In it, unlike elsewhere, the center of the first pixel is (0, 0).
     """
 
     x: float
@@ -250,7 +250,7 @@ def require_known_encoding(path: Path) -> None:
     """Refuse a photograph whose color profile states an encoding that is neither linear nor like sRGB.
 
     Raises:
-        PolarguideError: it does.
+        PolarguideError: the profile states such an encoding.
     """
     exponent = None if is_camera_raw(path) else stated_exponent(read_picture(path))
     if exponent is None or any(abs(exponent / known - 1) <= _NEAR for known in (1.0, _SRGB_EXPONENT)):

@@ -230,7 +230,7 @@ def read_stack(
                 path,
                 expected=f"EXIF orientation {codes[0]} like {paths[0].name}",
                 found=str(codes[-1]),
-                remedy="Keep the camera still between the shots of a view, or export them all alike.",
+                remedy="Keep the camera still between the shots of a view, or export all with the same settings.",
             )
     return stacked(np.stack(pictures), codes[0], lossy=is_lossy(paths[0]), levels=levels)
 
@@ -343,17 +343,17 @@ def _all_alike(root: Path, angles: str) -> list[SingleShot]:
     if any(angle is None for angle in repeating):
         raise PolarguideError(
             "--angles",
-            expected="unknown, none, angles in the order of the files such as 0,60,120, or the path of a .csv table",
+            expected="'unknown', 'none', angles in the order of the files ('0,60,120'), or the path of a .csv table",
             found=repr(angles),
-            remedy="Correct the value.",
+            remedy="Give one of these four.",
         )
     files = list(index_files(root, SHOT_SUFFIXES).values())
     if len(files) % len(repeating):
         raise PolarguideError(
             "--angles",
-            expected=f"a multiple of {len(repeating)} photographs, as these angles repeat",
+            expected=f"a number of photographs that {len(repeating)} divides, because these angles repeat",
             found=f"{len(files)} in {root}",
-            remedy=f"One is missing or too many: say each angle in {TABLE}.",
+            remedy=f"Add or remove photographs, or list the angle of each in {TABLE}.",
         )
     repeated = [repeating[number % len(repeating)] for number in range(len(files))]
     return [
@@ -388,9 +388,9 @@ def _by_table(root: Path, table: Path, lines: Sequence[Line]) -> list[SingleShot
         if path.suffix.lower() not in SHOT_SUFFIXES:
             raise PolarguideError(
                 table,
-                expected=f"pictures ({', '.join(SHOT_SUFFIXES)})",
+                expected=f"names of pictures ({', '.join(SHOT_SUFFIXES)})",
                 found=line.file,
-                remedy="Remove the line, or convert the file.",
+                remedy="Remove its line from the table, or convert the file to one of these formats.",
             )
         if line.view is None and path.stem in alone:
             raise ambiguous(root, f"one photograph called {path.stem}", alone[path.stem], path)

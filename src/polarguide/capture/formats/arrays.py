@@ -65,7 +65,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays in an ``.npz`` file, by name.
 
     Raises:
-        PolarguideError: the file cannot be read, is damaged or unfolds to more than cameras need.
+        PolarguideError: the file cannot be read, is damaged, or decompresses to more data than a file of
+            cameras may have.
     """
     data = read_file(path)
     try:
@@ -73,7 +74,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
             size = sum(entry.file_size for entry in archive.infolist())
             if size > _LARGEST_ARCHIVE:
-                raise ValueError(f"an archive that unfolds to {size} bytes")
+                raise ValueError(f"an archive that decompresses to {size} bytes")
             return {name: _array(_member(archive, entry)) for name, entry in members.items()}
     except BROKEN as error:
         what = "one that cannot be unpacked" if isinstance(error, zipfile.BadZipFile) else "a damaged one"
@@ -102,10 +103,10 @@ def unpacked(data: bytes, names: Collection[str], largest: int) -> dict[str, NDA
 
 
 def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
-    """A member of an archive. It may unfold to more than it says, so no more than that is ever unfolded.
+    """A member of an archive. It may decompress to more than it states; no more than that is ever decompressed.
 
     Raises:
-        One of ``BROKEN``: it is damaged, or packed otherwise than NumPy packs: others unfold without a bound.
+        One of ``BROKEN``: it is damaged, or packed otherwise than NumPy packs: others decompress without a bound.
     """
     if entry.compress_type not in _METHODS:
         raise ValueError(f"{entry.filename} is packed in a way that NumPy does not use")
@@ -117,7 +118,7 @@ def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], 
     """An array of finite numbers in one of the shapes, as float64.
 
     Raises:
-        PolarguideError: it has another shape or type, or values that are not finite.
+        PolarguideError: the array has another shape or type, or values that are not finite.
     """
     expected = f"finite numbers in shape {' or '.join('x'.join(map(str, shape)) for shape in shapes)}"
     try:

@@ -75,7 +75,7 @@ def write_analyzers(path: Path, calibration: AnalyzerCalibration) -> str:
     """Write the file of a calibration, which is the same bytes for the same content; returns the checksum.
 
     Raises:
-        PolarguideError: it cannot be written.
+        PolarguideError: the file cannot be written.
     """
     vectors = np.ascontiguousarray(calibration.vectors, np.float32)
     metadata = _Metadata(
@@ -93,7 +93,7 @@ def read_analyzers(path: Path) -> AnalyzerCalibration:
     """Read the file that ``polarguide calibrate`` wrote.
 
     Raises:
-        PolarguideError: it cannot be read, is cut short, damaged, or of another kind or version.
+        PolarguideError: the file cannot be read, is cut short, damaged, or of another kind or version.
     """
     require_file(path, expected="a calibration of polarguide calibrate", remedy=_REMEDY)
     try:

@@ -132,7 +132,7 @@ class AnalyzerCalibration:
             sensor: the sensor of what is to be corrected; None where nobody knows. where: for messages.
 
         Raises:
-            PolarguideError: it is another one.
+            PolarguideError: the calibration is of another sensor.
         """
         if sensor is not None and sensor != self.sensor:
             raise PolarguideError(
@@ -149,7 +149,7 @@ class AnalyzerCalibration:
             offset, size: of the region, in columns and rows of the sensor. where: for messages.
 
         Raises:
-            PolarguideError: it is not inside.
+            PolarguideError: the region is not inside the calibrated one.
         """
         inside = all(
             mine <= start and start + length <= mine + whole

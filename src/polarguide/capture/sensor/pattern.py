@@ -137,7 +137,7 @@ def sensor_pattern(sensor: str) -> Pattern:
             "--sensor",
             expected=f"one of {', '.join(SENSORS)}",
             found=repr(sensor),
-            remedy="Cameras with the same pattern as one of them are read under its name.",
+            remedy="Give one of these names: of your camera's sensor, or of a sensor with the same pattern.",
         )
     if not SENSORS[sensor]:
         return Pattern(_CELL.copy(), None)

@@ -214,7 +214,7 @@ def _camera_centers(run: OpenedRun) -> Tensor | None:
 
 
 def _spz(run: OpenedRun, presented: Presented, path: Path, version: int) -> Path:
-    """From a PLY that is gone afterwards. In units of the scene: its positions are multiples of 1/4096 of a unit."""
+    """From a PLY that is then deleted. In units of the scene: its positions are multiples of 1/4096 of a unit."""
     with temporary_folder(path.with_suffix(".ply")) as place:
         ply = _ply(
             run, presented, place / "splats.ply", replace(presented.placement, scale=1.0, metric=False)
@@ -224,7 +224,7 @@ def _spz(run: OpenedRun, presented: Presented, path: Path, version: int) -> Path
 
 
 def _sog(run: OpenedRun, presented: Presented, path: Path) -> Path:
-    """From a PLY that is gone afterwards."""
+    """From a PLY that is then deleted."""
     credit = presented.presentation.credit
     about = {"extras": {**presented.origin.record(), **presented.placement.record()}}
     with temporary_folder(path.with_suffix(".ply")) as place:
@@ -245,7 +245,7 @@ def _splat_glb(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]
 
 
 def _splat_usdz(run: OpenedRun, presented: Presented, path: Path) -> list[Path]:
-    """From a PLY that is gone afterwards; colors are encoded, as USD leaves open."""
+    """From a PLY that is then deleted; colors are encoded, as USD leaves open."""
     place = presented.upright(run)
     with temporary_folder(path.with_suffix(".ply")) as parts:
         ply = _ply(run, presented, parts / "splats.ply", place)

@@ -63,7 +63,7 @@ class Binary:
             more: further fields of the tree.
 
         Raises:
-            PolarguideError: it cannot be written.
+            PolarguideError: the file cannot be written.
         """
         self._data += bytes(-len(self._data) % 4)
         tree = {

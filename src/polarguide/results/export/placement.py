@@ -248,7 +248,7 @@ def _require_whole(folder: Path, images: int, points: int) -> None:
     """Read a model back: pycolmap does not say where the disk was full.
 
     Raises:
-        OSError: it is not whole.
+        OSError: the model is incomplete.
     """
     try:
         model = pycolmap.Reconstruction()

@@ -78,15 +78,15 @@ the last of them needs.
 def records(
     gaussians: Parameters, values: Mapping[str, Tensor], footprints: Tensor | None = None
 ) -> NDArray[Any]:
-    """Quantize Gaussians; those too faint to be drawn at all are left out.
+    """Quantized Gaussians for the page, without those that are too faint to be drawn.
 
     Args:
-        gaussians: the Gaussians. values: the shading model's, [N, ...] by the names of ``SLOTS``.
-        footprints: [N] of the training, see ``raster.magnification``; None: not known.
+        gaussians: parameters of the Gaussians.
+        values: parameters of the shading model, [N, ...], by the names of ``SLOTS``.
+        footprints: [N] size of a training pixel at each Gaussian, see ``raster.magnification``; None: not known.
 
     Returns:
-        [K] records of whole texels, with named fields; in the order of a curve that fills space, so that neighbors
-        in it are alike.
+        [K] structured records, each padded to whole texels, along a space-filling curve, so that neighbors are alike.
     """
     opacity = torch.sigmoid(gaussians["opacity_logits"])
     indices = (opacity >= MINIMUM_ALPHA).nonzero()[:, 0]

@@ -28,7 +28,7 @@ def write_splat_glb(path: Path, ply: Path, asset: dict[str, Any], encoding: Enco
         encoding: of the colors in the PLY.
 
     Raises:
-        PolarguideError: it cannot be written.
+        PolarguideError: the file cannot be written.
     """
     gaussians = read_ply(ply)
     fields = {

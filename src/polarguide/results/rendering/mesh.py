@@ -193,14 +193,15 @@ class ColoredMesh:
 def scene_mesh(
     cameras: Mapping[str, Camera], render: Callable[[Camera], RenderResult], *, resolution: int
 ) -> ColoredMesh:
-    """Fuse the depth that a scene's cameras see.
+    """Colored mesh of a scene, fused from depth maps of its cameras.
 
     Args:
-        cameras: at least two. render: gives a view with depth and normals.
-        resolution: voxels along the longest side of what the cameras see.
+        cameras: at least two cameras.
+        render: function that renders a camera's depth and normals.
+        resolution: number of voxels along the longest side of the box that the cameras see.
 
     Raises:
-        PolarguideError: there is no surface, or a library is missing.
+        PolarguideError: the depth maps have no surface, or a library for meshes is not installed.
     """
     surface, views, box = fused_surface(cameras, render, resolution=resolution)
     return painted(surface, views, box)

@@ -65,7 +65,7 @@ def photograph_color(view: View, x: float, y: float, where: str) -> Tensor:
     """The mean color [3] of a photograph's valid pixels around a place, see ``surface_at``.
 
     Raises:
-        PolarguideError: it lies outside, or no pixel there is valid; ``where`` names the option.
+        PolarguideError: the place lies outside, or no pixel there is valid; ``where`` names the option.
     """
     camera = view.camera
     if not (0 <= x < camera.width and 0 <= y < camera.height):
@@ -97,7 +97,7 @@ def gains_of(color: Tensor, where: str = "white_balance") -> Vector:
     """Gains that make a linear color [3] gray and leave green as it is, as cameras state their white balance.
 
     Raises:
-        PolarguideError: it is too dark, clips, or is no gray under any usual light; ``where`` names the option.
+        PolarguideError: the color is too dark, clips, or is no gray under any usual light; ``where`` names the option.
     """
     values = [float(value) for value in color]
     if not (min(values) > 0 and max(values) >= DARKEST and max(values) <= BRIGHTEST):

@@ -198,8 +198,10 @@ def read_panorama(path: Path) -> Tensor:
     if missing or not bool((values > 0).any()):
         raise PolarguideError(
             path,
-            expected="radiance at every pixel, and light somewhere",
+            expected="a finite value at every pixel, and one above 0",
             found=f"NaN at {missing} of {values[..., 0].numel()} pixels" if missing else "no value above 0",
-            remedy="Export the panorama again, or paint the pixels.",
+            remedy="Export the panorama again."
+            if not missing
+            else "Export the panorama again, or fill these pixels.",
         )
     return values.clamp(0, 6e4)

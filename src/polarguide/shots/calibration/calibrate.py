@@ -354,7 +354,10 @@ def _require_apart(out: Path, shots: Path, settings: CalibrateSettings) -> None:
 def _require_new(out: Path) -> None:
     if out.suffix.lower() != SUFFIX:
         raise PolarguideError(
-            "--out", expected=f"a file name that ends in {SUFFIX}", found=out.name, remedy="Correct it."
+            "--out",
+            expected=f"a file name that ends in {SUFFIX}",
+            found=out.name,
+            remedy=f"End the name in {SUFFIX}.",
         )
     for path in (out, out.with_suffix(".png")):
         if path.exists() or path.is_symlink():
@@ -431,7 +434,8 @@ def _say_choice(
     )
     if own and choice.noise > choice.scatter:
         reporter.warn(
-            "Noise exceeds what single pixels really differ by: take more shots, or leave --block out."
+            "Pixels differ by less than their noise: a calibration of single pixels is less accurate than one of "
+            "blocks. Take more shots, or leave --block out."
         )
     if defects:
         reporter.say(

@@ -132,9 +132,9 @@ class Shots:
         if means[dim].mean() < TOO_DARK:
             raise PolarguideError(
                 files[dim],
-                expected=f"a mean of at least {TOO_DARK:.0%} of full scale",
+                expected=f"a mean intensity of at least {TOO_DARK:.0%} of full scale",
                 found=f"{means[dim].mean():.1%}",
-                remedy="Expose longer; half of full scale is a good mean.",
+                remedy="Expose longer: half of full scale is good.",
             )
         shots = len(self.files)
         return ShotMeans(levels, means[:shots], means[shots:].mean(axis=0) if self._flat else None)
@@ -142,7 +142,7 @@ class Shots:
     def linear(
         self, levels: Levels, reporter: Reporter
     ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
-        """Each shot once more: linear intensities [H, W], full scale 1, and whether a sample is saturated."""
+        """Read each shot once more: linear intensities [H, W], full scale 1, and a mask [H, W] of saturated samples."""
         with reporter.track("fitting pixels", len(self.files)) as advance:
             for number, path in enumerate(self.files, 1):
                 values = self._read(path)

@@ -268,7 +268,7 @@ def _require_match(known: Array, apparent: Array, folder: Path, to_mean: bool) -
             "--angles",
             expected="angles from the image's horizontal, counter-clockwise as displayed",
             found=f"a zero that lies {-np.degrees(zero):+.1f} degrees off what the sensor in {folder} sees",
-            remedy="Correct them, or give --reference mean: the sensor's own mean is then the zero.",
+            remedy="Give angles from the horizontal, or --reference mean: the sensor's own mean is then the zero.",
         )
 
 

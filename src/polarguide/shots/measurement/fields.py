@@ -139,7 +139,7 @@ def read_limits(path: Path, regions: Collection[str], *, reference: bool) -> Lim
         regions: names that may occur in it. reference: whether shots are compared with one.
 
     Raises:
-        PolarguideError: it cannot be read, names a field or a region that there is not, or bounds nothing.
+        PolarguideError: the file cannot be read, names an unknown field or region, or bounds nothing.
     """
     limits = read_record(path, Limits, remedy=_REMEDY)
     if limits.format != 1:
@@ -165,9 +165,9 @@ def _check(path: Path, place: str, field: str, bound: Bound, reference: bool) ->
     if field in COMPARED and not reference:
         raise PolarguideError(
             f"{path} ({place})",
-            expected="a reference that shots are compared with",
+            expected="a golden part, because this field limits the difference from it",
             found="none",
-            remedy="Give --reference, or remove the field.",
+            remedy="Give the golden part with --reference, or remove the field.",
         )
     if bound.min is None and bound.max is None:
         raise _wrong(path, place, "min, max or both", "neither")

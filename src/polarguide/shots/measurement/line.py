@@ -96,7 +96,7 @@ class Measurer:
         """The maps of a shot: of the whole picture if ``whole`` or with a reference, else at least of the regions.
 
         Raises:
-            PolarguideError, OSError, MemoryError: it cannot be read.
+            PolarguideError, OSError, MemoryError: the shot cannot be read.
         """
         return read_shot(shot, self._reading, part=None if whole else self._part)
 
@@ -104,7 +104,7 @@ class Measurer:
         """The figures of its maps.
 
         Raises:
-            PolarguideError: it does not fit the regions or the reference.
+            PolarguideError: the shot does not fit the regions or the reference.
         """
         regions = placed(self._regions, maps.whole or maps.size, shot.where)
         differences = None if self.reference is None else self.reference.differences(maps)
@@ -254,7 +254,7 @@ class Line:
 
         Raises:
             ChangedWhileRead: they have become others meanwhile; nothing was written.
-            PolarguideError, OSError, MemoryError: it cannot be read, or does not fit the regions or the reference.
+            PolarguideError, OSError, MemoryError: the shot cannot be read, or does not fit regions or reference.
         """
         maps = self.measurer.read(shot)
         if stamps(shot.paths) != files:

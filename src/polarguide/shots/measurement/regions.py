@@ -132,7 +132,7 @@ def _wrong(expected: str, found: str) -> PolarguideError:
         "--roi",
         expected=expected,
         found=found if len(found) <= 100 else f"{found[:100]}...",
-        remedy="Correct the region.",
+        remedy="Write a region as --roi NAME=X,Y,WIDTH,HEIGHT, in pixels.",
     )
 
 
@@ -149,7 +149,7 @@ def placed(regions: Sequence[Region], size: tuple[int, int], where: Path | str) 
                 where,
                 expected=f"the region {region.name} within {width}x{height} pixels",
                 found=f"{region.x},{region.y},{region.width},{region.height}",
-                remedy="Correct --roi; it counts pixels of the developed picture.",
+                remedy="Make the region smaller, or move it; --roi counts pixels of the developed picture.",
             )
     return tuple(regions) or (Region(WHOLE, 0, 0, width, height),)
 
@@ -289,7 +289,7 @@ class Reference:
             options: as for the shots that it is compared with.
 
         Raises:
-            PolarguideError: it is not one shot, or cannot be read.
+            PolarguideError: the path is not one shot, or cannot be read.
         """
         shot = _reference_shot(path, options)
         return cls(shot, read_shot(shot, options))

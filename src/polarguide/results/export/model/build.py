@@ -57,7 +57,7 @@ def require_room(texture: int) -> None:
     """Check that a texture of so many texels along its side fits into memory.
 
     Raises:
-        PolarguideError: it does not.
+        PolarguideError: the texture does not fit.
     """
     needed, free = BYTES_PER_TEXEL * texture**2, free_memory()
     if free is not None and needed > free:

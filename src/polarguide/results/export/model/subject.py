@@ -91,7 +91,7 @@ def write_stl(path: Path, vertices: Places, faces: NDArray[np.int64], words: str
         path: the file. vertices: [V, 3] as the file has them. faces: [F, 3]. words: for its head, of which 80 are kept.
 
     Raises:
-        PolarguideError: it cannot be written.
+        PolarguideError: the file cannot be written.
     """
     table = np.zeros(len(faces), _TRIANGLE)
     table["corners"] = vertices[faces]
