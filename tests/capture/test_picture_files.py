@@ -266,7 +266,7 @@ PICTURES: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
     ),
     "a view of another depth": (
         lambda capture: capture.write_view("v003", capture.linear["v003"], bits=8),
-        Fault(expected="one number of bits for all views", found="8 bits in view v003 and 16 in view v000"),
+        Fault(expected="the same bit depth in all views", found="8 bits in view v003 and 16 bits in view v000"),
     ),
 }  # fmt: skip
 

@@ -217,7 +217,7 @@ def test_a_folder_of_something_else_is_refused(bench: Bench, tmp_path: Path) -> 
 def test_a_scene_is_no_place_for_the_bench_or_a_comparison(bench: Bench, tmp_path: Path) -> None:
     (tmp_path / "polar").mkdir()
     for place in (tmp_path, tmp_path / "polar" / "new"):
-        refused = Fault(str(place), "a folder for what is written", "scene")
+        refused = Fault(str(place), "an output folder", "scene")
         refused.raised_by(run_bench, place, RENDER, bench=bench)
         refused.raised_by(polarguide.compare, [tmp_path], ["3dgs"], place)
     Fault("results.json").raised_by(join_tables, [tmp_path], tmp_path)

@@ -42,7 +42,7 @@ def test_what_is_written_passes(tmp_path: Path) -> None:
         (("settings", "against"), "c", "settings.against", "one of a"),
         (("settings",), [3], "settings", "a JSON object {...}"),
         (("scenes",), [], "scenes", "a list"),
-        (("scenes", 1, "name"), "x", "scenes", "every name once"),
+        (("scenes", 1, "name"), "x", "scenes", "no name more than once"),
         (("recipes", 0, "data"), [], "recipes[0].data", "a JSON object {...}"),
         (("runs", 0, "seed"), -1, "runs[0].seed", "0 or more"),
         (("scenes", 0, "views"), -6, "scenes[0].views", "0 or more"),

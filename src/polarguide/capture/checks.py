@@ -46,7 +46,7 @@ class Measures:
         bright: 99th percentile of the linear intensities, in [0, 1].
         residuals: median of |difference of the two pair sums| / S0 for the three ways to pair the pictures:
             (0, 90 | 45, 135), (0, 45 | 90, 135), (0, 135 | 45, 90). The first is zero for an ideal capture.
-        sums: of the regression of r = (I0 + I90 - I45 - I135) / S0 on q = ((I0 - I90) / S0)^2 -
+        sums: sums of the regression of r = (I0 + I90 - I45 - I135) / S0 on q = ((I0 - I90) / S0)^2 -
             ((I45 - I135) / S0)^2: number of pixels, sums of q, r, q q, q r. Linear data have slope 0 whatever
             the gains of the four pictures; a concave encoding bends it down, a convex one up.
     """
@@ -130,7 +130,7 @@ def exposure_warnings(
     Args:
         names: view names.
         measures: figures of each view.
-        blown: of each view, the share of pixels of which a picture is at full scale.
+        blown: share, in each view, of pixels of which a picture is at full scale.
         largest: the largest value stored in any picture.
         full: the largest possible one.
     """

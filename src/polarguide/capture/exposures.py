@@ -79,7 +79,7 @@ class Exposure:
     """One picture of a view.
 
     Attributes:
-        angle: of the polarizer in degrees, in [0, 180); None where there is none, or where it is not known.
+        angle: angle of the polarizer in degrees, in [0, 180); None where there is none, or where it is not known.
         filtered: whether there was a polarizer before the lens or the sensor.
         gain: by what its values have to be divided to be on the scale of the scene's other pictures.
     """
@@ -195,10 +195,10 @@ class Line:
     """A line of the table.
 
     Attributes:
-        number: of the line, from 1.
+        number: number of the line, from 1.
         file: the picture's name: inside ``polar/`` of a scene, else relative to the folder of the photographs.
         view: pictures of one view share their pose; None for a view of its own, called like the file without suffix.
-        angle: of the polarizer.
+        angle: angle of the polarizer.
         gain: exposure relative to the other pictures; None if it is not given.
     """
 

@@ -132,7 +132,7 @@ def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor:
     """Read one ground-truth file.
 
     Args:
-        path: of the file, for messages.
+        path: path of the file, for messages.
         data: the whole file, NumPy's .npz with any of the arrays ``normal``, ``depth``, ``mask``,
             ``specular``, ``diffuse`` and ``objid``; others are ignored.
         size: height and width of the pictures as stored.

@@ -177,7 +177,7 @@ def read_views(
 
     Args:
         layout: the files of the capture.
-        names: of the views to read, sorted.
+        names: names of the views to read, sorted.
         model: the capture's COLMAP model, if it has one; views that it lacks are read without a camera.
         downscale: side of the pixel boxes to average.
         transfer: "linear" or "srgb".

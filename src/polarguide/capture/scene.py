@@ -225,15 +225,15 @@ class Scene:
             pictures: of each view, [K, H, W, 3] RGB or [K, H, W] gray: uint8 or uint16 as a camera stores them, or
                 linear floats from 0 to 1, where 1 is full scale. By name, or in an order (then called v000, v001,
                 ...); views may differ in size.
-            cameras: of each view, at the size of its pictures; ``Camera.from_matrices`` makes one of matrices.
+            cameras: cameras of each view, at the size of its pictures; ``Camera.from_matrices`` makes one of matrices.
             angles: of the K pictures: degrees counter-clockwise as displayed, ``unknown`` or ``none`` (no filter); of
                 all views, or by name.
             points: [M, 3] sparse points of the surfaces in the world, such as those of structure from motion.
             point_colors: [M, 3] uint8, as displayed; None: gray.
-            masks: of the foreground, [H, W] bool a view. invalid: pixels without use, [H, W] bool a view.
+            masks: masks of the foreground, [H, W] bool a view. invalid: pixels without use, [H, W] bool a view.
             test_views: names of the views to score on; None: as ``split`` chooses them.
             split, transfer, downscale: as ``load_scene`` takes them. mount: where the polarizer was.
-            refractive_index: of the surfaces, None if it is not known. name: of the scene.
+            refractive_index: refractive index of the surfaces, None if it is not known. name: name of the scene.
 
         Example:
             >>> scene = polarguide.Scene.from_arrays(stack, cameras, points=points)    # doctest: +SKIP

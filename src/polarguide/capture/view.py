@@ -218,7 +218,7 @@ class View:
         """The view with other pictures: made now where its own are in memory, else when they are read.
 
         Args:
-            change: makes new codes of the view's. exposures: of the new pictures; None: they stay.
+            change: makes new codes of the view's. exposures: exposures of the new pictures; None: they stay.
         """
         pictures = self.pictures
         made = pictures.then(change) if isinstance(pictures, Loader) else change(pictures)

@@ -108,7 +108,7 @@ class ViewData:
         """The view with its camera and its saturated pixels.
 
         Args:
-            camera: of the view. scale: as for ``saturated``. mount: where the polarizer was.
+            camera: camera of the view. scale: as for ``saturated``. mount: where the polarizer was.
             files: load codes and ground truth when they are read; None: those that are here stay in memory.
         """
         invalid, saturated = torch.from_numpy(self.invalid), torch.from_numpy(self.saturated(scale))
@@ -375,7 +375,7 @@ class StoredViews:
 
     Attributes:
         data: the views, sorted by name.
-        cameras: of each view at the size of its averaged pictures; None where the model has no pose.
+        cameras: cameras of each view at the size of its averaged pictures; None where the model has no pose.
         measures: ``checks.measure`` of each view.
         largest_value: the largest value that the files can store, 255 or 65535.
         full_scale: the stored value at which the capture saturates; None if nothing is saturated.

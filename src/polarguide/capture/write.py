@@ -89,7 +89,7 @@ def write_view(
             those of a monochrome sensor are, one is written.
         invalid: unusable pixels, [H, W].
         mask: object mask, [H, W].
-        angles: of the pictures, where there are others than four.
+        angles: angles of the pictures, where there are others than four.
 
     Returns:
         The size in bytes of each file that was written, by its path in the scene folder.

@@ -74,8 +74,8 @@ def workers(
 
     Args:
         options: where.
-        count: how many jobs work at a time. threads: of each. memory: bytes that each takes at most.
-        gpus: of this machine, for local workers.
+        count: how many jobs work at a time. threads: threads of each. memory: bytes that each takes at most.
+        gpus: GPUs of this machine, for local workers.
         reporter: is told where workers are.
 
     Raises:

@@ -140,7 +140,7 @@ class Bench:
         held_back: those that nobody tunes on.
         synth, views: how each is rendered.
         rows: names of recipes in the order of the tables, and how many seeds each is trained with.
-        training: of every run; the first seed, from which others count up.
+        training: settings of every training; the first seed, from which others count up.
     """
 
     development: tuple[str, ...]

@@ -34,7 +34,7 @@ class Region:
     Attributes:
         center: [3] in the world. unit: half the side of the middle cube, in world units: half of what a picture shows
             across at the center. Within the cube, grids have their full resolution.
-        radius: of the sphere, in this unit, at least 1.
+        radius: radius of the sphere, in this unit, at least 1.
     """
 
     center: tuple[float, float, float]
@@ -175,7 +175,7 @@ class GridField(Field):
     """Distances and features in dense grids over the region's cube, with a small head for the color.
 
     Args:
-        region: where it lies. shape: of what it is made. generator: first values are drawn from.
+        region: where it lies. shape: sizes of its grids and networks. generator: first values are drawn from.
     """
 
     def __init__(self, region: Region, shape: FieldShape, generator: torch.Generator) -> None:
@@ -224,7 +224,7 @@ class Background(nn.Module):
     """The background beyond the cameras' sphere: density and color in grids, by direction and inverse distance.
 
     Args:
-        shape: of what it is made. generator: first values are drawn from.
+        shape: sizes of its grids and networks. generator: first values are drawn from.
     """
 
     def __init__(self, shape: FieldShape, generator: torch.Generator) -> None:
@@ -276,7 +276,7 @@ class NetworkField(Field):
     """Distances of a network of places with a skip connection, colors of another one.
 
     Args:
-        region: where it lies. shape: of what it is made. generator: first values are drawn from.
+        region: where it lies. shape: sizes of its grids and networks. generator: first values are drawn from.
     """
 
     map_side = 65

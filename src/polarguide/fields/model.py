@@ -37,7 +37,7 @@ class FieldModel:
     """A trained field: a signed distance and colors.
 
     Args:
-        state: of the training. recipe: the method. device: where layers are rendered.
+        state: state of the training. recipe: the method. device: where layers are rendered.
         trained: whether its map of distances is to be brought up to date; a training does that itself.
     """
 

@@ -108,7 +108,7 @@ def sample_surfaces(
     Args:
         pairs: views and their surfaces, whose maps may be smaller than the pictures.
         pairing: the pairs of perpendicular pictures, an index into ``PAIRINGS``.
-        seed: of the random sampling.
+        seed: seed of the random sampling.
     """
     order = [PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]
     generator = torch.Generator().manual_seed(seed)
@@ -375,7 +375,7 @@ def short_run(
         steps: optimizer steps.
         backend: device and rasterizer.
         on_step: called after every step.
-        refractive_index: of the surfaces; None: that of the scene.
+        refractive_index: refractive index of the surfaces; None: that of the scene.
         recipe: what trains; None: ``RECIPE``.
         until: the step to stop after; 0: the last.
     """

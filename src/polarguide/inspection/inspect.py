@@ -243,7 +243,7 @@ class Inspection:
 
     Attributes:
         capture: what was inspected. settings: how. index: the refractive index that was used.
-        measurements: of each view. checks: in the order in which they are shown.
+        measurements: measurements of each view. checks: in the order in which they are shown.
         angles: order, sense and zero; of a capture with other pictures, what each tells of its polarizer.
     """
 

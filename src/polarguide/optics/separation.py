@@ -58,7 +58,7 @@ def exact_separation(
         stokes: [3, ..., C] with the colors last.
         normals: [..., 3] camera axes; only the direction matters.
         rays: [..., 3] unit camera rays.
-        refractive_index: of the surface, more than 1: a number or [...].
+        refractive_index: refractive index of the surface, more than 1: a number or [...].
         minimum_contrast: least ``rho_s + rho_d`` that counts as well-conditioned. The default excludes
             zeniths below about 11 degrees at n = 1.5. The divisor itself is held above a tenth of it, which
             bounds the amplification of noise.
@@ -98,7 +98,7 @@ def paper_separation(stokes: Tensor, zenith: Tensor, refractive_index: float | T
     Args:
         stokes: [3, ..., C] with the colors last.
         zenith: [...] radians.
-        refractive_index: of the surface, more than 1: a number or [...].
+        refractive_index: refractive index of the surface, more than 1: a number or [...].
 
     Returns:
         Separation in units of S0, ``conditioned`` True everywhere.
@@ -136,7 +136,7 @@ def paper_intensities(
         zenith: [...] radians.
         s_direction: [...] radians, the direction perpendicular to the plane of incidence: azimuth + pi/2.
         polarizer: radians, a number or [...].
-        refractive_index: of the surface, more than 1: a number or [...].
+        refractive_index: refractive index of the surface, more than 1: a number or [...].
 
     Returns:
         (specular, diffuse) intensities, each [..., C].
@@ -171,7 +171,7 @@ def predicted_stokes(
         specular, diffuse: [..., C] units of S0, the colors last.
         normals: [..., 3] camera axes; only the direction matters.
         rays: [..., 3] unit camera rays.
-        refractive_index: of the surface, more than 1: a number or [...].
+        refractive_index: refractive index of the surface, more than 1: a number or [...].
 
     Returns:
         [3, ..., C].

@@ -51,7 +51,7 @@ class MosaicFiles:
     """How the mosaics of one sensor are read.
 
     Attributes:
-        pattern: of the top-left pixel that is left after ``cut``.
+        pattern: pattern of the top-left pixel that is left after ``cut``.
         crop: columns and rows that ``cut`` takes off.
     """
 
@@ -160,9 +160,9 @@ def block_intensities(
 
     Args:
         samples: ``sample_blocks`` of two periods from each mosaic.
-        levels: of the capture.
+        levels: levels of the capture.
         floor: ``sample_blocks`` of the dark frame, or None.
-        pattern: of the mosaics.
+        pattern: pattern of the mosaics.
         matrices: [4, 4, ...]: ``sample_blocks`` of the corrections of cells, in blocks of one period, or None.
     """
     values = np.concatenate(samples)
@@ -207,7 +207,7 @@ class MosaicSource(Source):
 
         Args:
             root: the folder of mosaics.
-            settings: of the preparation.
+            settings: settings of the preparation.
             dataset: the published dataset of the mosaics, if they belong to one.
 
         Raises:

@@ -38,7 +38,7 @@ class DevelopedView:
         invalid: pixels that depend on an unusable sample, [H, W].
         geometry: crop and scale relative to the stored picture.
         mask: object mask, [H, W], or None.
-        angles: of the pictures, counter-clockwise as displayed.
+        angles: angles of the pictures, counter-clockwise as displayed.
         record: measurements for ``scene.json``.
         notes: messages for the user.
     """
@@ -360,7 +360,7 @@ def rim_agreement(
 
     Args:
         stokes: [3, H, W, C], in the dataset's own sense.
-        mask: of the object, [H, W].
+        mask: mask of the object, [H, W].
         zero: where the angles begin, in radians counter-clockwise from the picture's horizontal.
     """
     area = int(mask.sum())

@@ -163,7 +163,7 @@ class Family(ABC):
         """Take a run back to where what was painted over it still counts.
 
         Args:
-            state: of the training; changed. None: it has not begun.
+            state: state of the training; changed. None: it has not begun.
 
         Raises:
             PolarguideError: materials mean nothing to the recipe, or to a training this short.

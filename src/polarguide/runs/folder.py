@@ -60,7 +60,7 @@ class RunConfiguration:
         recipe: its name. recipe_data: all its values, for the record.
         settings: steps, seed, refractive index, with what was taken where nothing was specified.
         downscale: side of the averaged pixel boxes. transfer: how the files were read.
-        device: what it trained on. version: of the program.
+        device: what it trained on. version: version of the program.
         test_views: those held out; None in runs of the first versions, which held out every 8th without a split.json.
         painted: digest of the materials that were painted over the run and are in it, see ``runs.painted``; None: none.
     """
@@ -335,7 +335,7 @@ def most_gaussians(
     """How many Gaussians there may be for so many pixels of all views; 0 of a field, which has none.
 
     Args:
-        pixels: of the training views. asked, resumed: as for ``resolve``.
+        pixels: pixels of the training views. asked, resumed: as for ``resolve``.
     """
     if isinstance(method, NeuralRecipe):
         return 0
@@ -364,7 +364,7 @@ def resolve(
     """The settings of a training, with nothing left open.
 
     Args:
-        settings: as specified. scene, method: of the training.
+        settings: as specified. scene, method: those of the training.
         resumed: settings of the run that is resumed, whose values come before those of the scene and its size.
         processes: how many share the views of a step.
 

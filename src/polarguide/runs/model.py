@@ -119,7 +119,7 @@ def gaussian_colors(gaussians: Parameters, light: Light, shading: ShadingModel, 
     """Linear colors of every Gaussian toward viewing directions, reflections included.
 
     Args:
-        gaussians: the Gaussians. light: learned, by name. shading: of the recipe.
+        gaussians: the Gaussians. light: learned, by name. shading: shading of the recipe.
         directions: [K, 3] unit, from the camera to the Gaussian.
 
     Returns:
@@ -140,7 +140,7 @@ def baked_harmonics(
     """Harmonics, as of ``refit_sh``, of ``gaussian_colors``.
 
     Args:
-        gaussians, light, shading: of the run.
+        gaussians, light, shading: those of the run.
         present: what becomes of linear colors. linear: whether they are still linear then.
     """
     known = {
@@ -206,7 +206,7 @@ def write_run_ply(
     """Write the trained Gaussians; see the module's text, and ``learned_normals`` for the centers of the cameras.
 
     Args:
-        path: the file. state, shading: of the run. centers: [M, 3] of the cameras.
+        path: the file. state, shading: those of the run. centers: [M, 3] of the cameras.
         color: [3, 3] of a presentation; it holds for the harmonics that other programs show, never for our own fields.
         linear: whether the harmonics are of linear colors, for readers that want them.
     """

@@ -37,7 +37,7 @@ class OpenedRun:
     """A trained run: what it was trained as, what it learned, and the layers that it renders.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         configuration: what it was trained as. recipe: the method.
         model: what it learned.
         scene: the scene or its folder, where that is not the folder that the configuration names.
@@ -334,7 +334,7 @@ def read_scene(
     """Load a scene, with progress, and hand on its warnings.
 
     Args:
-        folder: of the scene. options: how it is read. reporter: receives progress.
+        folder: folder of the scene. options: how it is read. reporter: receives progress.
         test_views, hold: as for ``load_scene``.
 
     Raises:

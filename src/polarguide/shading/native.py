@@ -42,7 +42,7 @@ class RoughnessArguments(NamedTuple):
     """Arguments of the native pass for rough surfaces.
 
     Attributes:
-        channel: of the blended roughness.
+        channel: channel of the blended roughness.
         blur: mip levels from a mirror to a roughness of 1.
         alpha: [P] by which a pixel's blended roughness is divided; without a gradient.
     """

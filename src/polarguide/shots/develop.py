@@ -185,7 +185,7 @@ def _cut(part: Part | None, shape: tuple[int, ...], step: int) -> tuple[slice, s
     """The samples of a mosaic that a part of its picture needs: whole superpixels, with ``AROUND`` around them.
 
     Args:
-        part: of the picture. shape: of the mosaic, rows and columns. step: samples of a pixel, each way.
+        part: part of the picture. shape: shape of the mosaic, rows and columns. step: samples of a pixel, each way.
 
     Returns:
         Rows and columns; None for all, where hardly any would be left out.

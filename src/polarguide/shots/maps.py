@@ -87,7 +87,7 @@ class ShotMaps:
     angles and degrees are never averaged. The colors themselves are in ``intensities``.
 
     Attributes:
-        name: of the shot.
+        name: name of the shot.
         files: it was read from, in the order 0, 45, 90, 135 where there are four.
         intensities: [4, H, W, C] float32, linear, at 0, 45, 90 and 135 degrees, counter-clockwise as displayed; 1 is
             full scale; noise about black may be negative. C is 3 (R, G, B) or 1 (monochrome). Of a set at other angles
@@ -101,7 +101,7 @@ class ShotMaps:
         sigma_aolp: [H, W] float32, of ``aolp``, radians, at most ``optics.UNIFORM_SPREAD``.
         reason: [H, W] uint8, a ``Reason``. NOISE pixels do have an S0 and a (small) DoLP: means of these over a region
             take them in; they say nothing of an angle or a normal.
-        noise: of one sample of the sensor.
+        noise: noise of one sample of the sensor.
         pair_ratio: median of (I0 + I90) / (I45 + I135), which is 1 for ideal polarizers; None where it is too dark, and
             of a set at other angles.
         notes: what was assumed, for the user.
@@ -283,7 +283,7 @@ class Developed:
     Attributes:
         intensities: [4, H, W, C] float32, linear; noise about black may be negative.
         dark, saturated, masked: [H, W].
-        noise: of a sample. factors: variance of an intensity (of the luminance) as a multiple of a sample's,
+        noise: noise of a sample. factors: variance of an intensity (of the luminance) as a multiple of a sample's,
             [4, p, p] over a period of pixels.
         mean_variance, pair_ratio, notes, origin, whole: as in ``ShotMaps``.
     """

@@ -58,7 +58,7 @@ def read_shot(
         options: how to read it.
         part: x, y, width and height of what is wanted of the picture of a mosaic: the rest is left out where that saves
             time, as ``ShotMaps.origin`` and ``whole`` say. Noise that is not given is then estimated from the part.
-        angles: of the K pictures of an array, degrees counter-clockwise as displayed; files state theirs.
+        angles: angles of the K pictures of an array, degrees counter-clockwise as displayed; files state theirs.
 
     Raises:
         PolarguideError: the path is not one shot, a file is missing, cannot be read, or does not fit, or an array has
@@ -181,7 +181,7 @@ class SurfaceMaps:
         specular_exact, diffuse_exact: [H, W, C] float32, units of S0: Fresnel's split, which needs the normal, and so
             is as right as the guess above. They add up to S0.
         conditioned: [H, W] bool, where the exact one is well conditioned.
-        refractive_index: of all surfaces.
+        refractive_index: refractive index of all surfaces.
         perspective: whether the rays of the pixels are known; else all are parallel to the axis.
     """
 
@@ -238,9 +238,9 @@ def surface_maps(
     """Candidates of the normals, one of them, and both separations.
 
     Args:
-        maps: of the shot.
+        maps: maps of the shot.
         camera: of its pixels, for their rays; None takes rays parallel to the axis, which a long lens nearly has.
-        refractive_index: of all surfaces; None: ``INDEX``.
+        refractive_index: refractive index of all surfaces; None: ``INDEX``.
 
     Raises:
         PolarguideError: the refractive index is out of range.
@@ -328,8 +328,8 @@ def array_shot(
     Args:
         array: with a sensor, a raw mosaic [H, W] of uint8 or uint16; else pictures through a filter, [K, H, W] gray or
             [K, H, W, 3] RGB: uint8 or uint16 as stored, or linear floats from 0 to 1. It is not written to.
-        options: how it is read. name: of the shot.
-        angles: of the K pictures in degrees, counter-clockwise as displayed.
+        options: how it is read. name: name of the shot.
+        angles: angles of the K pictures in degrees, counter-clockwise as displayed.
 
     Raises:
         PolarguideError: shape, type or angles do not fit; its ``where`` is the name.

@@ -40,9 +40,9 @@ class SetSamples:
     """The pictures of a set, before anything is fitted.
 
     Attributes:
-        labels: of the pictures, for messages.
+        labels: labels of the pictures, for messages.
         values: [K, H, W, C] linear, uint16 codes or float32 intensities; C is 1 where all pictures are gray.
-        exposures: of the pictures: the angle in degrees, counter-clockwise as displayed, and the gain.
+        exposures: exposures of the pictures: the angle in degrees, counter-clockwise as displayed, and the gain.
         lost: [K, H, W], samples at full scale.
         dark: [H, W], 0 in all pictures. masked: [H, W].
         step: one stored value as a share of full scale.
@@ -138,7 +138,7 @@ def samples_of_arrays(
     """The samples of a set in memory.
 
     Args:
-        name: of the shot. stored: [K, H, W, 3] uint8 or uint16. angles: of the K pictures.
+        name: name of the shot. stored: [K, H, W, 3] uint8 or uint16. angles: angles of the K pictures.
     """
     require_no_order(options.calibration, name)
     places = [k for k, angle in enumerate(angles) if not isinstance(angle, str)]

@@ -43,10 +43,10 @@ class SetPicture:
     """One picture of a set.
 
     Attributes:
-        path: of the picture, or of the video.
+        path: path of the picture, or of the video.
         angle: of the polarizer as the user counts it, degrees; "unknown", or "none" without a polarizer: not used.
         gain: exposure relative to the others, where a table states it.
-        frame: of the video, from 0; None for a picture file.
+        frame: frame of the video, from 0; None for a picture file.
     """
 
     path: Path
@@ -74,7 +74,7 @@ class ExposureSet:
         fault: why it is no shot: ``read_shot`` raises it, and the shots beside it are not concerned.
         others: where there is a fault, files that ``files`` has no place for; or the folder that it is in. Of a view of
             a scene, its pictures where they are not the usual four.
-        pictures: of a set, by angle.
+        pictures: pictures of a set, by angle.
         table: that states their angles; None where names do.
         stored: the pictures of a shot in memory, which has no files: [H, W] of a mosaic, else [K, H, W, 3].
         angles: theirs, as the user counts them; none of a mosaic.

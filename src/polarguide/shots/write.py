@@ -47,7 +47,7 @@ class WrittenShots:
     """The outcome of several shots.
 
     Attributes:
-        folders: of the shots that were written, by name.
+        folders: folders of the shots that were written, by name.
         faults: the errors of the others, by name.
     """
 
@@ -77,7 +77,7 @@ def write_shots(
         formats: png (with legends), exr and npy (numbers; ``maps.json`` says their units), page.
         intrinsics: ``fx,fy,cx,cy`` of the developed pictures; without them, and without poses of a scene, rays are
             parallel.
-        refractive_index: of all surfaces; None: as ``surface_maps`` takes it.
+        refractive_index: refractive index of all surfaces; None: as ``surface_maps`` takes it.
         reporter: where messages and progress go.
 
     Raises:

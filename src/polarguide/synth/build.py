@@ -285,7 +285,7 @@ class BuiltScene:
         scenes: Mitsuba's scenes, one or three (see ``film.render_lobes``).
         shapes: Mitsuba's shape of every object in the first scene, in the order of the data.
         panorama: the environment, [H, W, 3].
-        textures: of every object, [H, W, 3] with rows from the top down, or None where it has one color.
+        textures: textures of every object, [H, W, 3] with rows from the top down, or None where it has one color.
     """
 
     spec: SceneSpec

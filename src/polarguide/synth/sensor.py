@@ -43,7 +43,7 @@ class Sensor:
         full_well: electrons at full scale.
         read_noise: standard deviation of the read noise in electrons.
         extinction: extinction ratio of the polarizers.
-        gains: of the samples behind polarizers at 0, 45, 90 and 135 degrees.
+        gains: gains of the samples behind polarizers at 0, 45, 90 and 135 degrees.
         bits: bits of a stored value.
         black: black level in stored values.
     """
@@ -229,8 +229,8 @@ def render_lobes(
             share their random numbers, so that the noise has no color.
         camera: pose and intrinsics; the reconstruction filter is a box of one pixel.
         samples: paths per pixel and lobe.
-        seed: of the view.
-        limits: of the paths.
+        seed: seed of the view.
+        limits: limits of the paths.
         center: send all rays through the centers of pixels.
     """
     pixels = camera.width * camera.height

@@ -97,7 +97,7 @@ def unpack_priors(entry: Entry, camera: Camera, settings: Priors) -> ViewPriors:
     """The priors again; what was not kept is not a number, in its shape.
 
     Args:
-        entry: by ``pack_priors``. camera: of the view. settings: that they were computed with.
+        entry: by ``pack_priors``. camera: camera of the view. settings: that they were computed with.
     """
     values = {name: unpacked(stored) for name, stored in entry.items()}
     device = next(iter(values.values())).device
@@ -257,7 +257,7 @@ class Feed:
 
     Args:
         backend: device and rasterizer. recipe: the method. index: of refraction.
-        store: keeps what is computed of the views. views: that are trained on. steps: of the training.
+        store: keeps what is computed of the views. views: that are trained on. steps: steps of the training.
         black: whether nothing is behind the subject.
         memory: gives back what was freed before and after the priors of a view are made.
 
@@ -310,7 +310,7 @@ class Feed:
         """Targets of the rendering of one of a step's views.
 
         Args:
-            weights: of the stage, which say what its terms read.
+            weights: weights of the stage, which say what its terms read.
             guide: Gaussians whose normals resolve what polarization leaves open; needed where a term reads priors.
         """
         size, priors = self._size(step), None

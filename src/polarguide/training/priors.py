@@ -107,7 +107,7 @@ def view_priors(
         view: the capture; its pictures have to determine the Stokes vector.
         normal: [H, W, 3] normals rendered from the frozen Gaussians, world axes, any length; its device does the work.
         settings: which candidates and which separation.
-        refractive_index: of all surfaces, or [H, W] of each pixel.
+        refractive_index: refractive index of all surfaces, or [H, W] of each pixel.
         precomputed: ``unguided`` of the view, where it is at hand; needed with the index of each pixel.
         metal: [H, W] share of metals, where what holds for dielectrics alone does not count; None: no metal.
         flat: a flat surface, whose normal replaces the guide and the color differences where the guide is far from it.

@@ -157,8 +157,8 @@ def first_state(
     """The state before the first step; drawn on the CPU, so that every device begins with the same.
 
     Args:
-        scene, recipe, settings: of the training.
-        device: of the Gaussians.
+        scene, recipe, settings: those of the training.
+        device: device of the Gaussians.
         surroundings: whether there are any, for which far Gaussians are added.
     """
     initialization = recipe.initialization if surroundings else replace(recipe.initialization, shell=0)

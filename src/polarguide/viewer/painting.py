@@ -58,7 +58,7 @@ class Materials:
         kinds: [N] uint8: 0 nothing, 1 dielectric, 2 metal, from 3 on the dielectrics of ``scene.json``.
 
     Args:
-        gaussians: of the model. rasterize: of its backend.
+        gaussians: Gaussians of the model. rasterize: rasterizer of its backend.
         kinds: what was painted before, as ``kinds_of`` reads it; called once.
     """
 
@@ -240,7 +240,7 @@ class Painting:
     """One session's painting. Callbacks only record; the rendering thread calls ``act``.
 
     Args:
-        client: viser's handle. controls: of its panel. paintable: of the run.
+        client: viser's handle. controls: controls of its panel. paintable: what can be painted.
         changed: called when there is something to do. noted: with a note for the visitor.
         caught: makes callbacks whose faults cost only this browser. busy: whether another tool takes clicks.
     """
@@ -274,7 +274,7 @@ class Painting:
         """Do what was asked for.
 
         Args:
-            camera: of the picture that was clicked into.
+            camera: camera of the picture that was clicked into.
         """
         todo, self._todo = self._todo, []
         for each in todo:

@@ -68,7 +68,7 @@ class GaussianScenery:
 
     Attributes:
         gaussians: the Gaussians. light: learned, by name.
-        shading: as it is now. rasterize: of the backend. sh_degree: of the base color.
+        shading: as it is now. rasterize: rasterizer of the backend. sh_degree: degree of the base color's harmonics.
         status: a line about it.
         footprints: [N] of a finished training, see ``raster.magnification``.
     """

@@ -106,8 +106,8 @@ class Session:
     Callbacks only record changes; the rendering thread calls ``draw``.
 
     Args:
-        client: viser's handle. photographs: by name. scene_frame: of the scene.
-        options: of the panel. wake: called when a picture may be due.
+        client: viser's handle. photographs: by name. scene_frame: frame of the scene.
+        options: options of the panel. wake: called when a picture may be due.
         gray_world: gives the gains of the photographs' mean.
         save: writes a presentation to the run, and returns a message; None: the browser downloads it.
         drop: called with what a callback has raised, to let the browser go. beside: as of ``Painter``.

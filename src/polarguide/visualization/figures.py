@@ -354,7 +354,7 @@ def write_png(
     """Write a uint8 RGB [H, W, 3] picture in one step: a reader sees the old file or the whole new one.
 
     Args:
-        path: of the file. rgb8: the picture. alpha8: [H, W] uint8 how opaque it is; None: wholly.
+        path: path of the file. rgb8: the picture. alpha8: [H, W] uint8 how opaque it is; None: wholly.
         about: texts in ASCII by keyword, which go into the file, see ``with_texts``.
 
     Raises:

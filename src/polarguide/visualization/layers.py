@@ -42,9 +42,9 @@ def layer_picture(
     """One layer as an 8-bit picture, or None where the recipe has no such layer.
 
     Args:
-        result, camera: the rendering. name: of the layer. depths: nearest and farthest, for depth's colors.
+        result, camera: the rendering. name: name of the layer. depths: nearest and farthest, for depth's colors.
         exposed: show radiance darker where more than 1 % of the pixels would clip.
-        color: of the presentation, [3, 3], of layers of radiance.
+        color: color of the presentation, [3, 3], of layers of radiance.
     """
     if name in POLARIZED:
         return None if result.predicted is None else polarization_picture(name, result.predicted)

@@ -71,7 +71,7 @@ def write_cameras(
     Args:
         folder: exists.
         cameras: by view name; may not be empty.
-        numbers: of each view's image and camera; counted from 1 if None.
+        numbers: numbers of each view's image and camera; counted from 1 if None.
     """
     number_of: dict[tuple[object, ...], int] = {}
     used: dict[int, tuple[Any, ...]] = {}

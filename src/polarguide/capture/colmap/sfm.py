@@ -60,7 +60,7 @@ def match_features(
         images: folder of ``<view>.png``.
         sizes: width and height of every picture, by view.
         matching: "exhaustive" or "sequential".
-        seed: of all random draws.
+        seed: seed of all random draws.
         reporter: for progress.
         cameras: intrinsics by view, where they are known.
         masks: folder of ``<view>.png``; features are extracted in white parts only. Views without a file have no mask.
@@ -254,8 +254,8 @@ def log_false_alarms(matches: int, agreeing: int, share: float) -> float:
     """Natural logarithm of the number of geometries expected by chance that fit as many of the matches.
 
     Args:
-        matches: of the two pictures. agreeing: those of them that fit.
-        share: of the picture's area that fits an epipolar line, at most: the probability that a wrong match does.
+        matches: matches of the two pictures. agreeing: those of them that fit.
+        share: share of the picture's area that fits an epipolar line, at most: the probability that a wrong match does.
     """
     if agreeing <= SAMPLE:
         return math.inf
@@ -339,7 +339,7 @@ def reconstruct(
         folder: holds the pictures; the database and the model are written there.
         sizes: width and height of every picture, by view.
         matching: "exhaustive", or "sequential" for views taken in the order of their names.
-        seed: of the random numbers.
+        seed: seed of the random numbers.
         reporter: for progress and messages.
         untried: the options that may connect more views, for messages.
         intrinsics: model and parameters of all pictures, where they are known.

@@ -134,10 +134,10 @@ def add_points(
 
     Args:
         folder: working folder; results of an earlier call in it are used.
-        cameras: of the pictures in it, by view.
+        cameras: cameras of the pictures in it, by view.
         where: the origin of the poses, for messages.
         matching: "exhaustive" or "sequential".
-        seed: of all random draws.
+        seed: seed of all random draws.
         reporter: for progress and messages.
 
     Returns:

@@ -211,7 +211,7 @@ def _size_of(path: Path, inner: Sequence[NDArray[np.float64]], size: Size, light
     Args:
         path: their file, for messages.
         inner: their intrinsics.
-        size: of the pictures. light: a file of Stokes vectors.
+        size: size of the pictures. light: a file of Stokes vectors.
     """
     centers = [(float(matrix[0, 2]), float(matrix[1, 2])) for matrix in inner]
     other = None if light is None else stated_size(light)

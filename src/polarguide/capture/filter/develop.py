@@ -97,7 +97,7 @@ def align_shots(
     Args:
         linear: [4, H, W, 3] linear intensities.
         clipped: unusable pixels of each shot, [4, H, W].
-        shifts: of the four shots.
+        shifts: shifts of the four shots.
 
     Returns:
         The moved intensities; and pixels for which an unusable one or one outside the picture was used, [4, H, W].

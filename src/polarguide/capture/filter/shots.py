@@ -270,7 +270,7 @@ class SingleShot:
     Attributes:
         path: the file.
         view: its view; photographs of one view share their pose.
-        angle: of the filter, as the user counts it.
+        angle: angle of the filter, as the user counts it.
         gain: exposure relative to the others, if the user knows it.
     """
 
@@ -351,7 +351,7 @@ def _all_alike(root: Path, angles: str) -> list[SingleShot]:
     if len(files) % len(repeating):
         raise PolarguideError(
             "--angles",
-            expected=f"a number of photographs that {len(repeating)} divides, because these angles repeat",
+            expected=f"a number of photographs divisible by {len(repeating)}, because these angles repeat",
             found=f"{len(files)} in {root}",
             remedy=f"Add or remove photographs, or list the angle of each in {TABLE}.",
         )

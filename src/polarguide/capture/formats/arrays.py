@@ -86,7 +86,7 @@ def unpacked(data: bytes, names: Collection[str], largest: int) -> dict[str, NDA
     """Arrays of an ``.npz`` file by name, those that are there; the others in it are not looked at.
 
     Args:
-        data: the whole file. names: of the arrays. largest: bytes that any of them may take.
+        data: the whole file. names: names of the arrays. largest: bytes that any of them may take.
 
     Raises:
         One of ``BROKEN``: it is damaged, encrypted, or one of them is larger or holds no numbers.

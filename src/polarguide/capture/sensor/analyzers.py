@@ -146,7 +146,7 @@ class AnalyzerCalibration:
         """Refuse a region that the calibration does not hold.
 
         Args:
-            offset, size: of the region, in columns and rows of the sensor. where: for messages.
+            offset, size: those of the region, in columns and rows of the sensor. where: for messages.
 
         Raises:
             PolarguideError: the region is not inside the calibrated one.

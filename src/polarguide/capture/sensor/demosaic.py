@@ -156,7 +156,7 @@ def demosaic(
     Args:
         values: linear intensities [H, W], black level and gains already applied.
         bad: unusable samples, [H, W].
-        pattern: of the top-left pixel, which starts a whole polarizer cell.
+        pattern: pattern of the top-left pixel, which starts a whole polarizer cell.
         mode: a key of ``DEMOSAIC_MODES``.
         interpolation: ``bilinear`` or ``guided``; ``quarter`` and a monochrome ``half`` interpolate no colors.
         registered: whether ``half`` brings the four angles to one place.

@@ -287,7 +287,7 @@ def unusable_samples(
 
     Args:
         values: [H, W] stored values, H and W even.
-        levels: of the capture.
+        levels: levels of the capture.
         dark: dark frame in stored values, [H, W].
 
     Returns:
@@ -350,7 +350,7 @@ def require_kind(sensor: str, blocks: NDArray[Any], levels: Levels) -> None:
     """Refuse mosaics of the other kind of sensor: nothing later would tell.
 
     Args:
-        sensor: its name, a key of ``SENSORS``. blocks: as for ``color_filters``. levels: of the stored values.
+        sensor: its name, a key of ``SENSORS``. blocks: as for ``color_filters``. levels: levels of the stored values.
 
     Raises:
         PolarguideError: the samples say that it is another one.

@@ -89,7 +89,7 @@ def export(
             panorama (EXR, HDR and PNG); cameras are a COLMAP model and transforms.json.
         out: folder to write; ``export`` in the run's folder by default.
         resolution: voxels of the mesh along its longest side, 16 to 1024.
-        spz_version: of the SPZ file, 3 or 4; readers are split between them.
+        spz_version: version of the SPZ file, 3 or 4; readers are split between them.
         model: options of the textured model.
         reporter: receives progress.
 

@@ -59,7 +59,7 @@ class Binary:
         """Write the file of one primitive.
 
         Args:
-            path: the file. asset: whom and what made it, without the version. primitive: of the only mesh.
+            path: the file. asset: whom and what made it, without the version. primitive: primitive of the only mesh.
             more: further fields of the tree.
 
         Raises:

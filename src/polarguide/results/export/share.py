@@ -225,7 +225,7 @@ def share_page(
 
     Args:
         gaussians: the Gaussians.
-        light: parameters of the learned light by name. shading: of the recipe, for the run's refractive index.
+        light: parameters of the learned light by name. shading: shading of the recipe, for the run's refractive index.
         cameras: poses to choose from by name, at least one. first: name of the one to begin with.
         title, caption: any text; it is escaped.
         metrics: labels and values, any text. notes: paragraphs before them, any text.

@@ -25,7 +25,7 @@ def write_splat_glb(path: Path, ply: Path, asset: dict[str, Any], encoding: Enco
 
     Args:
         path: the file to write. ply: as ``write_run_ply`` writes it. asset: glTF's record of whom and what made it.
-        encoding: of the colors in the PLY.
+        encoding: encoding of the colors in the PLY.
 
     Raises:
         PolarguideError: the file cannot be written.

@@ -233,7 +233,7 @@ def implicit_surface(cameras: Mapping[str, Camera], model: FieldModel, *, resolu
     """The zero set of a model's distance, where at least two cameras may see it: nearer than their own distance.
 
     Args:
-        cameras: at least two. model: of the run. resolution: voxels along the longest side.
+        cameras: at least two. model: model of the run. resolution: voxels along the longest side.
 
     Raises:
         PolarguideError: there is no surface, or a library is missing.

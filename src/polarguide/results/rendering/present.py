@@ -64,7 +64,7 @@ def present(
     run shows at a pixel of a photograph, counted from the top left corner.
 
     Args:
-        folder: of a scene, whose runs then have it from there, or of a run.
+        folder: folder of a scene, whose runs then have it from there, or of a run.
         white_balance: ``none``, ``gray`` (the mean of the photographs becomes gray), gains of R, G and B such as
             ``1.9,1,1.6``, or VIEW,X,Y: a place in a photograph that should be white or gray.
         chart: ``none``, or VIEW,X,Y,X,Y,X,Y,X,Y: the centers of the corner patches of a 24-patch color chart, around

@@ -42,7 +42,7 @@ def write_priors(
         out: folder to write.
         run: a run trained on this scene at this size, whose normals resolve the ambiguity.
         views: ``test``, ``train``, ``all``, or names separated by commas.
-        refractive_index: of the surfaces; None: that of the scene.
+        refractive_index: refractive index of the surfaces; None: that of the scene.
         threshold: DoLP above which a pixel's normal is used.
 
     Returns:

@@ -79,7 +79,7 @@ def fit_pixels(
     Args:
         shots: linear intensities [H, W] of each shot, and whether they are saturated.
         light: Stokes vectors of the shots, [T, 3].
-        pattern: of the region.
+        pattern: pattern of the region.
     """
     moments: Any = None
     for (values, clipped), stokes in zip(shots, light, strict=True):
@@ -151,7 +151,7 @@ def shared(pixels: PixelFit, offset: tuple[int, int], block: int, pattern: Patte
 
     Args:
         pixels: the single vectors. offset: column and row of the sensor at which they start. block: side in pixels.
-        pattern: of the region.
+        pattern: pattern of the region.
 
     Returns:
         [rows, columns, P, P, 3] as in ``AnalyzerCalibration.vectors``.
@@ -203,7 +203,7 @@ def _brightness(throughput: NDArray[np.float64], pattern: Pattern) -> NDArray[np
     It is smooth, and a plane over a cell, so that a light that is not quite uniform does not look like polarization.
 
     Args:
-        throughput: [H, W]. pattern: of the region.
+        throughput: [H, W]. pattern: pattern of the region.
     """
     left, top = pattern.cell_corner()
     height, width = ((length - cut) // 2 for length, cut in zip(throughput.shape, (top, left), strict=True))

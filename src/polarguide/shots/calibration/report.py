@@ -142,7 +142,7 @@ def calibration_picture(
 
     Args:
         calibration: it. analyzers: its positions. fit: of the shots. means: of the shots by position, [T, K], and
-        pattern: of the region, to which they belong.
+        pattern: pattern of the region, to which they belong.
     """
     maps = _maps(analyzers)
     curves = _curves(calibration, analyzers, fit, means, pattern)

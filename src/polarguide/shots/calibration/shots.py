@@ -59,7 +59,7 @@ class Shots:
     """The files of a calibration.
 
     Attributes:
-        files: the shots of the polarizer, by name. pattern: of the region, from its top-left pixel.
+        files: the shots of the polarizer, by name. pattern: pattern of the region, from its top-left pixel.
     """
 
     def __init__(self, root: Path, settings: CalibrateSettings) -> None:

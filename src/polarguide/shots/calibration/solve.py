@@ -49,7 +49,7 @@ class ShotFit:
     """The shots as they were.
 
     Attributes:
-        angles: of the polarizer, radians, [T]. levels: of the light behind it, [T], their mean is 1.
+        angles: angles of the polarizer, radians, [T]. levels: levels of the light behind it, [T], their mean is 1.
         vectors: analyzer vectors of the positions, [K, 3], in the unit of the means.
         misfit: root mean square deviation of the means from the fit, as a share of their mean.
         zero: mean deviation of the positions from their nominal angles before the reference was chosen, radians.
@@ -81,12 +81,12 @@ def solve_shots(
     """Estimate the shots.
 
     Args:
-        means: of each shot by position, [T, K]. nominal: angles of the positions by their names, radians, [K].
+        means: means of each shot by position, [T, K]. nominal: angles of the positions by their names, radians, [K].
         known: angles of the polarizer, radians, [T]; None to estimate them.
         flat: means of the flat field, [K], or None.
-        diattenuation: of the polarizer, (E - 1) / (E + 1) for the extinction ratio E.
+        diattenuation: diattenuation of the polarizer, (E - 1) / (E + 1) for the extinction ratio E.
         to_mean: whether the mean deviation of the positions from their nominal angles is the zero of all angles.
-        files: of the shots, for messages.
+        files: files of the shots, for messages.
 
     Raises:
         PolarguideError: the shots are not of a polarizer, not at different angles, contradict the angles given, ...

@@ -25,7 +25,7 @@ class Field:
 
     Attributes:
         key: its name.
-        unit: of its numbers; empty where it has none.
+        unit: unit of its numbers; empty where it has none.
         about: what it says.
         bounded: whether a limits file may bound it.
     """

@@ -193,7 +193,7 @@ class Outcome:
     """The outcome of a command.
 
     Attributes:
-        folder: of the table; None where nothing was written.
+        folder: folder of the table; None where nothing was written.
         counts: shots by status. Of ``measure_shots`` these are all it was given, those included that were in the table
             before; of ``watch_folder`` those that came while it watched.
         earlier: how many were in the table before; 0 of ``watch_folder``.

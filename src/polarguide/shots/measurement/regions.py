@@ -40,8 +40,8 @@ class Region:
     """A rectangle of pixels, its top-left corner included, ``x + width`` and ``y + height`` not; or a polygon in it.
 
     Attributes:
-        name, x, y, width, height: of the rectangle.
-        corners: of the polygon, relative to the rectangle's top-left corner; none: the rectangle itself.
+        name, x, y, width, height: those of the rectangle.
+        corners: corners of the polygon, relative to the rectangle's top-left corner; none: the rectangle itself.
     """
 
     name: str

@@ -75,7 +75,7 @@ class Charted:
 
     Attributes:
         mesh: with colors of the diffuse layer. inside: what belongs to it. voxel: side of those it was fused in.
-        unwrapped: the mesh, split along the borders of charts. texels: of the texture.
+        unwrapped: the mesh, split along the borders of charts. texels: places of the texture's texels.
     """
 
     mesh: ColoredMesh
@@ -98,7 +98,7 @@ def charted_subject(
 
     Args:
         run: of Gaussians; its scene is read. surface_view: renders a view of what lies in the crop box.
-        presentation: how it is presented. options: of the model. resolution: voxels along its longest side.
+        presentation: how it is presented. options: options of the model. resolution: voxels along its longest side.
         folder: for temporary files. reporter: receives progress, counts and warnings.
 
     Raises:
@@ -130,7 +130,7 @@ def textured_model(
 
     Args:
         run: of Gaussians; its scene is read. subject: its surface. presentation, placement: how it is presented.
-        options: of the model. reporter: receives progress and counts.
+        options: options of the model. reporter: receives progress and counts.
     """
     mesh, unwrapped, texels = subject.mesh, subject.unwrapped, subject.texels
     kind = options.resolved_base_color
