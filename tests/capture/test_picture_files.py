@@ -258,7 +258,7 @@ PICTURES: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
     ),
     "another depth": (
         other_picture(lambda capture: capture.linear["v003"][3], bits=8),
-        Fault("v003_135.png", found="12x10 with 8 bits", remedy="Export the pictures of a view alike"),
+        Fault("v003_135.png", found="12x10 with 8 bits", remedy="Export all pictures of a view"),
     ),
     "another size than its camera": (
         lambda capture: capture.write_view("v003", ideal_intensities(0, height=8, width=12)),

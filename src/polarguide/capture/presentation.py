@@ -225,8 +225,8 @@ def write_presentation(folder: Path, presentation: Presentation) -> Path:
     return path
 
 
-def parse_length(text: str, where: str = "distance") -> float:
-    """Meters of a length such as ``85mm``, ``8.5 cm``, ``0.085``; ``where`` is for messages.
+def parse_length(text: str) -> float:
+    """Meters of a length such as ``85mm``, ``8.5 cm``, ``0.085``.
 
     Raises:
         PolarguideError: the text is not a length.
@@ -236,7 +236,7 @@ def parse_length(text: str, where: str = "distance") -> float:
     meters = float(match[1]) * unit if match and unit else math.nan
     if not 0 < meters <= MOST_METERS:
         raise PolarguideError(
-            where,
+            "distance",
             expected=f"a length above 0 such as 85mm (units: {', '.join(LENGTHS)}; m without one)",
             found=repr(text),
             remedy="Give a number above 0 and its unit.",

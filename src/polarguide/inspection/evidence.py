@@ -100,18 +100,15 @@ class SurfaceSamples:
         return self.dolp > most + 2 * self.noise
 
 
-def sample_surfaces(
-    pairs: Iterable[tuple[InspectedView, Surface]], pairing: int = 0, seed: int = 0
-) -> SurfaceSamples:
+def sample_surfaces(pairs: Iterable[tuple[InspectedView, Surface]], pairing: int = 0) -> SurfaceSamples:
     """Sample pixels with a reliable normal and significant polarization, at most 400 per view.
 
     Args:
         pairs: views and their surfaces, whose maps may be smaller than the pictures.
         pairing: the pairs of perpendicular pictures, an index into ``PAIRINGS``.
-        seed: seed of the random sampling.
     """
     order = [PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     samples: list[Tensor] = []
     for view, surface in pairs:
         size = surface.known.shape

@@ -55,13 +55,13 @@ class _Angle:
     residual: float
 
 
-def chosen_pixels(samples: SetSamples, most: int = _PIXELS) -> tuple[NDArray[Any], NDArray[Any]]:
+def chosen_pixels(samples: SetSamples) -> tuple[NDArray[Any], NDArray[Any]]:
     """Rows and columns of pixels that are good in every picture, spread over the picture."""
     good = ~(samples.dark | samples.masked)
     for lost in samples.lost:
         good &= ~lost
     places = np.flatnonzero(good)
-    places = places[:: max(1, len(places) // most)]
+    places = places[:: max(1, len(places) // _PIXELS)]
     return np.unravel_index(places, good.shape)  # type: ignore[return-value]
 
 

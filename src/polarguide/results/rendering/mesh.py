@@ -120,12 +120,15 @@ def fuse(box: Box, views: Iterable[tuple[Camera, Tensor, Tensor]]) -> tuple[Tens
     return total / weight.clamp(min=1), weight
 
 
-def surface_of(box: Box, field: Tensor, weight: Tensor, *, least: int = 2, smallest: float = 0.01) -> Surface:
+LEAST_VIEWS, SMALLEST_PIECE = 2, 0.01
+"""Views that must have seen a voxel. Pieces with fewer faces than this share of the largest are dropped."""
+
+
+def surface_of(box: Box, field: Tensor, weight: Tensor) -> Surface:
     """The zero set where enough views looked, without small loose pieces (marching cubes, Lewiner et al. 2003).
 
     Args:
-        field, weight: as of ``fuse``. least: views that must have seen a voxel.
-        smallest: pieces with fewer faces than this share of the largest are dropped.
+        field, weight: as of ``fuse``.
 
     Raises:
         PolarguideError: scikit-image is not installed, or there is no surface.
@@ -133,7 +136,7 @@ def surface_of(box: Box, field: Tensor, weight: Tensor, *, least: int = 2, small
     marching_cubes: Callable[..., tuple[NDArray, NDArray, NDArray, NDArray]] = optional_import(
         "skimage.measure", "a mesh"
     ).marching_cubes
-    certain = (weight >= least).numpy()
+    certain = (weight >= LEAST_VIEWS).numpy()
     try:
         # Its normals point to smaller values, into the surface; with "descent" its faces turn outward.
         vertices, faces, inward, _ = marching_cubes(
@@ -144,7 +147,7 @@ def surface_of(box: Box, field: Tensor, weight: Tensor, *, least: int = 2, small
             "mesh", expected="a surface that several views see", found="none", remedy="Train for more steps."
         ) from None
     world = vertices.astype(np.float64) * box.size + box.low.numpy() + 0.5 * box.size
-    return largest_pieces(Surface(world, faces.astype(np.int64), -inward.astype(np.float64)), smallest)
+    return largest_pieces(Surface(world, faces.astype(np.int64), -inward.astype(np.float64)), SMALLEST_PIECE)
 
 
 def largest_pieces(surface: Surface, smallest: float) -> Surface:

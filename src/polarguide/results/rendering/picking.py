@@ -119,11 +119,11 @@ def gains_of(color: Tensor, where: str = "white_balance") -> Vector:
     return gains[0], 1.0, gains[2]
 
 
-def gray_world(views: Iterable[View], where: str = "white_balance") -> Vector:
+def gray_world(views: Iterable[View]) -> Vector:
     """Gains after which the photographs' mean is gray (Buchsbaum 1980), over valid pixels; green stays.
 
     Raises:
-        PolarguideError: there are no such pixels, or all are black; ``where`` names the option.
+        PolarguideError: there are no such pixels, or all are black.
     """
     total, count = torch.zeros(3, dtype=torch.float64), 0
     for view in views:
@@ -132,4 +132,4 @@ def gray_world(views: Iterable[View], where: str = "white_balance") -> Vector:
         count += int(valid.sum())
     mean = total / max(count, 1)
     # The gains do not depend on how bright the pictures are: black around an object changes nothing.
-    return gains_of(0.5 * mean / max(float(mean.max()), 1e-12), where)
+    return gains_of(0.5 * mean / max(float(mean.max()), 1e-12))

@@ -112,8 +112,8 @@ def difference_picture(differences: Differences, shot: str, reference: str) -> P
     return sheet
 
 
-def _short(name: str, most: int = 24) -> str:
-    return name if len(name) <= most else f"{name[: most - 3]}..."
+def _short(name: str) -> str:
+    return name if len(name) <= 24 else f"{name[:21]}..."
 
 
 def diverging(values: Map, most: float) -> Picture:
