@@ -179,10 +179,7 @@ class DeferredShading(ShadingModel):
         return RadianceCubemap("texels", self.radiance, self.raw_texels)
 
     def far_light(self, texels: Tensor, directions: Tensor, level: Tensor | None) -> Tensor:
-        """Radiance [P, 3] that arrives from far away along ``directions`` [P, 3].
-
-        ``level`` [P] is the mip level of the cubemap: a higher one is blurrier. None: the light is not blurred.
-        """
+        """Radiance [P, 3] from far away along directions [P, 3], read at mip levels [P]; None: not blurred."""
         if self.blend == "lerp":
             return self.radiance(cubemap_lookup(texels, directions))
         if level is None:

@@ -271,9 +271,7 @@ def develop(shot: ExposureSet, options: ShotOptions, part: Part | None = None) -
 
 
 def set_samples(shot: ExposureSet, options: ShotOptions) -> SetSamples | None:
-    """Samples of a view that was photographed at any polarizer angles, not the usual four.
-
-    None for a shot of the usual four angles or a mosaic, which ``develop`` reads.
+    """Samples of a view at any polarizer angles; None for four angles or a mosaic, which ``develop`` reads.
 
     Raises:
         PolarguideError: a file is missing, cannot be read, or does not fit the others or the options.
