@@ -134,9 +134,9 @@ def test_view_names_may_contain_underscores_and_digits(capture: TinyCapture) -> 
 def test_nothing_is_written_into_a_scene(tmp_path: Path, place: str) -> None:
     scene = tmp_path / "scene"
     (scene / "polar").mkdir(parents=True)
-    Fault(expected="a folder for what is written", found="scene").raised_by(refuse_scene, scene / place)
+    Fault(expected="an output folder", found="scene").raised_by(refuse_scene, scene / place)
     (tmp_path / "link").symlink_to(scene / place)
-    Fault("link", "a folder for what is written", "a scene").raised_by(refuse_scene, tmp_path / "link")
+    Fault("link", "an output folder", "a scene").raised_by(refuse_scene, tmp_path / "link")
     refuse_scene(tmp_path / "polar" / "new")
     refuse_scene(scene / "runs" / "mine")  # nothing is read from there
 
@@ -145,7 +145,7 @@ def test_four_folders_of_angles_are_a_scene_too(tmp_path: Path) -> None:
     for angle in ("I-00", "I-45", "I-90", "I-135"):
         (tmp_path / angle).mkdir()
     for place in (tmp_path, tmp_path / "I-45", tmp_path / "I-45" / "new"):
-        Fault(expected="a folder for what is written").raised_by(refuse_scene, place)
+        Fault(expected="an output folder").raised_by(refuse_scene, place)
 
 
 def warnings_of(capture: TinyCapture, **arguments: str) -> tuple[str, ...]:

@@ -169,7 +169,10 @@ def pose_of_another(capture: TinyCapture) -> None:
 
 NAN = struct.pack("<d", float("nan"))
 REFUSED = Fault(
-    "sparse/0", expected="a readable COLMAP model", found="pycolmap refuses", remedy="Export the model again"
+    "sparse/0",
+    expected="a readable COLMAP model",
+    found="pycolmap cannot read",
+    remedy="Export the model again",
 )
 FAULTS: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
     **{

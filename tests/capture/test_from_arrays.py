@@ -115,7 +115,11 @@ GOOD = np.full((4, 6, 8), 100, np.uint8)
         ({"pictures": [GOOD.astype(np.int64), GOOD]}, "pictures (v000)", "int64 of shape [4, 6, 8, 1]"),
         ({"pictures": [GOOD / 50, GOOD]}, "pictures (v000)", "2 to 2"),
         ({"pictures": [GOOD * np.nan, GOOD]}, "pictures (v000)", "nan to nan"),
-        ({"pictures": [GOOD, GOOD.astype(np.uint16)]}, "pictures", "8 bits in view v000 and 16 in view v001"),
+        (
+            {"pictures": [GOOD, GOOD.astype(np.uint16)]},
+            "pictures",
+            "8 bits in view v000 and 16 bits in view v001",
+        ),
         ({"pictures": []}, "pictures", "0"),
         ({"angles": (0, 45, 90)}, "angles (v000)", "3"),
         ({"angles": (0, 45, 90, "left")}, "angles (v000)", "'left'"),

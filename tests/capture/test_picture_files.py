@@ -190,7 +190,9 @@ def test_png_cut_anywhere(length: int) -> None:
 
 @given(at=st.integers(8, len(PNG) - 1), bit=st.integers(0, 7))
 def test_png_with_one_flipped_bit(at: int, bit: int) -> None:
-    bytearray(PNG)[at] ^= 1 << bit
+    data = bytearray(PNG)
+    data[at] ^= 1 << bit
+    assert find_damage(bytes(data)) is not None
 
 
 @pytest.mark.parametrize(
@@ -256,7 +258,7 @@ PICTURES: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
     ),
     "another depth": (
         other_picture(lambda capture: capture.linear["v003"][3], bits=8),
-        Fault("v003_135.png", found="12x10 with 8 bits", remedy="Export the pictures of a view alike"),
+        Fault("v003_135.png", found="12x10 with 8 bits", remedy="Export all pictures of a view"),
     ),
     "another size than its camera": (
         lambda capture: capture.write_view("v003", ideal_intensities(0, height=8, width=12)),
@@ -264,7 +266,7 @@ PICTURES: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
     ),
     "a view of another depth": (
         lambda capture: capture.write_view("v003", capture.linear["v003"], bits=8),
-        Fault(expected="one number of bits for all views", found="8 bits in view v003 and 16 in view v000"),
+        Fault(expected="the same bit depth in all views", found="8 bits in view v003 and 16 bits in view v000"),
     ),
 }  # fmt: skip
 

@@ -324,6 +324,6 @@ def test_three_and_none_hold_what_four_measured() -> None:
 
 
 def test_it_takes_four_pictures() -> None:
-    Fault(expected="0, 45, 90 and 135 degrees of every view").raised_by(
+    Fault(expected="0, 45, 90 and 135 degrees").raised_by(
         select_exposures, select_exposures(SCENE, "one"), "two"
     )

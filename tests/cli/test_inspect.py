@@ -76,7 +76,7 @@ def test_a_capture_without_poses(unposed: Path, tmp_path: Path, capsys: pytest.C
     tags.feed(page)
     assert tags.open == []
     kinds = [tag for tag, _ in tags.found]
-    assert kinds.count("img") == 3 * len(LAYERS)
+    assert kinds.count("img") == 3 * len(LAYERS) + 1, "and the wheel"
     assert "script" not in kinds
     assert "<i>ü" not in page
     assert "scene <b>" not in page

@@ -81,7 +81,7 @@ def test_a_long_rendering_is_announced_and_asked_for_before_there_is_a_folder(
         started.append(out)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("polarguide.synth.settings._missing_llvm", lambda: "none was found")
+    monkeypatch.setattr("polarguide.synth.settings.missing_llvm", lambda: "none was found")
     monkeypatch.setattr("polarguide.synth.render.build_scene", build)
     monkeypatch.setattr("sys.stdin", Keyboard(typed) if terminal else io.StringIO(typed))
     monkeypatch.setattr("polarguide.cli.console.console._force_terminal", terminal)

@@ -110,7 +110,7 @@ def test_scenes_are_rendered_once_and_compared(
     assert options["settings"] == bench.training
     assert options["seeds_of"] == {"3dgs": 1, "3dgs-dr": 2}
     assert options["options"].seeds == 2
-    assert options["asked"] == f"polarguide bench --out {rendered}"
+    assert options["command_line"] == f"polarguide bench --out {rendered}"
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
     for scene in scenes:
         assert f"{scene}   SHA-256 of its checksums.txt: {scene_digest(scene)}" in heard.said
@@ -125,7 +125,7 @@ def test_the_held_back_half_has_a_folder_of_its_own(
     assert [path.name for path in (tmp_path / "scenes").glob("*/")] == ["secret"]
     ((scenes, _, out), options) = compared[0]
     assert (scenes, out) == ([tmp_path / "scenes" / "secret"], tmp_path / "held-back")
-    assert options["asked"].endswith("--held-back")
+    assert options["command_line"].endswith("--held-back")
 
 
 def test_a_part_of_a_half() -> None:
@@ -148,13 +148,13 @@ def test_a_rendering_that_was_stopped_goes_on(
             raise KeyboardInterrupt
         render(job, number)
 
-    render = renderer._render_view
-    monkeypatch.setattr(renderer, "_render_view", stopped)
+    render = renderer.render_view
+    monkeypatch.setattr(renderer, "render_view", stopped)
     with pytest.raises(KeyboardInterrupt):
         run_bench(tmp_path, RENDER, bench=bench)
     first = tmp_path / "scenes" / "one" / "scene.json"
     stamp = first.stat().st_mtime_ns
-    monkeypatch.setattr(renderer, "_render_view", render)
+    monkeypatch.setattr(renderer, "render_view", render)
     run_bench(tmp_path, RENDER, bench=bench)
     assert first.stat().st_mtime_ns == stamp
     for name in ("one", "two"):
@@ -217,7 +217,7 @@ def test_a_folder_of_something_else_is_refused(bench: Bench, tmp_path: Path) -> 
 def test_a_scene_is_no_place_for_the_bench_or_a_comparison(bench: Bench, tmp_path: Path) -> None:
     (tmp_path / "polar").mkdir()
     for place in (tmp_path, tmp_path / "polar" / "new"):
-        refused = Fault(str(place), "a folder for what is written", "scene")
+        refused = Fault(str(place), "an output folder", "scene")
         refused.raised_by(run_bench, place, RENDER, bench=bench)
         refused.raised_by(polarguide.compare, [tmp_path], ["3dgs"], place)
     Fault("results.json").raised_by(join_tables, [tmp_path], tmp_path)

@@ -294,7 +294,7 @@ def test_a_task_survives_its_way(tmp_path: Path) -> None:
         ({"type": "dance"}, "task"),
         ({"scene": "no-such-scene"}, "no-such-scene: expected"),
         ({"recipe": "magic"}, "recipe: expected one of"),
-        ({}, "worker: expected the code of the command (digest other)"),
+        ({}, "worker: expected the same code as the command that uses this worker (digest other)"),
     ],
 )
 def test_a_wrong_task_is_refused_in_one_line(

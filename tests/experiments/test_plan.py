@@ -147,7 +147,7 @@ def test_the_command_in_the_record_asks_for_the_same() -> None:
         "polarguide compare 'my cup' --recipes 3dgs polarguide:without-normals --steps 40"
     )
     assert "--exposures" not in command
-    assert asked(asked="polarguide bench --out x").command == "polarguide bench --out x"
+    assert asked(command_line="polarguide bench --out x").command == "polarguide bench --out x"
 
 
 @pytest.fixture

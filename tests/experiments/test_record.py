@@ -42,7 +42,7 @@ def test_what_is_written_passes(tmp_path: Path) -> None:
         (("settings", "against"), "c", "settings.against", "one of a"),
         (("settings",), [3], "settings", "a JSON object {...}"),
         (("scenes",), [], "scenes", "a list"),
-        (("scenes", 1, "name"), "x", "scenes", "every name once"),
+        (("scenes", 1, "name"), "x", "scenes", "no name more than once"),
         (("recipes", 0, "data"), [], "recipes[0].data", "a JSON object {...}"),
         (("runs", 0, "seed"), -1, "runs[0].seed", "0 or more"),
         (("scenes", 0, "views"), -6, "scenes[0].views", "0 or more"),
@@ -195,7 +195,7 @@ def test_files_and_that_a_part_is_not_written_over(tmp_path: Path) -> None:
     }
     assert "Pictures are in the reports of the parts." in (tmp_path / "all" / "report.html").read_text()
     before = (y / "results.json").read_bytes()
-    Fault(expected="a folder of its own").raised_by(join_tables, [x, y], y)
+    Fault(expected="a folder that is none").raised_by(join_tables, [x, y], y)
     assert (y / "results.json").read_bytes() == before
 
 

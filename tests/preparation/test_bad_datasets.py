@@ -110,7 +110,7 @@ CELLS: dict[str, tuple[str, Callable[[Path], object], Fault]] = {
     "pandora: objects": (
         "pandora", npz("cameras.npz", world_mat_0=np.array([{}], dtype=object)), Fault(found="a damaged one")
     ),
-    "pandora: zip bomb": ("pandora", inflate, Fault(found="unfolds to 200000000 bytes")),
+    "pandora: zip bomb": ("pandora", inflate, Fault(found="decompresses to 200000000 bytes")),
     "pandora: no cameras": (
         "pandora", lambda d: (d / "cameras.npz").unlink(),
         Fault("cameras.npz", expected="a readable file")

@@ -180,8 +180,8 @@ COLMAP: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "points that go on for ever": ("points3D.bin", patched(0, "<Q", 1 << 62), "too short for"),
     "a track that goes on for ever": ("points3D.bin", patched(51, "<Q", 1 << 60), "too short for"),
     "a picture of no size": ("cameras.bin", patched(16, "<QQ", 0, 0), "a camera of 0x0 pixels"),
-    "another camera": ("images.bin", patched(72, "<I", 9), "COLMAP|refuses"),
-    "an unknown model": ("cameras.bin", patched(12, "<i", 99), "refuses"),
+    "another camera": ("images.bin", patched(72, "<I", 9), "COLMAP|cannot read"),
+    "an unknown model": ("cameras.bin", patched(12, "<i", 99), "cannot read"),
     "a nan pose": ("images.bin", patched(12, "<d", float("nan")), "an image whose pose is not finite"),
     "an infinite place": ("images.bin", patched(44, "<d", float("inf")), "an image whose pose is not finite"),
     "a zero quaternion": ("images.bin", patched(12, "<d", 0.0), "a quaternion of length 1, found one of length 0"),
@@ -197,20 +197,20 @@ COLMAP: dict[str, tuple[str, Callable[[Path], None], str]] = {
 TEXT: dict[str, tuple[str, str, str]] = {
     "no words": ("cameras.txt", "", "cameras.txt: .*an empty file"),
     "no images": ("images.txt", "", "images.txt: .*an empty file"),
-    "other words": ("cameras.txt", "hello there\n", "COLMAP model|images called|finite|refuses"),
-    "an unknown model": ("cameras.txt", "1 HOLE 64 48 80 82 32 24\n", "refuses"),
-    "parameters too few": ("cameras.txt", "1 PINHOLE 64 48 80 82\n", "COLMAP model|refuses|finite"),
+    "other words": ("cameras.txt", "hello there\n", "COLMAP model|images called|finite|cannot read"),
+    "an unknown model": ("cameras.txt", "1 HOLE 64 48 80 82 32 24\n", "cannot read"),
+    "parameters too few": ("cameras.txt", "1 PINHOLE 64 48 80 82\n", "COLMAP model|cannot read|finite"),
     "no size": ("cameras.txt", "1 PINHOLE 0 0 80 82 32 24\n", "expected the size of the pictures, 32x24.* found 0x0"),
-    "negative size": ("cameras.txt", "1 PINHOLE -64 -48 80 82 32 24\n", "expected the size|refuses|positive"),
-    "words for numbers": ("images.txt", "1 one 0 0 0 0 0 2 1 v000.png\n\n", "refuses|finite|images called"),
-    "a line cut short": ("images.txt", "1 1 0 0 0 0 0\n\n", "refuses|images called|COLMAP model"),
-    "another camera": ("images.txt", "1 1 0 0 0 0 0 2 7 v000.png\n\n", "refuses"),
+    "negative size": ("cameras.txt", "1 PINHOLE -64 -48 80 82 32 24\n", "expected the size|cannot read|positive"),
+    "words for numbers": ("images.txt", "1 one 0 0 0 0 0 2 1 v000.png\n\n", "cannot read|finite|images called"),
+    "a line cut short": ("images.txt", "1 1 0 0 0 0 0\n\n", "cannot read|images called|COLMAP model"),
+    "another camera": ("images.txt", "1 1 0 0 0 0 0 2 7 v000.png\n\n", "cannot read"),
     "two of a name": (
         "images.txt", "1 1 0 0 0 0 0 2 1 a/v000.png\n\n2 1 0 0 0 0 0 2 1 b/v000.jpg\n\n", "one image called v000"
     ),
     "strangers": ("images.txt", "1 1 0 0 0 0 0 2 1 other.png\n\n", "expected images named like the views"),
-    "a nan pose": ("images.txt", "1 nan 0 0 0 0 0 2 1 v000.png\n\n", "expected a pose and a lens of|refuses"),
-    "an infinite place": ("images.txt", "1 1 0 0 0 inf 0 2 1 v000.png\n\n", "expected a pose and a lens of|refuses"),
+    "a nan pose": ("images.txt", "1 nan 0 0 0 0 0 2 1 v000.png\n\n", "a pose and a lens of|cannot read"),
+    "an infinite place": ("images.txt", "1 1 0 0 0 inf 0 2 1 v000.png\n\n", "a pose and a lens of|cannot read"),
 }  # fmt: skip
 
 

@@ -399,9 +399,9 @@ def refused(root: Path, settings: PrepareSettings, fault: Fault) -> None:
         (
             ("IMG_1.jpg", "IMG_2.jpg"),
             {"angles": "0,60,120"},
-            Fault(expected="a multiple of 3 photographs", found="2"),
+            Fault(expected="divisible by 3", found="2"),
         ),
-        (("IMG_1.jpg", "IMG_2.jpg"), {"angles": "0,left"}, Fault("--angles", expected="unknown, none")),
+        (("IMG_1.jpg", "IMG_2.jpg"), {"angles": "0,left"}, Fault("--angles", expected="'unknown', 'none'")),
         (("IMG_1.jpg", "IMG_2.jpg"), {"angles": "there.csv"}, Fault("there.csv", expected="a readable file")),
         (("a_a30.jpg",), {"poses": "sfm"}, Fault(expected="at least 3 views")),
         (

@@ -27,6 +27,9 @@ SAME = "it is the same content in another form"
 UNUSED = "what is wrong with it is not read"
 PLAUSIBLE = "the number that changed is as plausible as the one before"
 A_NAME = "a name may be any that the disk takes"
+OPTIONAL = "the field may be missing, and is not relied on"
+CHECKED = "the chunk or the bytes that changed are not read, such as those behind the end of the picture"
+REPLACED = "a link is replaced, and what it led to stays"
 OF_FILES = ("folder", "pipe", "device", "loop", "dangling", "outside")
 PLACES: dict[str, Callable[[Path], object]] = {
     "file": lambda path: path.write_text("no folder"),

@@ -17,7 +17,7 @@ import numpy as np
 from base import MEASURE, MOSAIC, ONE, WATCH, into
 from case import Case, table
 from changes import (
-    beside, copy, edit_bytes, no_formula, put, remove, rename, several, text_forms, write, write_json,
+    REPLACED, beside, copy, edit_bytes, no_formula, put, remove, rename, several, text_forms, write, write_json,
 )  # fmt: skip
 
 CASES: list[Case] = []
@@ -147,7 +147,7 @@ CASES += table(
     )),
     *(Case(name, several(_measured, change), passes=reason, ci=ci) for name, change, reason, ci in (
         ("with other options", write("new/measure.json", '{"format": 1}\n'), "", True),
-        ("whose CSV is a link outside", put("new/table.csv", "outside"), "a link is replaced", False),
+        ("whose CSV is a link outside", put("new/table.csv", "outside"), REPLACED, False),
         ("whose lines are a link outside", put(LINES, "outside"), "", True),
         ("whose lines are a pipe", put(LINES, "pipe"), "", True),
         ("whose lock is a link outside", put("new/.lock", "outside"), "", False),

@@ -13,12 +13,11 @@ import numpy as np
 import spoil
 from base import HEIGHT, INSPECT, MASK, PICTURE, READ, TRAIN, WIDTH
 from case import Case, Change, table
-from changes import OF_FILES, SAME, UNUSED, chunk, copy, drawn, edit_bytes, instead, put, several
-from scenes import NAMES
+from changes import CHECKED, OF_FILES, SAME, UNUSED, chunk, copy, drawn, edit_bytes, instead, put, several
+from tiny_capture import NAMES
 
 CASES: list[Case] = []
 
-CHECKED = "the chunk or the bytes that changed are not read, such as those behind the end of the picture"
 ANGLES = ("000", "045", "090", "135")
 COLOR = np.full((HEIGHT, WIDTH, 3), 9000, np.uint16)
 DARK = np.zeros((HEIGHT, WIDTH), np.uint8)

@@ -6,26 +6,13 @@ import os
 from pathlib import Path
 
 from base import (
-    CHECKPOINT,
-    COMPARE,
-    EVAL,
-    FLAGS,
-    INSPECT,
-    MOSAIC,
-    MOSAICS,
-    ONE,
-    READ,
-    RENDER,
-    RESUME,
-    SHARE,
-    TRAIN,
-)
-from base import export, into, of, posed
+    CHECKPOINT, COMPARE, EVAL, FLAGS, INSPECT, MOSAIC, MOSAICS, ONE, READ, RENDER, RESUME, SHARE, TRAIN,
+    export, into, of, posed,
+)  # fmt: skip
 from case import Case, nothing, table
-from changes import OUTSIDE, SAME, deferred, link, put, several, write
+from changes import OUTSIDE, REPLACED, SAME, deferred, link, put, several, write
 
 CASES: list[Case] = []
-REPLACED = "a link is replaced, and what it led to stays"
 FILM = f"render run --path orbit --frames 2 --layers final {ONE}"
 MAPS = f"priors shots --out new --no-align --formats npy {ONE}"
 UNFINISHED = into("unfinished", MOSAICS)

@@ -16,12 +16,11 @@ import spoil
 from base import INSPECT, MAPS, MEASURE, MOSAIC, MOSAICS, READ, SHOTS, into, of, posed
 from case import Case, Change, nothing, table
 from changes import (
-    A_NAME, OF_FILES, PLAUSIBLE, copy, deferred, drawn, edit, instead, memory, put, remove, rename, several,
-    small_machine, sparse, text_forms, write,
+    A_NAME, CHECKED, OF_FILES, PLAUSIBLE, copy, deferred, drawn, edit, instead, memory, put, remove, rename,
+    several, small_machine, sparse, text_forms, write,
 )  # fmt: skip
 
 CASES: list[Case] = []
-CHECKED = "the chunk or the bytes that changed are not read, such as those behind the end of the picture"
 FORM = "it is the same picture in another form"
 NOISE, SIZES = "any picture may be noise", "mosaics may differ in size"
 SHOT = "shots/45/v001.png"

@@ -10,7 +10,8 @@ from typing import Any
 from base import INSPECT, ONE, SHARE, export
 from case import Case, Change, table
 from changes import (
-    A_NAME, OUTSIDE, deferred, link, no_formula, no_script, put, several, text_forms, write, write_json,
+    A_NAME, OUTSIDE, REPLACED, deferred, link, no_formula, no_script, put, several, text_forms, write,
+    write_json,
 )  # fmt: skip
 from comparison_records import content, run
 
@@ -35,6 +36,8 @@ CASES += table(
         ("of a box with nothing in it, shared", AWAY, SHARE, False),
     )),
     Case("with scripts, shared", write_json(PRESENTED, SCRIPTS), passes=ESCAPED, check=no_script, ci=True),
+    Case("with scripts as options, shared", more=["--title", SCRIPT, "--caption", SCRIPT], passes=ESCAPED,
+         check=no_script, ci=True),
     Case("with scripts, inspected", write_json("scene/presentation.json", SCRIPTS), INSPECT, passes=ESCAPED,
          check=no_script),
     Case("with a key twice", write(PRESENTED, '{"title": "a", "title": "b"}'), export("ply"),
@@ -88,7 +91,7 @@ CASES += table(
     Case("of an unknown format", _record(lambda record: record.update(format="polarguide-results-99")), ci=True),
     Case("into their own folder", _record(), "tables a --out a", passes="the record of one part is the same again"),
     Case("of two into the folder of one", OTHER, "tables a b --out a", ci=True),
-    Case("into links", LINKS, passes="a link is replaced, and what it led to stays", ci=True),
+    Case("into links", LINKS, passes=REPLACED, ci=True),
     Case("of NaN", _record(lambda record: record["runs"][0]["metrics"].update(psnr=float("nan"))), ci=True),
     Case("of a seed of 10^30", _run(seed=10**30), passes="a seed is a name"),
     Case("of a run twice", _record(lambda record: record["runs"].append(record["runs"][0])), ci=True),

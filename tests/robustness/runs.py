@@ -13,14 +13,13 @@ import spoil
 from base import CHECKPOINT, EVAL, FLAGS, PICTURE, RENDER, RESUME, SHARE, export
 from case import Case, Change, nothing, table
 from changes import (
-    OF_FILES, PLAUSIBLE, UNUSED, copy, edit, field, filled, put, remove, several, small_machine,
+    OF_FILES, OPTIONAL, PLAUSIBLE, UNUSED, copy, edit, field, filled, put, remove, several, small_machine,
     sparse, tensors, write, write_json,
 )  # fmt: skip
 
 CASES: list[Case] = []
 
 COMPUTED = "it is written anew from the run, and never read"
-OPTIONAL = "the field may be missing, and is not relied on"
 DROPPED = "lines that are none are dropped"
 EXTREME = "values in range are rendered as they are"
 RECORD, LOG = "run/run.json", "run/log.jsonl"

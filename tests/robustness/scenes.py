@@ -11,15 +11,14 @@ import spoil
 from base import EVAL, INSPECT, PICTURE, READ, TRAIN, of
 from case import Case, Change, table
 from changes import (
-    A_NAME, OF_FILES, PLAUSIBLE, UNUSED, copy, deferred, field, put, several, sparse, truth, write,
+    A_NAME, OF_FILES, OPTIONAL, PLAUSIBLE, UNUSED, copy, deferred, field, put, several, sparse, truth, write,
     write_json,
 )  # fmt: skip
+from tiny_capture import NAMES
 
 CASES: list[Case] = []
 
-OPTIONAL = "the field may be missing, and is not relied on"
 TWICE = "a view may be named twice"
-NAMES = [f"v{number:03d}" for number in range(9)]
 SCENE, SPLIT = "scene/scene.json", "scene/split.json"
 KEYS = {"scene.json": b'"refractive_index": 1.5', "split.json": b'"test": ["v000"]'}
 

@@ -11,11 +11,10 @@ import numpy as np
 import spoil
 from base import EVAL, HEIGHT, READ, TRUTH, WIDTH
 from case import Case, Change, table
-from changes import truth
+from changes import CHECKED, truth
 
 CASES: list[Case] = []
 
-CHECKED = "the bytes that changed are not read"
 FLAT = np.ones((HEIGHT, WIDTH), np.float32)
 LIGHT = np.ones((HEIGHT, WIDTH, 3), np.float32)
 GOOD = made.header("{'descr': '<f4', 'fortran_order': False, 'shape': (20, 24), }") + bytes(4 * 480)

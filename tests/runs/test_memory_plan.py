@@ -53,10 +53,10 @@ def test_pictures_leave_memory_before_targets_do(monkeypatch: pytest.MonkeyPatch
     plans = [plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=limit) for limit in (3.7, 5.0, 8.0, 30.0)]
     assert not plans[0].hold
     assert plans[-1] == MemoryPlan(True, None, plans[-1].peak)
-    kept = [plan.kept for plan in plans[:-1]]
+    kept = [plan.view_bytes for plan in plans[:-1]]
     assert None not in kept
     assert kept == sorted(kept, key=lambda count: count or 0)
-    assert plan_memory(SMALL, STOKES, 154_000, limit=4.0).kept is None
+    assert plan_memory(SMALL, STOKES, 154_000, limit=4.0).view_bytes is None
 
 
 def test_without_a_limit_what_is_free_counts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,7 +64,7 @@ def test_without_a_limit_what_is_free_counts(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(forecasts, "free_memory", lambda: 10**9)
     assert not plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=None).hold
     monkeypatch.setattr(forecasts, "free_memory", lambda: None)
-    assert plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=None).kept is None
+    assert plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=None).view_bytes is None
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def test_a_field_is_planned_for_by_its_numbers(monkeypatch: pytest.MonkeyPatch) 
     assert exact < learned * 1.02
     assert learned < exact * 1.1
     plan = plan_field_memory(SMALL, field, limit=4)
-    assert plan.kept is None
+    assert plan.view_bytes is None
     assert plan.peak > 400_000_000 + 4 * learned
     error = Fault("memory").raised_by(plan_field_memory, SMALL, field, limit=0.01)
     assert "Gaussians" not in str(error)
@@ -219,3 +219,12 @@ def test_other_exposures_leave_the_pictures_in_their_files(
         assert held == [hold] * len(held)
         means.append(run.gaussians["means"])
     assert torch.equal(*means)
+
+
+def test_priors_are_counted_by_step() -> None:
+    """Where the size changes they are all made once more."""
+    settings = ResolvedSettings(steps=1000, refractive_index=1.5)
+    whole = forecasts._priors_made(STOKES, settings, 10, 0)
+    halved = forecasts._priors_made(STOKES, settings, 10, 430)
+    assert sum(halved[:430]) > 0
+    assert sum(halved) == sum(whole) + 10

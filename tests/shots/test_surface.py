@@ -13,7 +13,7 @@ from faults import Fault
 import polarguide
 from polarguide import optics
 from polarguide.geometry.vectors import unit
-from polarguide.results.rendering.priors import _guide
+from polarguide.results.rendering.priors import resolving_normals
 from polarguide.shots.exposures import find_shots
 from polarguide.shots.maps import Developed, NoiseModel, ShotMaps
 from polarguide.shots.options import ShotOptions
@@ -39,7 +39,7 @@ def test_normals_are_those_of_the_scenes_priors(demo: Path) -> None:
     view = polarguide.load_scene(demo, views=[VIEW]).view(VIEW)
     rays = view.camera.rays()
     luminance = optics.luminance(optics.stokes(view.intensities()))
-    guide, _ = _guide(view, None, rays, luminance, 1.5)
+    guide, _ = resolving_normals(view, None, rays, luminance, 1.5)
     candidates = optics.physical_candidates(luminance, rays, 1.5)
     theirs = optics.disambiguate(candidates, guide, rays, azimuth_weight=0.5).normal.numpy()
     (shot,) = (s for s in find_shots([demo]) if s.view == VIEW)

@@ -119,13 +119,13 @@ def test_rendering_goes_on_to_the_same_files(
             raise KeyboardInterrupt
         render(job, opaque)
 
-    render = runner._render_view
+    render = runner.render_view
     out = tmp_path / "again"
-    monkeypatch.setattr(runner, "_render_view", stopped)
+    monkeypatch.setattr(runner, "render_view", stopped)
     with pytest.raises(KeyboardInterrupt):
         synthesize(spec, out, SETTINGS, Reporter(), threads=1)
     assert not (out / "scene.json").exists()
-    monkeypatch.setattr(runner, "_render_view", render)
+    monkeypatch.setattr(runner, "render_view", render)
     synthesize(spec, out, SETTINGS, Reporter(), threads=1)
     for name in (MANIFEST, "scene.json"):
         assert (scene / name).read_text() == (out / name).read_text()
@@ -222,7 +222,7 @@ def test_members_of_a_sweep_sort_like_their_numbers(
 
 
 def test_without_llvm_the_scalar_variant_is_taken(variant: Variant, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("polarguide.synth.settings._missing_llvm", lambda: "none was found")
+    monkeypatch.setattr("polarguide.synth.settings.missing_llvm", lambda: "none was found")
     try:
         found = choose_variant("rgb")
         assert found.note

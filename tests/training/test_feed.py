@@ -12,7 +12,6 @@ from trainings import different, make_trainer, run, trained
 from polarguide.capture import Scene
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
-from polarguide.runs.forecast import _priors_made
 from polarguide.training import feed
 from polarguide.training.feed import (
     Entry,
@@ -28,7 +27,6 @@ from polarguide.training.feed import (
 )
 from polarguide.training.priors import view_priors
 from polarguide.training.recipe import Coarse, Recipe, Weights
-from polarguide.training.settings import ResolvedSettings
 from polarguide.training.targets import StepTargets
 
 STEPS, STOP = 24, 13
@@ -184,10 +182,10 @@ def test_what_was_kept_of_smaller_pictures_goes(tiny_scene: Scene) -> None:
     store = ViewStore()
     trainer = make_trainer(tiny_scene, HALVED, ALL_STEPS, store=store)
     run(trainer, ALL_STEPS // 2)
-    kinds = {kind for kind, _ in store._held}
+    kinds = {kind for kind, _ in store._entries}
     assert {"small photograph", "small priors"} <= kinds
     run(trainer)
-    kinds = {kind for kind, _ in store._held}
+    kinds = {kind for kind, _ in store._entries}
     assert not any(kind.startswith("small") for kind in kinds)
     assert {"photograph", "priors"} <= kinds
 
@@ -210,12 +208,3 @@ def test_small_pictures_are_looked_at_whole(tiny_scene: Scene) -> None:
     assert coarse_steps(STOKES, tiny_scene.train_views, 5000) == 0
     assert coarse_steps(HALVED, tiny_scene.train_views, 5000) == 2500
     assert different(trained(tiny_scene, STOKES, ALL_STEPS), trained(tiny_scene, NEVER, ALL_STEPS)) == []
-
-
-def test_priors_are_counted_by_step() -> None:
-    """Where the size changes they are all made once more."""
-    settings = ResolvedSettings(steps=1000, refractive_index=1.5)
-    whole = _priors_made(STOKES, settings, 10, 0)
-    halved = _priors_made(STOKES, settings, 10, 430)
-    assert sum(halved[:430]) > 0
-    assert sum(halved) == sum(whole) + 10

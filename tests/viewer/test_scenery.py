@@ -224,7 +224,7 @@ def test_gaussians_are_drawn_with_the_blur_of_their_training() -> None:
     sizes = footprints(plain.gaussians["means"].detach(), [camera.downscaled(3)])
     smooth = replace(plain, footprints=sizes)
     for kept in (None, lambda means: means[:, 0] > 0):
-        pictures = [seen.render(camera, depth=False, kept=kept).alpha for seen in (plain, smooth)]
+        pictures = [seen.render(camera, depth=False, within=kept).alpha for seen in (plain, smooth)]
         assert float((pictures[1] - pictures[0]).max()) > 0.05
 
 

@@ -59,7 +59,7 @@ def priors(
         scene: a scene with poses, or its folder, which is read as ``reading`` says.
         out: folder to write.
         run, views, threshold: as ``results.rendering.priors.write_priors`` takes them.
-        refractive_index: of the surfaces; None: as ``scene.json`` says, else 1.5.
+        refractive_index: refractive index of the surfaces; None: as ``scene.json`` says, else 1.5.
         formats: of maps as ``shot_priors`` writes them, a folder for each view: png, exr, npy, page.
         shots: ``full_well``, ``read_noise`` and ``snr`` for the maps.
 

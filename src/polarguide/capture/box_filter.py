@@ -29,7 +29,7 @@ def mean(values: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
 
 
 def maximum(values: NDArray[Any], factor: int) -> NDArray[Any]:
-    """The largest value of each box, of [H, W]; for bool: whether any is True."""
+    """Maximum over each box of ``factor`` x ``factor`` pixels of an array [H, W]; of booleans, whether any is True."""
     return functools.reduce(np.maximum, _strided(values, factor)).copy()
 
 

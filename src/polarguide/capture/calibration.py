@@ -88,7 +88,7 @@ def checked(calibration: Calibration, where: object) -> Calibration:
             f"{where} (order)",
             expected="0, 45, 90 and 135, each once",
             found=str(calibration.order),
-            remedy="Correct the value.",
+            remedy="List the four angles in the order of the pictures.",
         )
     return calibration
 

@@ -46,7 +46,7 @@ class Measures:
         bright: 99th percentile of the linear intensities, in [0, 1].
         residuals: median of |difference of the two pair sums| / S0 for the three ways to pair the pictures:
             (0, 90 | 45, 135), (0, 45 | 90, 135), (0, 135 | 45, 90). The first is zero for an ideal capture.
-        sums: of the regression of r = (I0 + I90 - I45 - I135) / S0 on q = ((I0 - I90) / S0)^2 -
+        sums: sums of the regression of r = (I0 + I90 - I45 - I135) / S0 on q = ((I0 - I90) / S0)^2 -
             ((I45 - I135) / S0)^2: number of pixels, sums of q, r, q q, q r. Linear data have slope 0 whatever
             the gains of the four pictures; a concave encoding bends it down, a convex one up.
     """
@@ -130,7 +130,7 @@ def exposure_warnings(
     Args:
         names: view names.
         measures: figures of each view.
-        blown: of each view, the share of pixels of which a picture is at full scale.
+        blown: share, in each view, of pixels of which a picture is at full scale.
         largest: the largest value stored in any picture.
         full: the largest possible one.
     """
@@ -141,7 +141,7 @@ def exposure_warnings(
             f"The pictures are 16-bit files, yet no value exceeds {largest}: they look like unscaled {bits}-bit "
             f"data. Multiply the values by {2 ** (16 - bits)}."
         ]
-    dark = [name for name, found in zip(names, measures, strict=True) if found.bright < _DARK]
+    dark = [name for name, measure in zip(names, measures, strict=True) if measure.bright < _DARK]
     if dark:
         warnings.append(
             f"{len(dark)} of {len(names)} views are almost black: 99% of their values are under {_DARK:.0%} "
@@ -191,7 +191,7 @@ def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], tr
 
 def curvature(measures: Sequence[Measures]) -> float | None:
     """Slope of the regression described in ``Measures``, over all views; None if too few pixels are polarized."""
-    count, q, r, qq, qr = np.sum([found.sums for found in measures], axis=0)
+    count, q, r, qq, qr = np.sum([measure.sums for measure in measures], axis=0)
     if count < 1000:
         return None
     spread = qq / count - (q / count) ** 2
@@ -250,12 +250,12 @@ class MeasuredGains:
         if self.pairing != 0:
             return {}
         off = [log - shift for log, shift in zip(self.logs, stated, strict=True)]
-        found = {}
+        deviations = {}
         for place, angle in enumerate(ANGLES):
             apart = off[place] - float(np.median(off[:place] + off[place + 1 :]))
             if abs(apart) > max(OTHER_EXPOSURE, _SURE * max(self.errors)):
-                found[angle] = math.exp(apart)
-        return found
+                deviations[angle] = math.exp(apart)
+        return deviations
 
 
 def pair_moments(gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -270,11 +270,11 @@ def pair_moments(gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> 
     usable = usable & (total > 4 * _HIDDEN * float(gray.max(initial=0)))
     rows = np.where(usable, gray / np.where(usable, total, 1.0), 0.0)
     tiles = []
-    for band, kept in zip(
+    for band, mask in zip(
         np.array_split(rows, _TILES, axis=1), np.array_split(usable, _TILES, axis=0), strict=True
     ):
         for part, mine in zip(
-            np.array_split(band, _TILES, axis=2), np.array_split(kept, _TILES, axis=1), strict=True
+            np.array_split(band, _TILES, axis=2), np.array_split(mask, _TILES, axis=1), strict=True
         ):
             flat = part.reshape(4, -1)
             tiles.append(np.vstack([flat @ flat.T, [mine.sum()] * 4]))

@@ -55,12 +55,12 @@ def angle_text(angle: Angle) -> str:
 
 def angle_labels(angles: Sequence[Angle]) -> list[str]:
     """Parts of file names that identify the pictures of a view: 045, 012.5, unknown, none, unknown-2, ..."""
-    found: list[str] = []
+    labels: list[str] = []
     for angle in angles:
         label = angle if isinstance(angle, str) else _angle_digits(angle)
-        same = sum(other == label or other.startswith(f"{label}-") for other in found)
-        found.append(label if not same else f"{label}-{same + 1}")
-    return found
+        same = sum(other == label or other.startswith(f"{label}-") for other in labels)
+        labels.append(label if not same else f"{label}-{same + 1}")
+    return labels
 
 
 def _angle_digits(angle: float) -> str:
@@ -79,7 +79,7 @@ class Exposure:
     """One picture of a view.
 
     Attributes:
-        angle: of the polarizer in degrees, in [0, 180); None where there is none, or where it is not known.
+        angle: angle of the polarizer in degrees, in [0, 180); None where there is none, or where it is not known.
         filtered: whether there was a polarizer before the lens or the sensor.
         gain: by what its values have to be divided to be on the scale of the scene's other pictures.
     """
@@ -108,13 +108,13 @@ PLAIN = (Exposure(filtered=False),)
 def nominal(exposures: Sequence[Exposure]) -> Tensor:
     """Analyzers [K, 2] float64 of known exposures on the optical axis; (0, 0) of one without a filter."""
     zero = torch.zeros(1, 3, dtype=torch.float64)
-    found = [
+    cosines = [
         torch.zeros(2, dtype=torch.float64)
         if e.angle is None
         else optics.analyzer(math.radians(e.angle), zero)
         for e in exposures
     ]
-    return torch.stack(found) if found else torch.zeros(0, 2, dtype=torch.float64)
+    return torch.stack(cosines) if cosines else torch.zeros(0, 2, dtype=torch.float64)
 
 
 def analyzers(exposures: Sequence[Exposure], rays: Tensor, mount: Mount) -> Tensor:
@@ -195,10 +195,10 @@ class Line:
     """A line of the table.
 
     Attributes:
-        number: of the line, from 1.
+        number: number of the line, from 1.
         file: the picture's name: inside ``polar/`` of a scene, else relative to the folder of the photographs.
         view: pictures of one view share their pose; None for a view of its own, called like the file without suffix.
-        angle: of the polarizer.
+        angle: angle of the polarizer.
         gain: exposure relative to the other pictures; None if it is not given.
     """
 
@@ -221,8 +221,8 @@ def read_table(path: Path) -> list[Line]:
     """The lines of a table, in their order. Empty cells at the end of a line may be left out.
 
     Raises:
-        PolarguideError: it cannot be read, a column is missing or unknown, a file is listed twice, or an angle or a
-            gain is not a number; the message has the line.
+        PolarguideError: the table cannot be read, a column is missing or unknown, a file is listed twice, or an angle
+            or gain is not a number; the message has the line.
     """
     rows = read_rows(path, _REMEDY)
     columns = _header(path, rows[0][1] if rows else [])
@@ -248,7 +248,7 @@ def read_rows(path: Path, remedy: str) -> list[tuple[int, list[str]]]:
     """The rows of a CSV file that are not empty: number of the line, from 1, and cells without blanks around them.
 
     Raises:
-        PolarguideError: it cannot be read, or is no such file; ``remedy`` is for messages.
+        PolarguideError: the file cannot be read, or is no CSV file; ``remedy`` is for messages.
     """
     data = read_file(path, largest=_LARGEST_TABLE, remedy=remedy)
     try:
@@ -354,7 +354,7 @@ def angles_of_names(names: Sequence[str], *, folders: bool = False) -> list[tupl
     of a view are evenly spaced over half a turn or a whole one: 10, 40, ..., 160, or 0 to 175 by 5. ``folders``: names
     such as I_10 are angles alone, and no view I.
     """
-    found = [_stated(name, folders) for name in names]
+    stated = [_stated(name, folders) for name in names]
     numbered: dict[str, list[tuple[int, float]]] = {}
     for place, name in enumerate(names):
         match = _NUMBERED.fullmatch(name)
@@ -364,17 +364,17 @@ def angles_of_names(names: Sequence[str], *, folders: bool = False) -> list[tupl
     for view, places in numbered.items():
         if covers_turn([number for _, number in places]):
             for place, number in places:
-                if not folders or found[place] is None:
-                    found[place] = view, number
-    return found
+                if not folders or stated[place] is None:
+                    stated[place] = view, number
+    return stated
 
 
 def _stated(name: str, folder: bool) -> tuple[str, Angle] | None:
     """View and angle of a single name, of a picture or of a folder."""
-    found = None if folder else split_name(name)
-    if found is None and (alone := split_name(f"x_{name}")) is not None and alone[0] == "x":
+    parts = None if folder else split_name(name)
+    if parts is None and (alone := split_name(f"x_{name}")) is not None and alone[0] == "x":
         return "", alone[1]
-    return found
+    return parts
 
 
 def covers_turn(angles: Sequence[float]) -> bool:

@@ -35,7 +35,7 @@ def stored_pictures(pictures: Array, where: str) -> NDArray[Any]:
         pictures: [K, H, W] or [K, H, W, 3]. where: what messages call them.
 
     Raises:
-        PolarguideError: they have another shape or type, or floats outside 0 to 1.
+        PolarguideError: the pictures have another shape or type, or floats outside 0 to 1.
     """
     values = as_numpy(pictures)
     if values.ndim not in (3, 4) or 0 in values.shape or (values.ndim == 4 and values.shape[3] not in (1, 3)):
@@ -104,7 +104,7 @@ def _exposure(angle: Angle, where: str) -> Exposure:
             where,
             expected=f"angles in degrees up to {LARGEST:g}, unknown or none",
             found=repr(angle),
-            remedy="Correct the angle.",
+            remedy="Give the angle in degrees, or None where it is not known.",
         )
     return Exposure(normalized(degrees))
 

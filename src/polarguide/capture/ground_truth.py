@@ -132,7 +132,7 @@ def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor:
     """Read one ground-truth file.
 
     Args:
-        path: of the file, for messages.
+        path: path of the file, for messages.
         data: the whole file, NumPy's .npz with any of the arrays ``normal``, ``depth``, ``mask``,
             ``specular``, ``diffuse`` and ``objid``; others are ignored.
         size: height and width of the pictures as stored.
@@ -212,5 +212,5 @@ def _check(path: Path, name: str, array: NDArray[Any], size: tuple[int, int]) ->
             f"{path} ({name})",
             expected=f"finite numbers up to {_LARGEST:g}",
             found=f"{broken} of {array.size} values that are NaN, infinite or larger",
-            remedy="Write zeros where the value is unknown and exclude those pixels from the mask.",
+            remedy="Write 0 where the value is unknown or too large, and set those pixels of the mask to 0.",
         )

@@ -124,7 +124,7 @@ def refuse_scene(out: Path) -> None:
             found = f"{folder.name}/ of a scene"
     if found:
         raise PolarguideError(
-            out, expected="a folder for what is written", found=found, remedy="Give another --out."
+            out, expected="an output folder", found=found, remedy="Choose another folder with --out."
         )
 
 
@@ -195,7 +195,7 @@ def _read_flat(
                 f"{table} (line {item.number})",
                 expected="a picture in polar/",
                 found=f"none called {item.file}",
-                remedy="Correct the name, or remove the line.",
+                remedy="Correct the file's name in the table, or remove its line.",
             )
     pictures: dict[str, dict[int, Path]] = {}
     strangers = []
@@ -223,14 +223,14 @@ def _take_listed(
     for item in lines:
         views.setdefault(item.view or Path(item.file).stem, []).append((stored[item.file], item.exposure))
     others = {}
-    for view, found in views.items():
+    for view, pairs in views.items():
         named = pictures.pop(view, {})
-        found += [(path, FOUR[ANGLES.index(angle)]) for angle, path in sorted(named.items())]
-        of_four = {FOUR.index(exposure): path for path, exposure in found if exposure in FOUR}
-        if len(found) == len(of_four) == len(FOUR):
+        pairs += [(path, FOUR[ANGLES.index(angle)]) for angle, path in sorted(named.items())]
+        of_four = {FOUR.index(exposure): path for path, exposure in pairs if exposure in FOUR}
+        if len(pairs) == len(of_four) == len(FOUR):
             pictures[view] = {angle: of_four[place] for place, angle in enumerate(ANGLES)}
         else:
-            others[view] = tuple(found)
+            others[view] = tuple(pairs)
     return others
 
 
@@ -275,8 +275,8 @@ def _alike_but_for_the_angle(folders: Sequence[Path]) -> dict[int, Path]:
         for match in _NUMBER.finditer(path.name):
             around = path.name[: match.start()], path.name[match.end() :]
             sets.setdefault(around, {})[int(match[0])] = path
-    found = [of_angle for of_angle in sets.values() if set(of_angle) == set(ANGLES)]
-    return found[0] if len(found) == 1 else {}
+    complete = [of_angle for of_angle in sets.values() if set(of_angle) == set(ANGLES)]
+    return complete[0] if len(complete) == 1 else {}
 
 
 def angle_of_folder(path: Path) -> int | None:
@@ -303,7 +303,7 @@ def list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """The files of a folder with one of the suffixes, sorted; none if there is no such folder.
 
     Raises:
-        PolarguideError: it is no folder.
+        PolarguideError: ``folder`` is something else than a folder.
     """
     if not os.path.lexists(folder):
         return []
@@ -353,8 +353,8 @@ def check_memory(
         PolarguideError: the least that suffices is more.
     """
     pixels = stated_pixels(layout, names)
-    kept = sum((KEPT if hold else MASKS) * count // factor**2 for count in pixels)
-    needed = kept + sum(READ * count for count in sorted(pixels, reverse=True)[:at_once])
+    stored = sum((KEPT if hold else MASKS) * count // factor**2 for count in pixels)
+    needed = stored + sum(READ * count for count in sorted(pixels, reverse=True)[:at_once])
     remedy = "Give --downscale 2 or more, fewer views, or more --memory."
     require_memory(layout.root, needed, f"{len(names)} views", limit=limit, remedy=remedy)
 
@@ -367,7 +367,7 @@ def require_memory_of_each(paths: Sequence[Path], pixel: int, what: str, *, reme
         pixel: bytes that one of their pixels takes, at least. what, remedy: for messages.
 
     Raises:
-        PolarguideError: it does not.
+        PolarguideError: the largest file does not fit.
     """
     sizes = {path: stated_size(path) or (0, 0) for path in paths}
     if sizes:

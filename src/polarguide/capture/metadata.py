@@ -122,8 +122,8 @@ def refractive_index_of(path: Path, data: bytes) -> float | None:
     if scene.refractive_index is not None:
         return scene.refractive_index
     materials = [item.material for item in scene.objects]
-    found = {item.ior for item in materials if isinstance(item, _Material) and item.ior is not None}
-    index = found.pop() if len(found) == 1 else None
+    indices = {item.ior for item in materials if isinstance(item, _Material) and item.ior is not None}
+    index = indices.pop() if len(indices) == 1 else None
     return index if index is not None and LEAST_INDEX < index < LARGEST_INDEX else None
 
 
@@ -158,7 +158,7 @@ def mount_of(path: Path, data: bytes) -> Mount:
         path: ``scene.json``, for messages. data: its content.
 
     Raises:
-        PolarguideError: it says something else than "sensor" or "filter".
+        PolarguideError: ``polarizer`` is something else than "sensor" or "filter".
     """
     remedy = 'Write "sensor" for polarizers behind the lens, "filter" for a sheet before it.'
     return decode(data, _Polarizer, path, remedy=remedy).polarizer
@@ -179,10 +179,10 @@ def applied_calibration(path: Path, data: bytes) -> Calibration | None:
     if decode(data, _Scene, path, remedy="Prepare the scene again.").prepare is None:
         return None
     scene = decode(data, _Prepared, path, remedy="Prepare the scene again.")
-    found: Calibration | None = (scene.calibration or _Angles()).calibration()
+    calibration: Calibration | None = (scene.calibration or _Angles()).calibration()
     for correction in scene.corrections:
-        found = None if found is None else combined(found, correction.calibration())
-    return found
+        calibration = None if calibration is None else combined(calibration, correction.calibration())
+    return calibration
 
 
 Origin = Literal["mosaics", "stokes", "other"]

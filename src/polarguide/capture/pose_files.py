@@ -47,15 +47,15 @@ def read_pose_file(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, 
     if suffix == ".npz":
         return _idr(path, views, sizes)
     names = frozenset(views)
-    found = read_metashape(path, names) if suffix == ".xml" else read_transforms(path, names, sizes)
-    if not found:
+    cameras = read_metashape(path, names) if suffix == ".xml" else read_transforms(path, names, sizes)
+    if not cameras:
         raise PolarguideError(
             path,
             expected="cameras with a pose",
             found="none",
             remedy="Align the pictures and export the cameras again.",
         )
-    return found
+    return cameras
 
 
 def _idr(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, PosedCamera]:
@@ -82,13 +82,13 @@ def _idr(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, PosedCamer
             found=f"{len(cameras)} cameras, world_mat_{min(cameras)} to world_mat_{max(cameras)}",
             remedy="Number the views as the cameras are: view 7 has world_mat_7. Or leave out cameras without a view.",
         )
-    found = {}
+    posed = {}
     for view, number in chosen.items():
         inner, *pose = cameras[number]
         center = (float(inner[0, 2]), float(inner[1, 2]))
         size = settled_size(f"{path} (world_mat_{number})", sizes(view), center, in_pixels=True)
-        found[view] = pinhole_camera(size, inner, *pose)
-    return found
+        posed[view] = pinhole_camera(size, inner, *pose)
+    return posed
 
 
 _LARGEST_XML = 1 << 24
@@ -145,21 +145,21 @@ def read_metashape(path: Path, views: Collection[str]) -> dict[str, PosedCamera]
             path, f"{len(slaves)} cameras of a rig without a pose of their own, which are left out ({labels})"
         )
     sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
-    found: dict[str, PosedCamera] = {}
+    world_cameras: dict[str, PosedCamera] = {}
     for camera in posed:
         label = camera.get("label") or ""
         where, view = f"{path} (camera {label})", view_of_name(label, views)
         sensor = sensors.get(camera.get("sensor_id"))
         if sensor is None:
             raise wrong_camera(where, "the sensor it names", "none")
-        if view in found:
+        if view in world_cameras:
             raise wrong_camera(where, f"one camera called {view}", "two")
         _require_known(path, camera, sensor)
         text = camera.findtext("transform") or ""
         numbers = finite_numbers(where, [number_or_nan(part) for part in text.split()], ((16,),))
         size, lens = _lens_of(where, sensor)
-        found[view] = camera_to_world(where, size, lens, numbers.reshape(4, 4))
-    return found
+        world_cameras[view] = camera_to_world(where, size, lens, numbers.reshape(4, 4))
+    return world_cameras
 
 
 def _warn(path: Path, text: str) -> None:
@@ -238,7 +238,7 @@ def _lens_of(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[str, tuple
     the same terms as a frame camera its tangent.
 
     Raises:
-        PolarguideError: it is a panorama or another lens that is not read, or has terms that COLMAP's does not have.
+        PolarguideError: the lens is a panorama or another that is not read, or has terms that COLMAP's has not.
     """
     calibrations = sensor.findall("calibration")
     adjusted = [c for c in calibrations if c.get("class") == "adjusted"]
@@ -271,7 +271,7 @@ def _require_terms(where: str, value: Mapping[str, float], height: float, others
     """Refuse a lens with terms that its model does not have: ``others``, and a skew that moves pixels.
 
     Raises:
-        PolarguideError: it has one.
+        PolarguideError: the lens has such a term.
     """
     skew = abs(value["b2"]) * height / 2 / value["f"]
     named = [name for name in others if value[name]] + ["b2"] * (skew > _LARGEST_SKEW)

@@ -179,8 +179,8 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
     def to_record(self) -> dict[str, Any]:
         """As the file holds it, without what is missing."""
-        found: dict[str, Any] = msgspec.to_builtins(self)
-        return found
+        record: dict[str, Any] = msgspec.to_builtins(self)
+        return record
 
 
 WHITE = ("white_balance", "chart")
@@ -218,15 +218,15 @@ def write_presentation(folder: Path, presentation: Presentation) -> Path:
     """Write the file of a scene or a run as a whole.
 
     Raises:
-        PolarguideError: it cannot be written.
+        PolarguideError: the file cannot be written.
     """
     path = folder / PRESENTATION_FILE
     write_whole(path, to_json(presentation.to_record()))
     return path
 
 
-def parse_length(text: str, where: str = "distance") -> float:
-    """Meters of a length such as ``85mm``, ``8.5 cm``, ``0.085``; ``where`` is for messages.
+def parse_length(text: str) -> float:
+    """Meters of a length such as ``85mm``, ``8.5 cm``, ``0.085``.
 
     Raises:
         PolarguideError: the text is not a length.
@@ -236,10 +236,10 @@ def parse_length(text: str, where: str = "distance") -> float:
     meters = float(match[1]) * unit if match and unit else math.nan
     if not 0 < meters <= MOST_METERS:
         raise PolarguideError(
-            where,
+            "distance",
             expected=f"a length above 0 such as 85mm (units: {', '.join(LENGTHS)}; m without one)",
             found=repr(text),
-            remedy="Correct the length.",
+            remedy="Give a number above 0 and its unit.",
         )
     return meters
 

@@ -142,14 +142,14 @@ def _held_out(
     layout: Layout,
     model: ColmapModel,
     split: Split,
-    asked: Sequence[str] | None,
+    test_views: Sequence[str] | None,
 ) -> tuple[tuple[str, ...], list[str]]:
     """The names of the test views, and a warning where some are far from what is trained on, or a ring of them is."""
     check_choice("split", split, get_args(Split))
     data, posed = files.read_if_there(path, None), frozenset(model.names)
     cameras = {name: model.camera(name) for name in layout.names if name in posed}
-    if asked is not None:  # whoever asks has been told
-        return tuple(name for name in sorted(asked) if name in layout.names), []
+    if test_views is not None:  # whoever asks has been told
+        return tuple(name for name in sorted(test_views) if name in layout.names), []
     tests = chosen_views(cameras, split) if data is None else held_out(path, data, layout.names)
     other = (
         "take --split directions" if data is None and split != "directions" else "name others in split.json"
@@ -177,7 +177,7 @@ def read_views(
 
     Args:
         layout: the files of the capture.
-        names: of the views to read, sorted.
+        names: names of the views to read, sorted.
         model: the capture's COLMAP model, if it has one; views that it lacks are read without a camera.
         downscale: side of the pixel boxes to average.
         transfer: "linear" or "srgb".
@@ -189,8 +189,8 @@ def read_views(
     """
 
     def read(name: str) -> ViewData:
-        found = read_view(layout, name, factor=downscale, transfer=transfer)
-        return found if hold else _without_pictures(found)
+        view = read_view(layout, name, factor=downscale, transfer=transfer)
+        return view if hold else _without_pictures(view)
 
     posed = frozenset(() if model is None else model.names)
     data: list[ViewData] = []
@@ -247,12 +247,12 @@ def _content_warnings(layout: Layout, stored: StoredViews, invalid: list[str]) -
         (black, "have pictures that are black throughout ({})."),
         (gray if len(gray) < count else [], "have gray pictures among others in color ({})."),
     )  # fmt: skip
-    found = [f"{len(n)} of {count} views {text.format(listed(n))}" for n, text in table if n]
+    warnings = [f"{len(n)} of {count} views {text.format(listed(n))}" for n, text in table if n]
     if copies:
-        found.append(
+        warnings.append(
             f"Views have the same pictures ({copies}). Copy those of the other views, or leave them out."
         )
-    return found
+    return warnings
 
 
 def _pose_warnings(model: ColmapModel, all_names: list[str], data: Sequence[ViewData]) -> list[str]:
@@ -261,9 +261,11 @@ def _pose_warnings(model: ColmapModel, all_names: list[str], data: Sequence[View
     sizes = {item.name: (model.camera(item.name).width, model.camera(item.name).height) for item in data}
     scaled = [item.name for item in data if item.size != sizes[item.name]]
     if scaled:
-        found = ", ".join(f"{width}x{height}" for width, height in sorted({sizes[name] for name in scaled}))
+        resolutions = ", ".join(
+            f"{width}x{height}" for width, height in sorted({sizes[name] for name in scaled})
+        )
         warnings.append(
-            f"The intrinsics were made for another resolution ({found}) than that of the pictures and were "
+            f"The intrinsics were made for another resolution ({resolutions}) than that of the pictures and were "
             f"scaled in {len(scaled)} of {len(data)} views ({listed(scaled)}): right if the pictures were "
             "resized, wrong if they were cropped."
         )

@@ -126,10 +126,10 @@ def _middles(apart: NDArray[np.float64], count: int) -> list[int]:
         group = apart[:, middles].argmin(axis=1)
         group[middles] = np.arange(count)
         members = [np.flatnonzero(group == k) for k in range(count)]
-        found = [int(m[apart[np.ix_(m, m)].sum(axis=1).argmin()]) for m in members]
-        if found == middles:
+        medoids = [int(m[apart[np.ix_(m, m)].sum(axis=1).argmin()]) for m in members]
+        if medoids == middles:
             break
-        middles = found
+        middles = medoids
     taken = [middle for middle, m in zip(middles, members, strict=True) if len(m) > 2]
     while len(taken) < count:
         free = [int(k) for m in members if len(m) > 2 for k in m if k not in taken]
@@ -225,15 +225,15 @@ class Scene:
             pictures: of each view, [K, H, W, 3] RGB or [K, H, W] gray: uint8 or uint16 as a camera stores them, or
                 linear floats from 0 to 1, where 1 is full scale. By name, or in an order (then called v000, v001,
                 ...); views may differ in size.
-            cameras: of each view, at the size of its pictures; ``Camera.from_matrices`` makes one of matrices.
+            cameras: cameras of each view, at the size of its pictures; ``Camera.from_matrices`` makes one of matrices.
             angles: of the K pictures: degrees counter-clockwise as displayed, ``unknown`` or ``none`` (no filter); of
                 all views, or by name.
             points: [M, 3] sparse points of the surfaces in the world, such as those of structure from motion.
             point_colors: [M, 3] uint8, as displayed; None: gray.
-            masks: of the foreground, [H, W] bool a view. invalid: pixels without use, [H, W] bool a view.
+            masks: masks of the foreground, [H, W] bool a view. invalid: pixels without use, [H, W] bool a view.
             test_views: names of the views to score on; None: as ``split`` chooses them.
             split, transfer, downscale: as ``load_scene`` takes them. mount: where the polarizer was.
-            refractive_index: of the surfaces, None if it is not known. name: of the scene.
+            refractive_index: refractive index of the surfaces, None if it is not known. name: name of the scene.
 
         Example:
             >>> scene = polarguide.Scene.from_arrays(stack, cameras, points=points)    # doctest: +SKIP
@@ -400,14 +400,14 @@ def _digest(
     data: Sequence[ViewData], cameras: Mapping[str, Camera], more: Sequence[NDArray[Any]], how: object
 ) -> str:
     """SHA-256 over all that a scene was made of."""
-    found = hashlib.sha256(repr(how).encode())
+    digest = hashlib.sha256(repr(how).encode())
     for item in data:
         camera = cameras[item.name]
         lens = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        found.update(repr((item.name, item.exposures, item.codes.shape, lens)).encode())
-        found.update(camera.world_to_camera.numpy().tobytes())
+        digest.update(repr((item.name, item.exposures, item.codes.shape, lens)).encode())
+        digest.update(camera.world_to_camera.numpy().tobytes())
         for array in (item.codes, item.invalid, item.mask):
-            found.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
+            digest.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
     for array in more:
-        found.update(array.tobytes())
-    return found.hexdigest()
+        digest.update(array.tobytes())
+    return digest.hexdigest()

@@ -158,22 +158,22 @@ def read_transforms(path: Path, views: Collection[str], sizes: Sizes) -> dict[st
     if record.camera is not None or record.normal_mts_args is not None:
         name = "camera" if record.camera is not None else "normal_mts_args"
         raise wrong_camera(path, "cameras that look along -z with y up (OpenGL)", f"{name}, of other axes")
-    found: dict[str, PosedCamera] = {}
+    cameras: dict[str, PosedCamera] = {}
     for number, frame in enumerate((*record.frames, *record.test_frames)):
         where = f"{path} (frame {number}, {frame.file_path})"
         if not frame.file_path:
             named = listed(sorted(listed_frames[number]))
             raise wrong_camera(where, "file_path and transform_matrix, as nerfstudio writes them", named)
         view = view_of_name(frame.file_path, views)
-        if view in found:
+        if view in cameras:
             raise wrong_camera(where, f"one frame called {view}", "two")
         lens = _lens_of(where, frame, record)
         # NeuS2 says by ``from_na`` that its axes are right, down, forward.
         to_world = _pose_of(where, frame) @ (np.eye(4) if record.from_na else _OPENGL)
-        found[view] = _camera_of(where, lens, to_world, functools.partial(sizes, view))
+        cameras[view] = _camera_of(where, lens, to_world, functools.partial(sizes, view))
     known = {*_Transforms.__struct_fields__, *_Frame.__struct_fields__, *_IRRELEVANT}
     require_known_names(path, names - known)
-    return found
+    return cameras
 
 
 _MATRIX = ("fl_x", "fl_y", "cx", "cy")
@@ -244,7 +244,7 @@ def _is_fisheye(where: str, lens: Mapping[str, Any]) -> bool:
     """Whether the lens is a fisheye of OpenCV.
 
     Raises:
-        PolarguideError: it is a panorama or another lens that is not read, or fields contradict one another.
+        PolarguideError: the lens is a panorama or another lens that is not read, or fields contradict one another.
     """
     model = lens["camera_model"]
     expected = f"a camera of {', '.join(_PERSPECTIVE)} or {_FISHEYE}"
@@ -296,7 +296,7 @@ def _stated_size(where: str, lens: Mapping[str, Any]) -> tuple[int, int] | None:
     """Width and height that the file states; None where it has neither.
 
     Raises:
-        PolarguideError: it has one of them, or a size that no picture has.
+        PolarguideError: the file has one of the two, or a size that no picture has.
     """
     width, height = lens["w"], lens["h"]
     if width is None and height is None:
@@ -314,7 +314,7 @@ def _focal_lengths(
     Raises:
         PolarguideError: no value is positive, or two values differ.
     """
-    found: list[float | None] = []
+    lengths: list[float | None] = []
     for axis, side in zip("xy", size, strict=True):
         length, angle, degrees = lens[f"fl_{axis}"], lens[f"camera_angle_{axis}"], lens[f"{axis}_fov"]
         angles = [*([angle] if angle else []), *([math.radians(degrees)] if degrees else [])]
@@ -328,8 +328,8 @@ def _focal_lengths(
             others = " and ".join(f"{one:.6g}" for one in stated)
             expected = f"fl_{axis} that agrees with camera_angle_{axis} and the width or height of {side}"
             raise wrong_camera(where, expected, f"focal lengths of {others} pixels")
-        found.append(stated[0] if stated else None)
-    x, y = found
+        lengths.append(stated[0] if stated else None)
+    x, y = lengths
     if x is None and y is None:
         raise wrong_camera(where, "a focal length, fl_x or camera_angle_x", "none")
     return float(x or y or 0.0), float(y or x or 0.0)

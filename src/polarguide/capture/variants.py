@@ -154,9 +154,9 @@ def select_exposures(scene: Scene, exposures: Exposures) -> Scene:
     if others:
         raise PolarguideError(
             scene.root,
-            expected=f"pictures at 0, 45, 90 and 135 degrees of every view for --exposures {exposures}",
-            found=f"other pictures in {len(others)} views, {others[0]} first",
-            remedy="Give a scene with four pictures of each view.",
+            expected=f"four pictures of every view, at 0, 45, 90 and 135 degrees, for --exposures {exposures}",
+            found=f"{len(others)} views without them ({others[0]} first)",
+            remedy="Use a scene with these four pictures of every view.",
         )
     places = {view.name: place for place, view in enumerate(scene.train_views)}
     change = _CHANGES[exposures]
@@ -189,11 +189,11 @@ def _computed(view: View, pictures: Callable[[View], list[Tensor]], exposures: t
 def _three(view: View, _place: int) -> View:
     def pictures(view: View) -> list[Tensor]:
         stokes, rays = view.stokes(), view.camera.rays()
-        found = []
+        intensities = []
         for angle in THREE:
             cosine, sine = optics.analyzer(math.radians(angle), rays, view.mount)[..., None].unbind(0)
-            found.append((stokes[0] + stokes[1] * cosine + stokes[2] * sine) / 2)
-        return found
+            intensities.append((stokes[0] + stokes[1] * cosine + stokes[2] * sine) / 2)
+        return intensities
 
     return _computed(view, pictures, tuple(Exposure(angle) for angle in THREE))
 
@@ -281,5 +281,5 @@ def smaller(scene: Scene, longest: int) -> Scene:
     if factor == 1:
         return scene
     small = (smaller_view(view, factor, Latest()) for view in views)
-    held = (replace(view, pictures=view.codes, mask=None, subject_only=False) for view in small)
-    return replace(scene, views=tuple(held), test_names=())
+    stored = (replace(view, pictures=view.codes, mask=None, subject_only=False) for view in small)
+    return replace(scene, views=tuple(stored), test_names=())

@@ -68,7 +68,7 @@ class Latest:
     """Room for one value: the last one that any of the loaders which share it made."""
 
     def __init__(self) -> None:
-        self.kept: tuple[object, Any] | None = None
+        self.loaded: tuple[object, Any] | None = None
 
 
 class Loader(Generic[T]):
@@ -87,14 +87,14 @@ class Loader(Generic[T]):
 
     def __call__(self) -> T:
         """The value."""
-        kept = self._latest.kept
-        if kept is not None and kept[0] is self:
-            return kept[1]
-        del kept  # so that its memory can be taken for the next
+        latest = self._latest.loaded
+        if latest is not None and latest[0] is self:
+            return latest[1]
+        del latest  # so that its memory can be taken for the next
         if not self._derived:
-            self._latest.kept = None
+            self._latest.loaded = None
         value = self._make()
-        self._latest.kept = self, value
+        self._latest.loaded = self, value
         return value
 
     def then(self, change: Callable[[T], T]) -> Loader[T]:
@@ -148,7 +148,7 @@ class View:
         floats.
 
         Raises:
-            PolarguideError: they are loaded from files, and a file has changed or is gone.
+            PolarguideError: a file of the view has changed or was deleted.
         """
         codes = self.pictures() if isinstance(self.pictures, Loader) else self.pictures
         if not self.subject_only or self.mask is None:
@@ -160,7 +160,7 @@ class View:
         """Ground truth of the view, or None.
 
         Raises:
-            PolarguideError: it is loaded from a file, which has changed or is gone.
+            PolarguideError: the file has changed or was deleted.
         """
         return self.truth() if isinstance(self.truth, Loader) else self.truth
 
@@ -218,7 +218,7 @@ class View:
         """The view with other pictures: made now where its own are in memory, else when they are read.
 
         Args:
-            change: makes new codes of the view's. exposures: of the new pictures; None: they stay.
+            change: makes new codes of the view's. exposures: exposures of the new pictures; None: they stay.
         """
         pictures = self.pictures
         made = pictures.then(change) if isinstance(pictures, Loader) else change(pictures)
@@ -255,8 +255,8 @@ class View:
             raise self.undetermined("a Stokes vector")
         places = [k for k, exposure in enumerate(self.exposures) if exposure.known]
         rays = self.camera.rays(device=self.device)
-        found = analyzers([self.exposures[k] for k in places], rays, self.mount)
-        return optics.fitted_stokes(self.intensities()[places], found)
+        rows = analyzers([self.exposures[k] for k in places], rays, self.mount)
+        return optics.fitted_stokes(self.intensities()[places], rows)
 
     def photograph(self) -> Tensor:
         """Linear S0 / 2 in [0, 1], [H, W, 3] float32: of four pictures, their mean.

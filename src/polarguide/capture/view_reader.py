@@ -108,7 +108,7 @@ class ViewData:
         """The view with its camera and its saturated pixels.
 
         Args:
-            camera: of the view. scale: as for ``saturated``. mount: where the polarizer was.
+            camera: camera of the view. scale: as for ``saturated``. mount: where the polarizer was.
             files: load codes and ground truth when they are read; None: those that are here stay in memory.
         """
         invalid, saturated = torch.from_numpy(self.invalid), torch.from_numpy(self.saturated(scale))
@@ -138,14 +138,17 @@ class ViewFiles:
         self._pictures, self._truths = Latest(), Latest()
 
     def codes(self, name: str) -> Loader[Tensor]:
-        """Loads ``View.codes``; an error where a file has changed, or is gone."""
+        """Loader of ``View.codes``, which raises an error if a file was changed or deleted."""
         return Loader(functools.partial(self._read_codes, name), self._pictures)
 
     def ground_truth(self, name: str, size: tuple[int, int]) -> Loader[GroundTruth | None] | None:
-        """Loads ``View.ground_truth``; an error where the file has changed, or is gone. None: there is no such file.
+        """Loader of ``View.ground_truth``, or None if the scene has no ground truth of this view.
+
+        The loader raises an error if the file was changed or deleted after the scene was opened.
 
         Args:
-            name: of the view. size: width and height of the pictures as stored.
+            name: view name.
+            size: width and height of the stored pictures.
         """
         path = self._layout.ground_truth.get(name)
         return None if path is None else Loader(functools.partial(self._read_truth, path, size), self._truths)
@@ -215,7 +218,7 @@ def require_factor(factor: int, height: int, width: int) -> None:
     """Check that boxes of ``factor`` x ``factor`` pixels fit into a picture.
 
     Raises:
-        PolarguideError: they do not.
+        PolarguideError: the boxes do not fit.
     """
     if factor > min(height, width):
         raise PolarguideError(
@@ -303,10 +306,14 @@ def _read_pictures(files: Files, paths: list[Path]) -> list[NDArray[Any]]:
 
 
 def require_size(path: Path, data: bytes, size: Sequence[int], *, like: Path | None = None) -> None:
-    """Check the size that a picture file states, height and width, before memory is taken to decode it.
+    """Reject a picture whose header states another size, before memory is allocated to decode it.
+
+    Args:
+        path, data: the file and its bytes.
+        size: expected height and width. like: the file that has this size, for the message.
 
     Raises:
-        PolarguideError: it states another one.
+        PolarguideError: the header states another size.
     """
     stated = declared_size(data)
     if stated is not None:
@@ -322,7 +329,7 @@ def _require_same(path: Path, found: tuple[int, int], size: Sequence[int], like:
             found=f"{found[0]}x{found[1]}",
             remedy="Make it anew for these pictures."
             if like is None
-            else "Export the pictures of a view alike.",
+            else "Export all pictures of a view with the same settings.",
         )
 
 
@@ -340,7 +347,7 @@ def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: ND
             path,
             expected=f"{expected} like {'/'.join(first_path.parts[-2:])}",
             found=own,
-            remedy="Export the pictures of a view alike.",
+            remedy="Export all pictures of a view with the same settings.",
         )
 
 
@@ -368,7 +375,7 @@ class StoredViews:
 
     Attributes:
         data: the views, sorted by name.
-        cameras: of each view at the size of its averaged pictures; None where the model has no pose.
+        cameras: cameras of each view at the size of its averaged pictures; None where the model has no pose.
         measures: ``checks.measure`` of each view.
         largest_value: the largest value that the files can store, 255 or 65535.
         full_scale: the stored value at which the capture saturates; None if nothing is saturated.
@@ -385,7 +392,7 @@ class StoredViews:
         """Measure views, and find where they saturate.
 
         Raises:
-            PolarguideError: they differ in depth.
+            PolarguideError: the views differ in bit depth.
         """
         largest_value = _largest_value(data)
         scale = checks.full_scale(np.sum([item.histogram for item in data], axis=0), largest_value)
@@ -410,8 +417,8 @@ def _largest_value(data: Sequence[ViewData]) -> int:
     if len(first) > 1:
         raise PolarguideError(
             "pictures",
-            expected="one number of bits for all views",
-            found=f"8 bits in view {first[1]} and 16 in view {first[2]}",
-            remedy="Export all pictures alike.",
+            expected="the same bit depth in all views",
+            found=f"8 bits in view {first[1]} and 16 bits in view {first[2]}",
+            remedy="Save all pictures with the same bit depth.",
         )
     return int(np.iinfo(data[0].peak.dtype).max)

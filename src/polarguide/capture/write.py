@@ -54,8 +54,8 @@ def intensity_codes(
     values = np.clip(intensities, 0.0, 1.0) * np.float32(FULL_CODE)
     multiples: Any = np.float32(rounding[0][1])
     if len(rounding) > 1:
-        starts, found = (np.array(numbers) for numbers in zip(*rounding, strict=True))
-        table = found[np.searchsorted(starts, np.arange(FULL_CODE + 1), side="right") - 1]
+        starts, rounded = (np.array(numbers) for numbers in zip(*rounding, strict=True))
+        table = rounded[np.searchsorted(starts, np.arange(FULL_CODE + 1), side="right") - 1]
         multiples = table.astype(np.float32)[values.astype(np.uint16)]
     codes = (np.rint(values / multiples) * multiples).astype(np.uint32)
     full = invalid[None, ..., None] & (codes >= FULL_CODE - multiples // 2)
@@ -89,7 +89,7 @@ def write_view(
             those of a monochrome sensor are, one is written.
         invalid: unusable pixels, [H, W].
         mask: object mask, [H, W].
-        angles: of the pictures, where there are others than four.
+        angles: angles of the pictures, where there are others than four.
 
     Returns:
         The size in bytes of each file that was written, by its path in the scene folder.

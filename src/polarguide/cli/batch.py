@@ -139,7 +139,7 @@ def _lines(collection: Path, out: Path) -> list[_Line]:
     """The captures of a collection, in its order.
 
     Raises:
-        PolarguideError: it is neither a folder of folders nor such a table.
+        PolarguideError: the collection is neither a folder of folders nor such a table.
     """
     lines = _table(collection) if collection.is_file() else _folders(collection, out)
     taken: dict[str, str] = {}

@@ -27,12 +27,13 @@ def prepare(
     angles: Annotated[CalibrationOptions, tyro.conf.arg(name="")],
     compute: Annotated[ThreadOptions, tyro.conf.arg(name="")],
 ) -> None:
-    """Camera files to a scene folder: raw mosaics, shots through a rotating filter, published datasets.
+    """Convert camera files to a scene folder: raw mosaics, shots through a rotating filter, published datasets.
 
-    A preparation that was stopped goes on with the same command. docs/reference/formats.md describes the files.
+    The same command resumes a stopped preparation. docs/reference/formats.md describes the files.
 
     Args:
-        source: Folder of raw mosaics (one file a view), of filter shots (four folders or suffixes), or of a dataset.
+        source: Folder of raw mosaics (one file a view), filter shots (four subfolders, or four suffixes of names),
+            ordinary photographs, or a dataset.
         out: Scene folder to write.
     """
     use_threads(compute.threads)
@@ -63,15 +64,17 @@ def inspect(
     settings: Annotated[InspectSettings, tyro.conf.arg(name="")],
     compute: Annotated[ComputeOptions, tyro.conf.arg(name="")],
 ) -> None:
-    """Check a capture: a page, a JSON file, and the order of its angles by geometry.
+    """Check a capture and its polarizer angles, and write a page and a JSON file.
 
-    Each check ends in ok, warning, wrong or n/a, and says what to do. Works without poses; order, sense and zero of the
-    angles take poses. docs/how-to/inspect.md describes the checks and what they cannot decide.
+    Each check ends in ok, warning, wrong or n/a, and says what to do. Camera poses are needed only to check the order,
+    the direction of rotation and the zero of the angles. docs/how-to/inspect.md describes the checks and what they
+    cannot decide.
 
     Args:
         scene: Scene folder.
-        out: Folder to write; without it SCENE-inspection beside the scene.
-        fix: New folder for a corrected copy of the scene, if order, sense or zero are wrong and decided.
+        out: Folder for the page. Without it, SCENE-inspection beside the scene.
+        fix: New folder for a corrected copy of the scene, written if the order, the direction or the zero is wrong and
+            the right one is certain.
     """
     if fix is not None and settings.calibration is not None:
         raise PolarguideError(
@@ -105,8 +108,8 @@ def _fix(inspected: Any, out: Path, reporter: ConsoleReporter) -> None:
         raise PolarguideError(
             "--fix",
             expected="a scene with four pictures of each view",
-            found="a scene whose angles stand in a table",
-            remedy="Correct SCENE/angles.csv as the report says, or repeat prepare.",
+            found="a scene whose angles are listed in angles.csv",
+            remedy="Edit SCENE/angles.csv as the page of the inspection says, or repeat polarguide prepare.",
         )
     change = fixing.correction(inspected.capture, inspected.angles)
     if change is None:
@@ -267,7 +270,7 @@ def _confirm(seconds: float, yes: bool) -> None:
     """Ask before a rendering that takes long, if somebody sits at a terminal.
 
     Raises:
-        PolarguideError: it is not wanted.
+        PolarguideError: the user declines.
     """
     if seconds <= LONG_SECONDS or yes or not (sys.stdin.isatty() and console.is_terminal):
         return

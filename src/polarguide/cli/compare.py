@@ -155,13 +155,14 @@ def bench(
     out: Path,
     options: Annotated[BenchOptions, tyro.conf.arg(name="")],
 ) -> None:
-    """Run the bench of generality: render its scenes where they are missing, and compare all methods on them.
+    """Render the scenes of the benchmark that are missing, then train and score every recipe on each scene.
 
-    Scenes go to scenes/ of the folder given by --out, tables and report to development/ or held-back/. What is finished
-    is checked and not repeated; after Ctrl-C the same command goes on. Rendering needs Mitsuba, as ``synth`` does.
+    Scenes are written to scenes/ below the folder given by --out. Tables and the report are written to development/
+    for the scenes on which constants are tuned, to held-back/ for the others. Finished results are verified and reused,
+    so the same command resumes after Ctrl-C. Rendering needs Mitsuba, as ``synth`` does.
 
     Args:
-        out: Folder to write.
+        out: Output folder.
     """
     use_threads(options.threads)
     run_bench = importlib.import_module("polarguide.experiments.bench").run_bench

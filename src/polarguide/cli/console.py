@@ -127,7 +127,7 @@ class Lines:
     def __init__(self, label: str, total: int | None, clock: Callable[[], float] = time.monotonic) -> None:
         self._label, self._total, self._clock = label, total, clock
         self._last = clock()
-        self._seen: deque[tuple[float, int]] = deque()  # when how much was done, about once a second
+        self._progress: deque[tuple[float, int]] = deque()  # when how much was done, about once a second
         self._line = ""
 
     def __call__(
@@ -136,11 +136,11 @@ class Lines:
         """See ``core.progress.Advance``."""
         now = self._clock()
         self._total = total or self._total
-        if not self._seen or now - self._seen[-1][0] >= 1:
-            self._seen.append((now, done))
-        while len(self._seen) > 2 and now - self._seen[1][0] >= SPEED_SECONDS:
-            self._seen.popleft()
-        begin, first = self._seen[0]  # a training that goes on does not begin at 0
+        if not self._progress or now - self._progress[-1][0] >= 1:
+            self._progress.append((now, done))
+        while len(self._progress) > 2 and now - self._progress[1][0] >= SPEED_SECONDS:
+            self._progress.popleft()
+        begin, first = self._progress[0]  # a training that goes on does not begin at 0
         finished = self._total is not None and done >= self._total
         if left is None and self._total is not None and done > first:
             left = (now - begin) * (self._total - done) / (done - first)

@@ -53,9 +53,10 @@ def diagnosis() -> dict[str, Any]:
     """The state of this installation, as plain values that JSON can hold.
 
     Returns:
-        ``polarguide``, ``python``, ``packages`` (versions by name, None: not installed), ``kernels`` and ``torch``
-        (with ``error`` in place of the values where they cannot be loaded), ``extras``, ``machine``, and two lists of
-        lines: ``problems`` stop commands, ``notes`` do not.
+        ``polarguide`` and ``python``: versions. ``packages``: versions by name, None for a package that is not
+        installed. ``kernels`` and ``torch``: their properties, or ``error`` alone if they cannot be loaded.
+        ``extras``: optional packages. ``machine``: processor, memory and disk. ``problems``: lines about faults that
+        make commands fail. ``notes``: lines about faults that do not.
     """
     packages = {
         each.name: _version(each.name)

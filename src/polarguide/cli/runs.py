@@ -260,7 +260,7 @@ def demo(
     """Train, evaluate and render the small scene that ships with the program.
 
     Args:
-        out: Run folder to write; a finished or interrupted demo there is gone on with.
+        out: Run folder to write; a demo there that is finished or was interrupted is resumed.
         steps: Optimizer steps.
         seed: Seed of every random draw.
     """

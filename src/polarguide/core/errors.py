@@ -136,7 +136,7 @@ def require_package(module: str, what: str, *, extra: str = "") -> None:
     """Check that a package is there, without loading it: before work begins, not after. See ``optional_import``.
 
     Raises:
-        PolarguideError: it is not installed.
+        PolarguideError: the package is not installed.
     """
     try:
         there = importlib.util.find_spec(module) is not None
@@ -156,7 +156,7 @@ def optional_import(module: str, what: str, *, extra: str = "") -> Any:
             brings it; empty: it comes with polarguide.
 
     Raises:
-        PolarguideError: it is not installed.
+        PolarguideError: the package is not installed.
     """
     before = signal.getsignal(signal.SIGINT)
     try:

@@ -30,7 +30,7 @@ def atomic(path: Path) -> Iterator[Path]:
         The temporary file's path, in the same folder.
 
     Raises:
-        PolarguideError: it cannot be written, for example because the disk is full.
+        PolarguideError: the file or folder cannot be written, for example because the disk is full.
     """
     temporary = _temporary(path)
     with writing(path):
@@ -50,7 +50,7 @@ def temporary_folder(path: Path) -> Iterator[Path]:
     """A folder beside ``path`` for work on it, which is removed afterwards, and at the next call after a kill.
 
     Raises:
-        PolarguideError: it cannot be written, for example because the disk is full.
+        PolarguideError: the file or folder cannot be written, for example because the disk is full.
     """
     temporary = _temporary(path)
     with writing(path):
@@ -69,7 +69,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         The temporary folder, beside ``path``, which is made.
 
     Raises:
-        PolarguideError: it cannot be written, for example because the disk is full.
+        PolarguideError: the file or folder cannot be written, for example because the disk is full.
     """
     make_folder(path)
     with temporary_folder(path) as temporary:
@@ -120,7 +120,7 @@ def write_whole(path: Path, data: bytes) -> int:
     """Write a file completely or not at all; returns its size.
 
     Raises:
-        PolarguideError: it cannot be written.
+        PolarguideError: the file cannot be written.
     """
     with atomic(path) as temporary:
         temporary.write_bytes(data)
@@ -131,7 +131,7 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file in UTF-8, completely or not at all; halves of characters in it become escapes.
 
     Raises:
-        PolarguideError: it cannot be written.
+        PolarguideError: the file cannot be written.
     """
     write_whole(path, text.encode("utf-8", "backslashreplace"))
 
@@ -140,7 +140,7 @@ def make_folder(path: Path) -> None:
     """Create a folder and those above it, unless it exists.
 
     Raises:
-        PolarguideError: it cannot be created.
+        PolarguideError: the folder cannot be created.
     """
     with writing(path):
         path.mkdir(parents=True, exist_ok=True)
@@ -186,7 +186,7 @@ def require_file(path: Path, *, expected: str, remedy: str) -> None:
     """Check that something is an ordinary file: reading a pipe or a device may never end.
 
     Raises:
-        PolarguideError: it is something else, or there is nothing.
+        PolarguideError: ``path`` is no ordinary file, or does not exist.
     """
     if path.is_file():
         return

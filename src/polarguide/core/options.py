@@ -67,7 +67,7 @@ def check_count(name: str, value: int, minimum: int = 1, most: int = MOST) -> No
     """Check an option's value.
 
     Raises:
-        PolarguideError: it is not a whole number, or less than ``minimum`` or more than ``most``.
+        PolarguideError: the value is not a whole number, or less than ``minimum`` or more than ``most``.
     """
     if not isinstance(value, numbers.Integral) or isinstance(value, bool):
         remedy = "Round it."
@@ -81,7 +81,7 @@ def check_finite(name: str, value: float, least: float = -math.inf, most: float 
     """Check an option's value.
 
     Raises:
-        PolarguideError: it is not a finite number from ``least`` to ``most``.
+        PolarguideError: the value is not a finite number from ``least`` to ``most``.
     """
     if not (math.isfinite(value) and least <= value <= most):
         whole = math.isinf(least) and math.isinf(most)
@@ -93,7 +93,7 @@ def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
     """Check an option's value.
 
     Raises:
-        PolarguideError: it is not one of the choices.
+        PolarguideError: the value is not one of the choices.
     """
     allowed = list(choices)
     if value not in allowed:

@@ -23,7 +23,7 @@ _WORDS = {
 }  # fmt: skip
 _DEEPEST = 50
 LARGEST_RECORD = 1 << 26
-"""Bytes of a JSON file; what they unfold to takes some twenty times as much."""
+"""Bytes of a JSON file; what they decode to takes some twenty times as much."""
 _STEP = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
 
 
@@ -35,7 +35,7 @@ def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
         remedy: what to do about a file that is wrong.
 
     Raises:
-        PolarguideError: the file cannot be read, or ``decode`` refuses it.
+        PolarguideError: the file cannot be read, or ``decode`` rejects it.
     """
     return decode(read_file(path, largest=LARGEST_RECORD, remedy=remedy), kind, path, remedy=remedy)
 
@@ -52,7 +52,7 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
         where: the file or flag, for messages. remedy: what to do about data that is wrong.
 
     Raises:
-        PolarguideError: it is not JSON, or not of this type; the message names the field and the value.
+        PolarguideError: the data are not JSON, or not of this type; the message names the field and the value.
     """
     try:
         value = json.loads(data, object_pairs_hook=_each_once) if isinstance(data, bytes) else data
@@ -93,7 +93,7 @@ def _require_shallow(value: Any) -> None:
     """Refuse lists in lists in lists, which take more of the stack than there is.
 
     Raises:
-        RecursionError: they are nested more deeply than any record of ours.
+        RecursionError: the lists are nested more deeply than any record of ours.
     """
     level = [value]
     for _ in range(_DEEPEST):
@@ -155,16 +155,16 @@ def _fault(message: str, value: Any, kind: Any) -> tuple[str, str, str]:
         value = _at(value, name, index)
         form = _form_at(form, name, index)
     field = path.lstrip(".")
-    expected, found = _plain(what.removeprefix("Expected ")), shortened(value)
+    expected, value_found = _plain(what.removeprefix("Expected ")), shortened(value)
     if value is _UNKNOWN:
-        found = _plain(got) or "another"
+        value_found = _plain(got) or "another"
     if what.startswith("Object contains unknown field"):
         fields = [field for kind in _kinds(form) for field in getattr(kind, "fields", ())]
         expected = f"only {', '.join(field.encode_name for field in fields)}"
-        found = what.partition("`")[2].rstrip("`")
+        value_found = what.partition("`")[2].rstrip("`")
     elif what.startswith("Object missing required field"):
         expected = f"the field {what.partition('`')[2].rstrip('`')}"
-        found = f"only {', '.join(value)}" if isinstance(value, dict) and value else "none"
+        value_found = f"only {', '.join(value)}" if isinstance(value, dict) and value else "none"
     elif what.startswith("Number out of range"):
         expected = "a number of usual size"
     elif what.startswith("Invalid enum value"):
@@ -172,7 +172,7 @@ def _fault(message: str, value: Any, kind: Any) -> tuple[str, str, str]:
         expected = f"{', '.join(others)} or {last}" if others else last
     elif _limits(form) and not got:
         expected = _limits(form)
-    return field, expected, found
+    return field, expected, value_found
 
 
 def shortened(value: Any, most: int = 100) -> str:

@@ -72,7 +72,7 @@ class StopSignals:
     """
 
     def __init__(self) -> None:
-        self._asked = self._works = False
+        self._stopping = self._works = False
 
     def __enter__(self) -> StopSignals:
         self._old = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, *stop_signals())}
@@ -84,13 +84,13 @@ class StopSignals:
 
     def __call__(self) -> bool:
         self._works = True
-        return self._asked
+        return self._stopping
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         if self._works:
-            if self._asked and number == signal.SIGINT:
+            if self._stopping and number == signal.SIGINT:
                 interrupt(number, frame)
-            self._asked = True
+            self._stopping = True
         elif number == signal.SIGTERM and process_count() > 1:
             # torchrun ends the others when one process is lost: first one of them has to say what happened.
             timer = threading.Timer(LAST_WORDS_SECONDS, os._exit, (128 + number,))
@@ -115,7 +115,7 @@ def exclusive_lock(path: Path) -> Iterator[None]:
 
     Raises:
         BlockingIOError: another process holds it.
-        OSError: it cannot be opened, or is a link: what that leads to is not ours to open.
+        OSError: the file cannot be opened, or is a link: what the link leads to is not ours to open.
     """
     fcntl = _posix("fcntl")
     handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
@@ -158,7 +158,10 @@ def only_writer(lock: Path, *, expected: str, found: str) -> Iterator[None]:
             stack.enter_context(exclusive_lock(lock))
         except BlockingIOError:
             raise PolarguideError(
-                lock.parent, expected=expected, found=found, remedy="Wait for it, or give another --out."
+                lock.parent,
+                expected=expected,
+                found=found,
+                remedy="Wait until the other command has ended, or choose another folder with --out.",
             ) from None
         yield
 

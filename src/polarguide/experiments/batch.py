@@ -52,7 +52,7 @@ class Row:
     """A capture on the page.
 
     Attributes:
-        name, source: of the capture. folder: of its results. state: "done", "failed" or "waiting".
+        name, source: those of the capture. folder: folder of its results. state: "done", "failed" or "waiting".
         error: why it failed, in one line. record: how far it is.
     """
 
@@ -155,9 +155,9 @@ class Capture:
     """A capture of a collection, and what to do with it.
 
     Attributes:
-        name: of its folder in the results. path: its files, or a scene.
+        name: name of its folder in the results. path: its files, or a scene.
         prepare: how to prepare it; not used for a scene.
-        recipe, settings, reading: of its training.
+        recipe, settings, reading: those of its training.
     """
 
     name: str

@@ -81,7 +81,7 @@ def run_bench(
         settings=bench.training,
         options=options.comparing(max(rows.values())),
         seeds_of=rows,
-        asked=_command(out, options, places),
+        command_line=_command(out, options, places),
         reporter=reporter,
     )
 

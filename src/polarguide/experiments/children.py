@@ -127,7 +127,7 @@ def perform(
     Args:
         messages: the tasks, each is done in a process of its own.
         folder: made if need be. Its ``stderr.txt`` takes what the children write.
-        gpus: of the workers of this machine, who are called 0, 1, ... and take one each, in turn.
+        gpus: GPUs of the workers of this machine, who are called 0, 1, ... and take one each, in turn.
     """
     from distributed import get_worker
     from distributed.worker import thread_state

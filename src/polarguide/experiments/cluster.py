@@ -43,11 +43,12 @@ SETTINGS = {
 
 @dataclass
 class Workers:
-    """Workers and how to replace lost ones.
+    """Worker processes, of which lost ones are replaced.
 
     Attributes:
-        client: to their scheduler. most: jobs that may be at work at a time, and workers to replace lost ones up to.
-        gpus: what each in turn is to see of the GPUs of this machine; empty: as it is.
+        client: connection to their scheduler.
+        most: largest number of jobs at a time. Lost workers are replaced up to it.
+        gpus: GPUs of this machine that each worker in turn sees; empty: every worker sees all.
     """
 
     client: Client
@@ -73,8 +74,8 @@ def workers(
 
     Args:
         options: where.
-        count: how many jobs work at a time. threads: of each. memory: bytes that each takes at most.
-        gpus: of this machine, for local workers.
+        count: how many jobs work at a time. threads: threads of each. memory: bytes that each takes at most.
+        gpus: GPUs of this machine, for local workers.
         reporter: is told where workers are.
 
     Raises:

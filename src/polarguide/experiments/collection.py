@@ -32,7 +32,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         source: absolute path of its folder. stamp: number, size and newest time of its files.
         prepare: ``PrepareSettings.record()``; None: the source is a scene already.
-        recipe, settings, reading: of the training. formats: of the export.
+        recipe, settings, reading: those of the training. formats: formats of the export.
     """
 
     source: str
@@ -58,8 +58,8 @@ class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         done: the steps that are finished. at: the one that was begun last.
-        verdict, findings: of the inspection; all but those that are ok.
-        pictures: of one view, label and data URI each. files: exported, relative to the capture's folder.
+        verdict, findings: those of the inspection; all but those that are ok.
+        pictures: pictures of one view, label and data URI each. files: exported, relative to the capture's folder.
     """
 
     format: int
@@ -80,7 +80,7 @@ class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The record in a folder; None where there is none yet.
 
         Raises:
-            PolarguideError: it is no such record.
+            PolarguideError: the file is no such record.
         """
         if not os.path.lexists(folder / RECORD):
             return None
@@ -91,7 +91,7 @@ class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Refuse to go on with another request than it was begun with; one that is done may lose its source.
 
         Raises:
-            PolarguideError: they differ.
+            PolarguideError: the requests differ.
         """
         if request.stamp == NO_FILES and set(self.done) == set(STEPS):
             return

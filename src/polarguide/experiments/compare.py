@@ -60,7 +60,7 @@ def compare(
     options: CompareOptions = CompareOptions(),
     seeds_of: Mapping[str, int] = MappingProxyType({}),
     steps_of: Mapping[str, int] = MappingProxyType({}),
-    asked: str = "",
+    command_line: str = "",
     reporter: Reporter = SILENT,
 ) -> Results:
     """Train and score every recipe on every scene with every seed, each run in processes of its own.
@@ -80,7 +80,7 @@ def compare(
         options: how runs are trained, timed and shown.
         seeds_of: by the name of a recipe, how many seeds where that is not ``options.seeds``.
         steps_of: by the name of a recipe, how many steps where that is not ``settings.steps``.
-        asked: the command line that asked, for the record, if not ``polarguide compare``.
+        command_line: for the record, if not ``polarguide compare``.
         reporter: receives messages and progress.
 
     Returns:
@@ -97,7 +97,7 @@ def compare(
         out=Path(out),
         seeds_of=dict(seeds_of),
         steps_of=dict(steps_of),
-        asked=asked,
+        command_line=command_line,
     )
     names = [recipe.name for recipe in comparison.recipes]
     for word, of, most in (("seeds_of", seeds_of, MOST_SEEDS), ("steps", steps_of, MOST)):
@@ -162,9 +162,9 @@ def _folder(scene: object) -> Path:
         return Path(scene)
     raise PolarguideError(
         "scenes",
-        expected="folders of scenes, which other processes read",
+        expected="paths of scene folders",
         found=f"a {type(scene).__name__}",
-        remedy="Pass scene.root in place of a loaded scene.",
+        remedy="Pass scene.root: other processes read the scene from its folder.",
     )
 
 
@@ -198,7 +198,7 @@ def _checked_recipes(recipes: Sequence[str | Method]) -> tuple[Method, ...]:
                 "recipes",
                 expected=f"the registered recipe {own.name}",
                 found="a recipe of this name with other values",
-                remedy="Give it a name of its own, and register it under the entry points polarguide.recipes.",
+                remedy="Give it another name, and register it under the entry points polarguide.recipes.",
             )
     if not registered:
         remedy = "Name at least one recipe."
@@ -206,7 +206,9 @@ def _checked_recipes(recipes: Sequence[str | Method]) -> tuple[Method, ...]:
     names = [recipe.name for recipe in registered]
     if len(set(names)) < len(names):
         remedy = "Name each once."
-        raise PolarguideError("recipes", expected="every name once", found=" ".join(names), remedy=remedy)
+        raise PolarguideError(
+            "recipes", expected="no name more than once", found=" ".join(names), remedy=remedy
+        )
     return registered
 
 

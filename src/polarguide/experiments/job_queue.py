@@ -187,7 +187,7 @@ def run_jobs(
     waiting, active, losses = deque(jobs), list[_Active](), _Losses()
     with contextlib.ExitStack() as stack:
         progress = _Progress(jobs, reporter, stack)
-        slots, asked = workers.slots(), time.monotonic()
+        slots, asked_at = workers.slots(), time.monotonic()
         try:
             while waiting or active:
                 while waiting and len(active) < max(1, min(slots, workers.most)):
@@ -204,8 +204,8 @@ def run_jobs(
                     on_end(each.job, error)
                 progress.report(active, slots)
                 time.sleep(POLL_SECONDS)
-                if time.monotonic() - asked > ASK_SECONDS:
-                    slots, asked = workers.slots(), time.monotonic()
+                if time.monotonic() - asked_at > ASK_SECONDS:
+                    slots, asked_at = workers.slots(), time.monotonic()
                     workers.replace_lost()
         except BaseException:  # whatever happens here, no child goes on unwatched
             _stop(active, workers)

@@ -56,7 +56,7 @@ def join_tables(parts: Sequence[PathLike], out: PathLike, *, against: str | None
     if len(paths) > 1 and written in map(os.path.realpath, paths):
         raise PolarguideError(
             out,
-            expected="a folder of its own",
+            expected="a folder that is none of the parts",
             found=f"that of a part, whose {RECORD} would be written over",
             remedy="Give another --out.",
         )
@@ -143,9 +143,9 @@ def _check_same_code(ours: Provenance, theirs: Provenance, label: str, name: str
     """Of one version, and of one commit or with equal digests: compilers may make other bytes of the same sources."""
     _check_same(ours.version, theirs.version, f"{name} (provenance.version)", label)
     if ours.commit is None or ours.commit != theirs.commit:
-        (code, found) = (f"{of.sources}, commit {of.commit}" for of in (ours, theirs))
+        (code, other_code) = (f"{of.sources}, commit {of.commit}" for of in (ours, theirs))
         if ours.sources != theirs.sources:
-            _check_same(code, found, f"{name} (provenance.sources)", label)
+            _check_same(code, other_code, f"{name} (provenance.sources)", label)
 
 
 def _check_same(first: object, found: object, where: str, label: str) -> None:

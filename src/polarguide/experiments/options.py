@@ -70,15 +70,16 @@ class CompareOptions(ClusterOptions, SceneOptions):
     """How runs are trained, timed and shown.
 
     Attributes:
-        seeds: How many seeds: 3 trains with the seeds 0, 1 and 2, and shows mean and spread.
-        speed: At the end time pictures, one run after the other, where that was not done alone before.
+        seeds: Number of seeds. 3 trains each recipe with the seeds 0, 1 and 2, and tables show mean and spread.
+        speed: Measure the rendering speed of each run after all trainings, one run at a time. Runs that were already
+            measured without other work on the machine are not measured again.
         report_views: Test views of each scene in the report; 0 leaves the pictures out.
         device: The device of trainings and renderings.
-        against: One of the recipes: tables have the difference of every other one to it.
-        exposures: A row for each: as if a scene with four pictures of each view had been captured with four; three (0,
-            60, 120 degrees); two at right angles; one; one at an unknown angle; mixed, four of every fourth view and
-            the rest without a filter; sparse, every fourth view alone; none, all without a filter, and without any
-            polarization in the recipe.
+        against: Reference recipe. Tables show the difference of every other recipe to it.
+        exposures: Ways to capture, a row of the tables each, imitated with a scene of four pictures a view.
+            four: all four. three: 0, 60 and 120 degrees. two: two at right angles. one: one. unknown: one, at an
+            unknown angle. mixed: four of every fourth view, the others without a filter. sparse: every fourth view
+            alone. none: no filter, and no polarization in the recipe.
     """
 
     seeds: int = 1
@@ -139,7 +140,7 @@ class Bench:
         held_back: those that nobody tunes on.
         synth, views: how each is rendered.
         rows: names of recipes in the order of the tables, and how many seeds each is trained with.
-        training: of every run; the first seed, from which others count up.
+        training: settings of every training; the first seed, from which others count up.
     """
 
     development: tuple[str, ...]
@@ -219,9 +220,9 @@ class BenchOptions(ClusterOptions):
             if name in bench.held_back and not self.held_back:
                 raise PolarguideError(
                     "scenes",
-                    expected=f"scenes of the development half ({', '.join(half)})",
-                    found=f"{name}, which is held back",
-                    remedy="Nobody tunes on it; --held-back runs it at the end of a change that claims something.",
+                    expected=f"a development scene ({', '.join(half)})",
+                    found=f"{name}, a held-back scene",
+                    remedy="Do not tune on held-back scenes. For the last run of a finished change, add --held-back.",
                 )
             check_choice("scenes", name, half)
         return tuple(name for name in half if name in self.scenes or not self.scenes)

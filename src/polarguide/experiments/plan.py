@@ -70,12 +70,12 @@ class Comparison:
 
     Attributes:
         scenes: folders. recipes: the methods, in the order of the tables.
-        settings: of each training, as specified; the first seed, from which others count up.
+        settings: settings of each training, as specified; the first seed, from which others count up.
         options: how runs are trained, timed and shown.
         out: folder to write.
         seeds_of: by the name of a recipe, how many seeds where that is not ``options.seeds``.
         steps_of: by the name of a recipe, how many steps where that is not ``settings.steps``.
-        asked: the command line that asked, if not ``polarguide compare``.
+        command_line: for the record, if not ``polarguide compare``.
     """
 
     scenes: tuple[Path, ...]
@@ -85,7 +85,7 @@ class Comparison:
     out: Path
     seeds_of: Mapping[str, int] = field(default_factory=dict)
     steps_of: Mapping[str, int] = field(default_factory=dict)
-    asked: str = ""
+    command_line: str = ""
 
     @property
     def steps(self) -> int:
@@ -136,7 +136,7 @@ class Comparison:
             "--exposures": options.exposures,
         }
         line = [word for option, values in arguments.items() if values for word in (option, *values)]
-        return self.asked or shlex.join(map(str, ["polarguide", "compare", *self.scenes, *line]))
+        return self.command_line or shlex.join(map(str, ["polarguide", "compare", *self.scenes, *line]))
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class PlannedRun:
     """One training: a scene, a row of the tables with its recipe, and a seed.
 
     Attributes:
-        steps: of the training. settings: what it is asked for; what they leave open, ``train`` resolves.
+        steps: steps of the training. settings: what it is asked for; what they leave open, ``train`` resolves.
     """
 
     scene: SceneEntry
@@ -294,9 +294,9 @@ def run_key(
     """A short digest of everything that a training's result depends on.
 
     Args:
-        scene_digest: of the scene's files.
+        scene_digest: SHA-256 of the scene's files.
         recipe: all values of the recipe.
-        settings: of the training.
+        settings: settings of the training.
         reading: how the pictures are read.
         code: which version of the program trains.
 
@@ -335,7 +335,7 @@ def jobs_at_a_time(options: ClusterOptions, count: int, memory: int, gpus: Seque
     Args:
         options: where, and how many if that was specified.
         count: how many there are to do.
-        memory: bytes that each takes at most. gpus: of this machine, each for one job.
+        memory: bytes that each takes at most. gpus: GPUs of this machine, each for one job.
     """
     if options.jobs or not options.local:
         return max(1, min(options.jobs or count, count))

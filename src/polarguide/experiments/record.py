@@ -137,7 +137,7 @@ class Record(msgspec.Struct):
         names = {"scene": [s.name for s in self.scenes], "recipe": [r.name for r in self.recipes]}
         for kind, names_of_kind in names.items():
             if len(set(names_of_kind)) < len(names_of_kind):
-                raise _fault(f"{kind}s", "every name once", names_of_kind)
+                raise _fault(f"{kind}s", "no name more than once", names_of_kind)
         _require("settings.against", self.settings.against, [*names["recipe"], None])
         for index, run in enumerate(self.runs):
             for kind, names_of_kind in names.items():

@@ -99,9 +99,9 @@ def panel(title: str, axis: str, series: list[Series], columns: Sequence[list[st
     )
 
 
-def ticks(low: float, high: float, about: int = 6) -> list[float]:
-    """Round numbers at equal distances that enclose [low, high], roughly as many as asked for."""
-    rough = max(high - low, 1e-6) / about
+def ticks(low: float, high: float) -> list[float]:
+    """Round numbers at equal distances that enclose [low, high], about six."""
+    rough = max(high - low, 1e-6) / 6
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough * 0.999)
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)

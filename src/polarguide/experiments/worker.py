@@ -119,8 +119,12 @@ class _Work:
     def _inspect(self) -> dict[str, Any]:
         out = self.folder / INSPECTION
         reading, settings = self.task.request.reading, self.task.request.settings
-        asked = InspectSettings(refractive_index=settings.refractive_index, transfer=reading.transfer)
-        inspected = inspect_scene(self._scene, out, asked, choose_backend(self.task.compute.device))
+        inspect_settings = InspectSettings(
+            refractive_index=settings.refractive_index, transfer=reading.transfer
+        )
+        inspected = inspect_scene(
+            self._scene, out, inspect_settings, choose_backend(self.task.compute.device)
+        )
         write_inspection(inspected, out)
         findings = tuple(
             f"{check.verdict}: {check.title}: {check.finding}"
@@ -236,9 +240,9 @@ def check_code(message: Message) -> None:
     if message.files != files_digest() and message.code != code_digest():
         raise PolarguideError(
             "worker",
-            expected=f"the code of the command (digest {message.code})",
+            expected=f"the same code as the command that uses this worker (digest {message.code})",
             found=f"polarguide {__version__} with digest {code_digest()} in {Path(__file__).parents[1]}",
-            remedy="Install the same version on all machines, and leave it as it is while the command works.",
+            remedy="Install identical code on all machines, and do not change it while the command runs.",
         )
 
 

@@ -34,7 +34,7 @@ class Region:
     Attributes:
         center: [3] in the world. unit: half the side of the middle cube, in world units: half of what a picture shows
             across at the center. Within the cube, grids have their full resolution.
-        radius: of the sphere, in this unit, at least 1.
+        radius: radius of the sphere, in this unit, at least 1.
     """
 
     center: tuple[float, float, float]
@@ -54,7 +54,10 @@ class Region:
         return cls((x, y, z), unit, max(1.0, MARGIN * farthest / unit))
 
     def first_radius(self, radius: float) -> float:
-        """Radius of the initial sphere, clamped so that it stays clear of all cameras."""
+        """Radius of the sphere that the field represents before training.
+
+        ``radius``, in the field's unit, is reduced where the sphere would come near a camera.
+        """
         return min(radius, 0.5 * self.radius)
 
     def inner(self, points: Tensor) -> Tensor:
@@ -172,7 +175,7 @@ class GridField(Field):
     """Distances and features in dense grids over the region's cube, with a small head for the color.
 
     Args:
-        region: where it lies. shape: of what it is made. generator: first values are drawn from.
+        region: where it lies. shape: sizes of its grids and networks. generator: first values are drawn from.
     """
 
     def __init__(self, region: Region, shape: FieldShape, generator: torch.Generator) -> None:
@@ -221,7 +224,7 @@ class Background(nn.Module):
     """The background beyond the cameras' sphere: density and color in grids, by direction and inverse distance.
 
     Args:
-        shape: of what it is made. generator: first values are drawn from.
+        shape: sizes of its grids and networks. generator: first values are drawn from.
     """
 
     def __init__(self, shape: FieldShape, generator: torch.Generator) -> None:
@@ -273,7 +276,7 @@ class NetworkField(Field):
     """Distances of a network of places with a skip connection, colors of another one.
 
     Args:
-        region: where it lies. shape: of what it is made. generator: first values are drawn from.
+        region: where it lies. shape: sizes of its grids and networks. generator: first values are drawn from.
     """
 
     map_side = 65

@@ -61,7 +61,7 @@ class FeatureGrids(nn.Module):
 
     Args:
         resolutions: cells along a side of the cube [-1, 1]^3, one grid each.
-        channels: of each. spread: half-width of the uniform first values.
+        channels: channels of each. spread: half-width of the uniform first values.
         generator: they are drawn from.
     """
 

@@ -62,7 +62,7 @@ def march(
     sampling: Sampling,
     *,
     generator: torch.Generator | None = None,
-    kept: Callable[[Tensor], Tensor] | None = None,
+    within: Callable[[Tensor], Tensor] | None = None,
 ) -> RaySamples:
     """Look along rays.
 
@@ -71,7 +71,7 @@ def march(
         origin, direction: [N, 3] in the field's coordinates, direction of unit length.
         sampling: how many samples.
         generator: moves the samples within their strata; None: they lie in the middle.
-        kept: which places [M, 3] are there, [M] bool, and nothing lies behind them; None: everything.
+        within: which places [M, 3] are there, [M] bool, and nothing lies behind them; None: everything.
     """
     count, fine = len(origin), sampling.fine
     with torch.no_grad():
@@ -88,12 +88,12 @@ def march(
     distance = geometry.distance.view(count, fine)
     first, last = ((distance + falling * step) * field.sharpness for step in (before, after))
     alpha = section_opacity(first, last)
-    if kept is not None:
-        alpha = alpha * kept(flat).view(count, fine)
+    if within is not None:
+        alpha = alpha * within(flat).view(count, fine)
     through = torch.cumprod(1 - alpha + 1e-7, dim=1)
     weights = alpha * torch.cat((torch.ones_like(through[:, :1]), through[:, :-1]), dim=1)
     color = (weights[..., None] * colors).sum(dim=1)
-    if kept is None:
+    if within is None:
         color = color + through[:, -1:] * _behind(field, origin, direction, sampling.background, generator)
     shape = (count, fine, 3)
     return RaySamples(color, along, weights, places, geometry.slope.view(shape), normals.view(shape))

@@ -20,7 +20,7 @@ from polarguide.shading.result import RenderResult
 
 CHUNK = 4096
 """Rays at a time."""
-Kept = Callable[[Tensor], Tensor]
+Within = Callable[[Tensor], Tensor]
 """Which places [N, 3] of the scene are shown, [N] bool."""
 
 
@@ -37,7 +37,7 @@ class FieldModel:
     """A trained field: a signed distance and colors.
 
     Args:
-        state: of the training. recipe: the method. device: where layers are rendered.
+        state: state of the training. recipe: the method. device: where layers are rendered.
         trained: whether its map of distances is to be brought up to date; a training does that itself.
     """
 
@@ -84,15 +84,15 @@ class FieldModel:
         normals: bool = True,
         depth: bool = False,
         surface: bool = False,
-        kept: Kept | None = None,
+        within: Within | None = None,
     ) -> RenderResult:
         """All layers; ``depth`` only on request.
 
         Args:
             camera: any. normals: they come with the colors. surface: its depth is that of the surface in any case.
-            kept: see ``Kept``; None: all, with what lies behind.
+            within: see ``Within``; None: all, with what lies behind.
         """
-        batches = [self._ray_pixels(*rays, depth, kept) for rays in self._rays(camera)]
+        batches = [self._ray_pixels(*rays, depth, within) for rays in self._rays(camera)]
         color, normal, opacity, distance = (torch.cat(parts) for parts in zip(*batches, strict=True))
         size = (camera.height, camera.width)
         final = srgb_decode(color).view(*size, 3)
@@ -152,12 +152,14 @@ class FieldModel:
         center = self.field.region.inner(camera.pose(directions.dtype, self.device).center)
         return [(center.expand(len(part), 3), part) for part in directions.split(CHUNK)]
 
-    def _ray_pixels(self, origin: Tensor, direction: Tensor, depth: bool, kept: Kept | None) -> _RayPixels:
+    def _ray_pixels(
+        self, origin: Tensor, direction: Tensor, depth: bool, within: Within | None
+    ) -> _RayPixels:
         region = self.field.region
-        inside = None if kept is None else lambda inner: kept(region.world(inner))
-        marched = march(self.field, origin, direction, self.recipe.sampling, kept=inside)
+        inside = None if within is None else lambda inner: within(region.world(inner))
+        marched = march(self.field, origin, direction, self.recipe.sampling, within=inside)
         distance = marched.distance
         if depth:
             traced, hit = trace(self.field, origin, direction)
-            distance = torch.where(hit & (kept is None), traced, distance)
+            distance = torch.where(hit & (within is None), traced, distance)
         return _RayPixels(marched.color, marched.normal, marched.opacity, distance)

@@ -17,8 +17,8 @@ class FieldShape:
 
     Attributes:
         kind: dense grids with a small head, or the networks of the publication.
-        resolutions: of the grids, cells along a side. channels: features that each of them has.
-        width: of the two hidden layers of the heads.
+        resolutions: resolutions of the grids, cells along a side. channels: features that each of them has.
+        width: width of the two hidden layers of the heads.
         background: resolutions of the grids behind the cameras' sphere.
         first_radius: of the sphere that the surface starts as, in the unit of the region: half of what a picture shows
             across. It is never more than half of the radius of the cameras' sphere.
@@ -85,7 +85,7 @@ class FieldRates:
     Attributes:
         distances: of the coarsest grid of distances. finer: those of the others go with this power of their cells'
             size: with 1, all of them bend normals as fast.
-        features: of all grids of features. networks: of heads and networks. sharpness: of its
+        features: features of all grids of features. networks: of heads and networks. sharpness: sharpness of its
             logarithm, over 10.
         warmup: share of all steps over which they rise. last: what they end with, over what they rise to.
     """

@@ -42,7 +42,7 @@ def free_space(points: Tensor, cameras: Sequence[Camera], share: float, quantile
     """The free space in front of cameras that see SfM points [M, 3].
 
     Args:
-        share: of the depth of a view's nearest points, which is free. quantile: of depths, which is the nearest.
+        share: share of the depth of a view's nearest points, which is free. quantile: of depths, which is the nearest.
     """
     radii = []
     for camera in cameras:
@@ -78,7 +78,7 @@ class Densification:
             of them sees.
         reset_opacity: what a reset lowers opacities to (Kerbl et al. 2023).
         free_share: no Gaussian stays within this share of the depth of a view's nearest points
-            (``gaussians.densify``). free_quantile: of the points' depths, which counts as the nearest.
+            (``gaussians.densify``). free_quantile: quantile of the points' depths, which counts as the nearest.
     """
 
     every: int = 100
@@ -109,7 +109,7 @@ class DensityStatistics:
     result does not depend on the number of processes.
 
     Args:
-        count: N, of the Gaussians. slots: S, views a step. device: of the Gaussians.
+        count: N, of the Gaussians. slots: S, views a step. device: device of the Gaussians.
 
     Attributes:
         gradient, seen: sums, [N], or [S, N] for more than one slot.

@@ -150,7 +150,7 @@ class Gaussians(Trained):
         """Replace a tensor's values and zero its moments, as 3DGS does at every reset.
 
         Args:
-            values: of all Gaussians, also where ``rows`` chooses among them.
+            values: values of all Gaussians, also where ``rows`` chooses among them.
             rows: [N] bool, those whose values are replaced and whose moments are zeroed; all, if not given.
         """
         tensor = self._tensors[name]

@@ -68,7 +68,7 @@ def initial_parameters(
         colors: [M, 3] linear colors in [0, 1].
         centers: [V, 3] camera centers.
         settings: how many Gaussians are added, where, and the opacity.
-        seed: of the random positions and orientations.
+        seed: seed of the random positions and orientations.
 
     Returns:
         The tensors of ``CORE_SHAPES`` by name, float32.

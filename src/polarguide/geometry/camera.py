@@ -103,7 +103,7 @@ class Camera:
             width, height: picture size in pixels.
 
         Raises:
-            PolarguideError: they are no such matrices.
+            PolarguideError: the matrices have another shape, or are no camera's.
         """
         inner, outer = (
             torch.as_tensor(m).cpu().numpy().astype(np.float64) for m in (intrinsics, world_to_camera)

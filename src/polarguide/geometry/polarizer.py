@@ -18,7 +18,7 @@ def malus(stokes: Any, angle: Any) -> Any:
 
     Args:
         stokes: S0, S1 and S2, each [...]: an array or tensor [3, ...], or three.
-        angle: of the polarizer, radians: a number, or an array or tensor that broadcasts against [...].
+        angle: angle of the polarizer, radians: a number, or an array or tensor that broadcasts against [...].
 
     Returns:
         [...], of the type of ``stokes``.

@@ -25,7 +25,7 @@ class SceneFrame:
     Attributes:
         center: [3] float64, what the cameras look at.
         up: [3] float64, unit.
-        distance: of the cameras from the center, their median; world units, positive.
+        distance: distance of the cameras from the center, their median; world units, positive.
     """
 
     center: Tensor

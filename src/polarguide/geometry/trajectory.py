@@ -38,7 +38,7 @@ def orbit(
     """Once around the scene at the cameras' median height and distance, beginning at the first camera's side.
 
     Args:
-        cameras: of the scene, at least one; the first one's lens is used.
+        cameras: cameras of the scene, at least one; the first one's lens is used.
         frames: pictures, the last a step before the first. swing: up and down by this share of the distance, twice.
         around: the scene's frame; that of the cameras if None.
     """

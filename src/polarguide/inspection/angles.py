@@ -234,7 +234,7 @@ class Hypothesis:
 
     Attributes:
         order: sense and zero. files: the angles that the pictures called 0, 45, 90 and 135 were taken at.
-        probability: of this order. log_odds: of the most likely order to it, 0 or more.
+        probability: probability of this order. log_odds: log odds of the most likely order to it, 0 or more.
     """
 
     order: Order
@@ -259,7 +259,7 @@ class AngleFindings:
 
     Attributes:
         pairing: index into ``PAIRINGS``, from the pair sums. sources: the evidence.
-        posterior: of all usable evidence together; None if there is none.
+        posterior: posterior of all usable evidence together; None if there is none.
         applied: what ``prepare`` took the angles for; None for a scene of another origin.
         mosaic: whether ``prepare`` made the pictures of mosaics of a sensor.
     """
@@ -412,7 +412,7 @@ def handedness_check(angles: AngleFindings) -> Check:
 
 
 def zero_check(angles: AngleFindings) -> Check:
-    """Check whether the zero of the angles is the image's horizontal."""
+    """Check whether a polarizer angle of 0 degrees is the image's horizontal."""
     key, title = "zero_offset", "Zero of the angles"
     if angles.posterior is None:
         return Check(key, title, UNVERIFIED, _no_evidence(angles), _more_evidence(angles))

@@ -45,7 +45,7 @@ class InspectedView:
     """The pictures of a view, four mostly, and its pose if it has one.
 
     Attributes:
-        name: of the view.
+        name: name of the view.
         codes: linear intensities as in ``View.codes``, [K, H, W, 3] uint16.
         invalid, saturated: as in ``View``, [H, W] bool.
         black: pixels that are 0 in all angles; they count as ``saturated``, too.
@@ -86,7 +86,7 @@ class Capture:
         refractive_index: as ``scene.json`` gives it, or None.
         applied: order, sense and zero that ``prepare`` made the pictures with; None for a scene of another origin.
         factor: side of the averaged pixel boxes. transfer: how the files were read.
-        bits: of the files. size: width and height of the pictures as stored.
+        bits: bits of the files. size: width and height of the pictures as stored.
         digest: SHA-256 over the stored pictures.
         origin: the files that ``prepare`` made the pictures of.
     """

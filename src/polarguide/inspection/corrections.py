@@ -304,10 +304,10 @@ def analyzer_check(capture: Capture, path: Path | None) -> Check | None:
     """The calibration of the sensor's analyzers; None where nothing was calibrated."""
     key, title = "analyzers", "Analyzers of the sensor"
     if path is not None:
-        found = read_analyzers(path)
-        text = f"Corrected for this inspection with the calibration of {found.sensor}"
+        calibration = read_analyzers(path)
+        text = f"Corrected for this inspection with the calibration of {calibration.sensor}"
         remedy = "The scene itself is as it was: prepare its mosaics with --calibration."
-        record = found.record()
+        record = calibration.record()
     else:
         analyzers = _about(capture).analyzers
         if analyzers is None:

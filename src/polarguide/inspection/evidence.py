@@ -100,19 +100,16 @@ class SurfaceSamples:
         return self.dolp > most + 2 * self.noise
 
 
-def sample_surfaces(
-    pairs: Iterable[tuple[InspectedView, Surface]], pairing: int = 0, seed: int = 0
-) -> SurfaceSamples:
+def sample_surfaces(pairs: Iterable[tuple[InspectedView, Surface]], pairing: int = 0) -> SurfaceSamples:
     """Sample pixels with a reliable normal and significant polarization, at most 400 per view.
 
     Args:
         pairs: views and their surfaces, whose maps may be smaller than the pictures.
         pairing: the pairs of perpendicular pictures, an index into ``PAIRINGS``.
-        seed: of the random sampling.
     """
     order = [PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]
-    generator = torch.Generator().manual_seed(seed)
-    found: list[Tensor] = []
+    generator = torch.Generator().manual_seed(0)
+    samples: list[Tensor] = []
     for view, surface in pairs:
         size = surface.known.shape
         gray = view.intensities().mean(dim=-1)[order]
@@ -131,8 +128,8 @@ def sample_surfaces(
         position = position + surface.camera.center.float()
         rows = (optics.aolp(stokes), degree, spread, optics.azimuth(surface.normal, rays), zenith)
         flat = torch.stack([*(row.flatten() for row in rows), *position.reshape(-1, 3).unbind(-1)])
-        found.append(flat[:, chosen])
-    rows_found = torch.cat(found, dim=1) if found else torch.zeros(8, 0)
+        samples.append(flat[:, chosen])
+    rows_found = torch.cat(samples, dim=1) if samples else torch.zeros(8, 0)
     aolp, dolp, noise_of, azimuth, zenith_of = rows_found[:5].unbind(0)
     return SurfaceSamples(aolp, dolp, noise_of, azimuth, zenith_of, rows_found[5:].T)
 
@@ -188,13 +185,13 @@ def _log_likelihood(
     height = 1 / (math.pi * torch.special.i0e(concentration))
     across = torch.where(must, _SPECULAR, 0.5)[:, None]
     turn = torch.deg2rad(2 * zeros.float())[None]
-    found = []
+    columns = []
     for sense in SENSES:
         cosine = torch.cos(2 * (sense * pixels.aolp - pixels.azimuth)[:, None] + turn)
         lobes = across * torch.exp(-concentration * (1 + cosine))
         lobes += (1 - across) * torch.exp(-concentration * (1 - cosine))
-        found.append(torch.log((1 - inliers) / math.pi + inliers * height * lobes))
-    return torch.stack(found, dim=1)
+        columns.append(torch.log((1 - inliers) / math.pi + inliers * height * lobes))
+    return torch.stack(columns, dim=1)
 
 
 POINTS = "points observed in several views"
@@ -272,7 +269,7 @@ def _seen_pixels(
 
 
 def _observed_fields(
-    views: tuple[InspectedView, ...], points: Tensor, seen: Tensor, index: float, pairing: int
+    views: tuple[InspectedView, ...], points: Tensor, visible: Tensor, index: float, pairing: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Fields in the world and the axes perpendicular to field and ray, [2, P, V, 2, 3]; weights [P, V]; DoLP and its
     noise [P, V, 2].
@@ -299,7 +296,7 @@ def _observed_fields(
         spread = optics.dolp_noise(stokes, sampled[3])
         degrees[:, column] = torch.stack((degree, spread), dim=-1)
         certain = degree > limit + 3 * spread
-        good = seen[:, column] & inside & certain & (sampled[4] < 1e-3) & (stokes[0] > 0.02)
+        good = visible[:, column] & inside & certain & (sampled[4] < 1e-3) & (stokes[0] > 0.02)
         # Light that was polarized before the reflection turns the field by about sqrt(1 - d^2) / d times its DoLP,
         # alike in many observations: hence the square of the inverse variance that this suggests.
         weights[:, column] = good * (degree**2 / (1.05 - degree**2)) ** 2
@@ -322,12 +319,12 @@ def _spread(fields: Tensor, weights: Tensor) -> Tensor:
     e, p = fields.unbind(dim=2)
     moments = [torch.einsum("pv,pvi,pvj->pij", share, a, b) for a, b in ((e, e), (p, p), (e, p))]
     mixed = moments[2] + moments[2].mT
-    found = []
+    spreads = []
     for zero in range(DEGREES):
         c, s = math.cos(math.radians(zero)), math.sin(math.radians(zero))
         moment = c * c * moments[0] + s * s * moments[1] + s * c * mixed
-        found.append(torch.linalg.eigvalsh(moment)[:, 0].clamp(min=0))
-    return torch.stack(found, dim=1)
+        spreads.append(torch.linalg.eigvalsh(moment)[:, 0].clamp(min=0))
+    return torch.stack(spreads, dim=1)
 
 
 RECIPE = "3dgs-dr:consistent"
@@ -340,7 +337,10 @@ _AGREEMENT = 0.9
 
 
 def photograph_digest(scene: Scene) -> str:
-    """SHA-256 over what the short training sees: photographs, poses, points. No order of the pictures changes it."""
+    """SHA-256 of what the short training of an inspection reads: photographs, camera poses and points.
+
+    The order of the four pictures of a view does not affect the digest.
+    """
     digest = hashlib.sha256(scene.points.numpy().tobytes())
     for view in scene.train_views:
         camera = view.camera
@@ -372,7 +372,7 @@ def short_run(
         steps: optimizer steps.
         backend: device and rasterizer.
         on_step: called after every step.
-        refractive_index: of the surfaces; None: that of the scene.
+        refractive_index: refractive index of the surfaces; None: that of the scene.
         recipe: what trains; None: ``RECIPE``.
         until: the step to stop after; 0: the last.
     """
@@ -380,8 +380,8 @@ def short_run(
         named = recipe_named(RECIPE)
         assert isinstance(named, Recipe)
         recipe = named
-    asked = TrainSettings(steps, 0, refractive_index, begin_again=False)
-    settings = resolve(asked, scene, recipe)
+    specified = TrainSettings(steps, 0, refractive_index, begin_again=False)
+    settings = resolve(specified, scene, recipe)
     wanted = {
         "photographs": photograph_digest(scene),
         "steps": steps,

@@ -67,7 +67,7 @@ GATE_SHARE = 0.02
 
 @dataclass(frozen=True)
 class PairError:
-    """Median distance of matches from their epipolar lines between two views, in stored pixels."""
+    """Median distance between the feature matches of two views and their epipolar lines, in pixels as stored."""
 
     first: str
     second: str
@@ -80,12 +80,12 @@ def epipolar_errors(capture: Capture) -> list[PairError]:
     views = capture.posed
     features = [_features(view) for view in views]
     pairs = _neighbor_pairs([view.camera for view in views if view.camera is not None])
-    found = []
+    errors = []
     for i, j in pairs:
         error = _pair_error(views[i], views[j], features[i], features[j], capture.factor)
         if error is not None:
-            found.append(error)
-    return found
+            errors.append(error)
+    return errors
 
 
 def view_errors(errors: Sequence[PairError]) -> dict[str, float]:
@@ -100,9 +100,9 @@ def view_errors(errors: Sequence[PairError]) -> dict[str, float]:
 def _features(view: InspectedView) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
     gray = view.codes.numpy().astype(np.float64).mean(axis=(0, 3))
     top = max(float(np.percentile(gray, 99.5)), 1.0)
-    shown = (255 * np.clip(gray / top, 0, 1) ** (1 / 2.2)).astype(np.uint8)
+    encoded = (255 * np.clip(gray / top, 0, 1) ** (1 / 2.2)).astype(np.uint8)
     keypoints, descriptors = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.02).detectAndCompute(  # type: ignore[attr-defined]
-        shown, None
+        encoded, None
     )
     # OpenCV has its first pixel center at 0, COLMAP at 0.5.
     places = np.array([point.pt for point in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
@@ -135,11 +135,11 @@ def _pair_error(
         return None
     there = cv2.BFMatcher(cv2.NORM_L2).knnMatch(d1, d2, k=2)
     back = {m.queryIdx: m.trainIdx for m in cv2.BFMatcher(cv2.NORM_L2).match(d2, d1)}
-    kept = [m for m, n in there if m.distance < RATIO * n.distance and back.get(m.trainIdx) == m.queryIdx]
-    if len(kept) < FEWEST_MATCHES:
+    matches = [m for m, n in there if m.distance < RATIO * n.distance and back.get(m.trainIdx) == m.queryIdx]
+    if len(matches) < FEWEST_MATCHES:
         return None
-    p1 = np.concatenate([x1[[m.queryIdx for m in kept]], np.ones((len(kept), 1))], axis=1)
-    p2 = np.concatenate([x2[[m.trainIdx for m in kept]], np.ones((len(kept), 1))], axis=1)
+    p1 = np.concatenate([x1[[m.queryIdx for m in matches]], np.ones((len(matches), 1))], axis=1)
+    p2 = np.concatenate([x2[[m.trainIdx for m in matches]], np.ones((len(matches), 1))], axis=1)
     matrix = _fundamental(first.camera, second.camera)
     along2, along1 = p1 @ matrix.T, p2 @ matrix
     value = np.abs((p2 * along2).sum(axis=1))
@@ -209,18 +209,21 @@ def coverage_check(capture: Capture) -> Check:
     if len(cameras) < 2:
         return Check(key, title, "n/a", "Fewer than two views have a pose.")
     focus = scene_frame(cameras).center
-    seen = unit_array(torch.stack([camera.center - focus for camera in cameras]).numpy())
-    angles = np.degrees(np.arccos(np.clip(seen @ seen.T, -1, 1))) + 360 * np.eye(len(seen))
+    directions = unit_array(torch.stack([camera.center - focus for camera in cameras]).numpy())
+    angles = np.degrees(np.arccos(np.clip(directions @ directions.T, -1, 1))) + 360 * np.eye(len(directions))
     nearest = angles.min(axis=1)
-    spread = float(np.degrees(np.arccos(np.clip(seen @ unit_array(seen.mean(axis=0)), -1, 1))).max())
-    figures = {"views": len(seen), "median_step_deg": float(np.median(nearest)),
+    spread = float(
+        np.degrees(np.arccos(np.clip(directions @ unit_array(directions.mean(axis=0)), -1, 1))).max()
+    )
+    figures = {"views": len(directions), "median_step_deg": float(np.median(nearest)),
                "largest_step_deg": float(nearest.max()), "half_angle_deg": spread}  # fmt: skip
     finding = (
-        f"{len(seen)} views, {np.median(nearest):.0f}° from the nearest view (median; at most {nearest.max():.0f}°), "
+        f"{len(directions)} views, {np.median(nearest):.0f}° from the nearest view "
+        f"(median; at most {nearest.max():.0f}°), "
         f"within {spread:.0f}° of their mean direction."
     )
     lonely = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > GAP_DEG)
-    if lonely or len(seen) < FEW_VIEWS:
+    if lonely or len(directions) < FEW_VIEWS:
         return Check(
             key, title, "warning", finding,
             "Reconstruction is unreliable across gaps: add views at most 15 degrees apart.", lonely, figures,
@@ -240,7 +243,7 @@ class Inspection:
 
     Attributes:
         capture: what was inspected. settings: how. index: the refractive index that was used.
-        measurements: of each view. checks: in the order in which they are shown.
+        measurements: measurements of each view. checks: in the order in which they are shown.
         angles: order, sense and zero; of a capture with other pictures, what each tells of its polarizer.
     """
 
@@ -337,15 +340,15 @@ def _shots(
         checks += [pose_check(capture), coverage_check(capture)]
     if len(capture.posed) < FEWEST_TO_TRAIN:
         why = f"The angles are checked by a short training, which takes {FEWEST_TO_TRAIN} views with a pose."
-        found = ShotFindings(why=why)
+        findings = ShotFindings(why=why)
     elif settings.normals == "points":
-        found = ShotFindings(
+        findings = ShotFindings(
             why="The angles are checked by a short training, which --normals points leaves out."
         )
     else:
         scene = _training_scene(capture, settings, reporter, held_out=())
         with reporter.track("short training", settings.steps) as advance:
-            found = find_shots(
+            findings = find_shots(
                 scene,
                 out / RUN_FOLDER,
                 steps=settings.steps,
@@ -353,7 +356,7 @@ def _shots(
                 backend=backend,
                 on_step=lambda report: advance(min(report.step + 1, settings.steps)),
             )
-    return checks + shot_checks(found), found
+    return checks + shot_checks(findings), findings
 
 
 def _angles(

@@ -182,10 +182,10 @@ def response_curvature(capture: Capture) -> tuple[float, float] | None:
     count = total[0, 0]
     if count < 1000 or total[3, 3] / count - (total[0, 3] / count) ** 2 < 0.005**2:
         return None
-    found = slope(total)
+    curvature = slope(total)
     without = np.array([slope(total - part) for part in groups])
-    error = math.sqrt(float(((without - found) ** 2).sum()) * (len(groups) - 1) / len(groups))
-    return found, error
+    error = math.sqrt(float(((without - curvature) ** 2).sum()) * (len(groups) - 1) / len(groups))
+    return curvature, error
 
 
 def _exposure(

@@ -73,8 +73,8 @@ SHOT_LAYERS: tuple[Layer, ...] = (
 def layer_uris(view: InspectedView, layers: Sequence[Layer]) -> dict[str, str]:
     """Layers of a view as data URIs, by key."""
     photograph = view.intensities().mean(dim=0)
-    shown = figures.radiance_to_rgb(photograph / max(quantile(photograph, 0.99), 1e-6))
-    pictures = {"s0": shown, "saturation": _marked(shown, view)}
+    photograph_shown = figures.radiance_to_rgb(photograph / max(quantile(photograph, 0.99), 1e-6))
+    pictures = {"s0": photograph_shown, "saturation": _marked(photograph_shown, view)}
     if layers is LAYERS:
         pictures |= _of_four(view)
     return {layer.key: data_uri(pictures[layer.key], layer.key, SIDE) for layer in layers}
@@ -94,9 +94,9 @@ def _of_four(view: InspectedView) -> dict[str, Picture]:
     }
 
 
-def _marked(shown: Picture, view: InspectedView) -> Picture:
+def _marked(picture: Picture, view: InspectedView) -> Picture:
     """The photograph in dark gray, with saturated and invalid pixels in color."""
-    dim = (shown.mean(axis=-1, keepdims=True) * 0.6).astype(np.uint8).repeat(3, axis=-1)
+    dim = (picture.mean(axis=-1, keepdims=True) * 0.6).astype(np.uint8).repeat(3, axis=-1)
     for mask, color in (
         (view.black | view.invalid, INVALID_COLOR),
         (view.saturated & ~view.black, SATURATED_COLOR),
@@ -109,19 +109,19 @@ def _marked(shown: Picture, view: InspectedView) -> Picture:
 FILE = "inspection.html"
 
 
-def inspection_html(found: Inspection, reporter: Reporter = SILENT) -> str:
+def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
     """The HTML page; all names and texts in it are escaped.
 
     Args:
-        found: the findings.
+        inspection: the findings.
         reporter: receives the progress.
     """
-    capture, settings, angles = found.capture, found.settings, found.angles
+    capture, settings, angles = inspection.capture, inspection.settings, inspection.angles
     layers = LAYERS if capture.four else SHOT_LAYERS
-    marked = {name for check in found.checks for name in check.views}
+    marked = {name for check in inspection.checks for name in check.views}
     tiles = []
     with reporter.track("drawing", len(capture.views)) as advance:
-        for view, measured in zip(capture.views, found.measurements, strict=True):
+        for view, measured in zip(capture.views, inspection.measurements, strict=True):
             uris = layer_uris(view, layers)
             pictures = [(layer, uris[layer.key], layer.caption(measured)) for layer in layers]
             tiles.append((measured.view, view.name in marked, pictures))
@@ -133,20 +133,20 @@ def inspection_html(found: Inspection, reporter: Reporter = SILENT) -> str:
         "inspection.html",
         title=f"Inspection of {capture.name}",
         summary=f"{len(capture.views)} views of {width} x {height} pixels, {capture.bits} bits; {posed}",
-        found=found,
+        found=inspection,
         why=_why(angles),
         orders=_orders(angles) if isinstance(angles, AngleFindings) else [],
         shots=_shots(angles) if isinstance(angles, ShotFindings) else [],
         notes=_notes(angles) if isinstance(angles, AngleFindings) else [],
         layers=layers,
         ramps={layer.ramp: figures.color_gradient(layer.ramp) for layer in layers if layer.ramp},
-        wheel=figures.aolp_wheel(),
+        wheel=data_uri(figures.angle_wheel(), "aolp", 2 * SIDE),
         tiles=tiles,
-        figures=_figures(found.measurements),
+        figures=_figures(inspection.measurements),
         facts={
             "transfer": capture.transfer,
             "box filter": f"{capture.factor} x {capture.factor} pixels",
-            "refractive index": f"{found.index:g}",
+            "refractive index": f"{inspection.index:g}",
             "normals": f"{settings.normals}, {settings.steps} steps if trained",
             "SHA-256 of the pictures": capture.digest,
         },
@@ -176,23 +176,23 @@ def _orders(angles: AngleFindings) -> list[tuple[str, str, float, str]]:
 
 
 def _notes(angles: AngleFindings) -> list[str]:
-    found = angles.posterior
-    zero = "" if found is None else f"{found.offset:+.2f}° ± {found.offset_error:.2f}°"
+    posterior = angles.posterior
+    zero = "" if posterior is None else f"{posterior.offset:+.2f}° ± {posterior.offset_error:.2f}°"
     notes = [f"Zero offset beyond the best order: {zero}."] if zero else []
     return notes + [
         f"{e.source.capitalize()}{'' if e.usable else ' (not used)'}: {e.note}" for e in angles.sources
     ]
 
 
-def _shots(found: ShotFindings) -> list[tuple[str, ...]]:
+def _shots(findings: ShotFindings) -> list[tuple[str, ...]]:
     """Rows of the table of angles: what is specified of each picture, and what was found."""
     rows: list[tuple[str, ...]] = []
-    for judgment, exposure in zip(found.judgments, found.stated, strict=True):
+    for judgment, exposure in zip(findings.judgments, findings.stated, strict=True):
         angle = "without a filter, as it looks" if judgment.unfiltered else f"{judgment.angle:.0f}°"
         angle = "too little polarization to tell" if judgment.vague else angle
         numbers = (f"{judgment.spread:.1f}°", f"{judgment.modulation:.2f}", f"{judgment.gain:.2f}")
         rows.append((judgment.view, exposure.words, angle, *numbers))
-    return [] if found.why else rows
+    return [] if findings.why else rows
 
 
 def _figures(measurements: Sequence[ViewMeasurements]) -> list[tuple[str, ...]]:
@@ -225,9 +225,9 @@ SCHEMA = 2
 RECORD = "inspection.json"
 
 
-def inspection_record(found: Inspection) -> dict[str, Any]:
+def inspection_record(inspection: Inspection) -> dict[str, Any]:
     """The findings as plain JSON types; docs/reference/inspection.md describes the keys."""
-    capture = found.capture
+    capture = inspection.capture
     record: dict[str, Any] = plain(
         {
             "schema": SCHEMA,
@@ -243,27 +243,27 @@ def inspection_record(found: Inspection) -> dict[str, Any]:
             "settings": {
                 "downscale": capture.factor,
                 "transfer": capture.transfer,
-                "refractive_index": found.index,
-                "normals": found.settings.normals,
-                "steps": found.settings.steps,
+                "refractive_index": inspection.index,
+                "normals": inspection.settings.normals,
+                "steps": inspection.settings.steps,
             },
-            "verdict": found.verdict,
-            "checks": [check.record() for check in found.checks],
-            "angles": found.angles.record(),
-            "views": [measured.record() for measured in found.measurements],
+            "verdict": inspection.verdict,
+            "checks": [check.record() for check in inspection.checks],
+            "angles": inspection.angles.record(),
+            "views": [measured.record() for measured in inspection.measurements],
         }
     )
     return record
 
 
-def write_inspection(found: Inspection, out: Path, reporter: Reporter = SILENT) -> tuple[Path, Path]:
+def write_inspection(inspection: Inspection, out: Path, reporter: Reporter = SILENT) -> tuple[Path, Path]:
     """Write the page and ``inspection.json`` into a folder; returns their paths.
 
     Raises:
-        PolarguideError: they cannot be written.
+        PolarguideError: a file cannot be written.
     """
     make_folder(out)
     page, record = out / FILE, out / RECORD
-    write_whole(record, to_json(inspection_record(found)))
-    write_text(page, inspection_html(found, reporter))
+    write_whole(record, to_json(inspection_record(inspection)))
+    write_text(page, inspection_html(inspection, reporter))
     return page, record

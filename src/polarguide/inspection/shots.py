@@ -111,12 +111,15 @@ def find_shots(
     backend: Backend,
     on_step: Callable[[StepReport], None],
 ) -> ShotFindings:
-    """Train without any angle until all are found.
+    """Estimate the polarizer angle of every shot by a training that starts with no known angle.
 
     Args:
-        scene: at the size to train at, with views that are trained on. folder: where the state is kept.
-        steps: about how many to take. refractive_index: of the surfaces.
-        backend: device and rasterizer. on_step: called after every step.
+        scene: scene at the size to train at; it needs training views.
+        folder: folder of the training's state, from which a stopped search resumes.
+        steps: approximate number of training steps.
+        refractive_index: refractive index of the surfaces.
+        backend: device and rasterizer.
+        on_step: function called after every step.
     """
     if not any(exposure.filtered for view in scene.train_views for exposure in view.exposures):
         return ShotFindings(why="No picture was taken through a filter.", unfiltered=True)

@@ -28,7 +28,10 @@ def safe_sqrt(x: Tensor) -> Tensor:
 
 
 def safe_atan2(y: Tensor, x: Tensor) -> Tensor:
-    """``atan2(y, x)`` in radians; value and gradient are zero where both are (below the smallest normal)."""
+    """``atan2(y, x)`` in radians; value and gradient are zero where both y and x are.
+
+    A number below the smallest normal floating-point number counts as zero.
+    """
     y, x = torch.broadcast_tensors(y, x)
     size = torch.maximum(y.abs(), x.abs()).detach()
     live = size > torch.finfo(size.dtype).tiny

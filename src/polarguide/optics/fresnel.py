@@ -47,7 +47,7 @@ def reflectances_from_cosine(cosine: Tensor, refractive_index: float | Tensor = 
 
     Args:
         cosine: [...] cos(zenith); negative values (a normal that faces away) count as grazing.
-        refractive_index: of the surface, more than 1.
+        refractive_index: refractive index of the surface, more than 1.
 
     Returns:
         (Rs, Rp), each [...] in [0, 1].
@@ -68,7 +68,7 @@ def reflectances(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> tupl
 
     Args:
         zenith: [...] angle of incidence, radians.
-        refractive_index: of the surface, more than 1.
+        refractive_index: refractive index of the surface, more than 1.
 
     Returns:
         (Rs, Rp), each [...] in [0, 1].
@@ -88,7 +88,7 @@ def transmittances(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> tu
 
     Args:
         zenith: [...] angle outside the dielectric, radians.
-        refractive_index: of the surface, more than 1.
+        refractive_index: refractive index of the surface, more than 1.
 
     Returns:
         (Ts, Tp), each [...] in [0, 1].
@@ -113,7 +113,7 @@ def dolp_slopes(cosine: Tensor, refractive_index: float | Tensor = 1.5) -> tuple
 
     Args:
         cosine: [...] cos(zenith); negative values count as grazing.
-        refractive_index: of the surface, more than 1.
+        refractive_index: refractive index of the surface, more than 1.
 
     Returns:
         (rho_s / sin^2, rho_d / sin^2), each [...], positive.
@@ -139,7 +139,7 @@ def specular_dolp(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Ten
 
     Args:
         zenith: [...] radians.
-        refractive_index: of the surface, more than 1.
+        refractive_index: refractive index of the surface, more than 1.
 
     Returns:
         [...] in [0, 1].
@@ -159,7 +159,7 @@ def diffuse_dolp(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Tens
 
     Args:
         zenith: [...] radians.
-        refractive_index: of the surface, more than 1.
+        refractive_index: refractive index of the surface, more than 1.
 
     Returns:
         [...] in [0, 1).
@@ -208,7 +208,7 @@ def diffuse_zenith(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> Tens
 
     Args:
         dolp: [...]; clamped to [0, ``diffuse_dolp_limit(refractive_index)``].
-        refractive_index: of the surface, more than 1.
+        refractive_index: refractive index of the surface, more than 1.
 
     Returns:
         [...] radians in [0, pi/2]. The gradient, infinite in the limit of d = 0, is 0 at d = 0 itself.
@@ -235,7 +235,7 @@ def specular_zeniths(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> tu
 
     Args:
         dolp: [...]; clamped to [0, 1].
-        refractive_index: of the surface, more than 1.
+        refractive_index: refractive index of the surface, more than 1.
 
     Returns:
         (below, above) Brewster's angle, each [...] radians in [0, pi/2]; equal at d = 1. Gradients, infinite

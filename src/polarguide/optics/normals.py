@@ -94,7 +94,7 @@ def paper_candidates(stokes: Tensor, rays: Tensor, refractive_index: float | Ten
     Args:
         stokes: [3, ...] of the luminance.
         rays: [..., 3] unit camera rays.
-        refractive_index: of the surface, more than 1: a number or [...].
+        refractive_index: refractive index of the surface, more than 1: a number or [...].
 
     Returns:
         Candidates.
@@ -119,7 +119,7 @@ def physical_candidates(
     Args:
         stokes: [3, ...] of the luminance.
         rays: [..., 3] unit camera rays.
-        refractive_index: of the surface, more than 1: a number or [...].
+        refractive_index: refractive index of the surface, more than 1: a number or [...].
 
     Returns:
         PhysicalCandidates. Candidates that are not valid hold the clamped value.
@@ -201,8 +201,8 @@ def dolp_noise(stokes: Tensor, noise_sigma: float | Tensor) -> Tensor:
 
     Args:
         stokes: [3, ...].
-        noise_sigma: of one of the four intensities in the units of ``stokes``, a number or [...]. For the
-            mean over three colors with independent noise, 1/sqrt(3) of one channel's.
+        noise_sigma: standard deviation of one of the four intensities in the units of ``stokes``, a number or [...].
+            For the mean over three colors with independent noise, 1/sqrt(3) of one channel's.
 
     Returns:
         [...]; infinite where S0 <= 0 and the noise is positive.
@@ -313,7 +313,7 @@ def chromatic_normals(
 
     Args:
         stokes: [3, H, W, C] with the colors last.
-        refractive_index: of the surface, more than 1.
+        refractive_index: refractive index of the surface, more than 1.
         window: odd side of the window in pixels; the surface should be flat over it.
         minimum_certainty: least certainty of a decided pixel.
         minimum_contrast: least standard deviation of S0 among the colors, as a share of S0.

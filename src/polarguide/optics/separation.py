@@ -58,7 +58,7 @@ def exact_separation(
         stokes: [3, ..., C] with the colors last.
         normals: [..., 3] camera axes; only the direction matters.
         rays: [..., 3] unit camera rays.
-        refractive_index: of the surface, more than 1: a number or [...].
+        refractive_index: refractive index of the surface, more than 1: a number or [...].
         minimum_contrast: least ``rho_s + rho_d`` that counts as well-conditioned. The default excludes
             zeniths below about 11 degrees at n = 1.5. The divisor itself is held above a tenth of it, which
             bounds the amplification of noise.
@@ -98,7 +98,7 @@ def paper_separation(stokes: Tensor, zenith: Tensor, refractive_index: float | T
     Args:
         stokes: [3, ..., C] with the colors last.
         zenith: [...] radians.
-        refractive_index: of the surface, more than 1: a number or [...].
+        refractive_index: refractive index of the surface, more than 1: a number or [...].
 
     Returns:
         Separation in units of S0, ``conditioned`` True everywhere.
@@ -123,19 +123,20 @@ def paper_intensities(
     polarizer: float | Tensor,
     refractive_index: float | Tensor = 1.5,
 ) -> tuple[Tensor, Tensor]:
-    """The reflection cue of PolarGuide-GSDR behind a polarizer: both layers as functions of its angle.
+    """Intensities of both layers behind a polarizer, by the reflection cue of PolarGuide-GSDR.
 
-    ``(Imax + Imin) / 2 + (Imax - Imin) / 2 * cos 2(polarizer - s_direction)`` with Imax, Imin = ``S0 / 2``
-    times Rs, Rp; for the diffuse layer the p-direction, the light left over, and Tp, Ts. (PolarGuide-GSDR has
-    ``cos 2 theta`` with the angle from the image's x axis, which would change when the camera rolls.) The
-    mean over the four polarizer angles is half of ``paper_separation``.
+    A layer's intensity is ``(Imax + Imin) / 2 + (Imax - Imin) / 2 * cos 2(polarizer - d)``. The specular layer has
+    ``Imax = S0 / 2 * Rs``, ``Imin = S0 / 2 * Rp`` and ``d = s_direction``. The diffuse layer has Tp and Ts of the light
+    that is left in place of Rs and Rp of S0, and d is perpendicular to ``s_direction``. (PolarGuide-GSDR has ``cos 2
+    theta`` with the angle from the image's x axis, which would change when the camera rolls.) The mean over the four
+    polarizer angles is half of what ``paper_separation`` returns.
 
     Args:
         stokes: [3, ..., C] with the colors last.
         zenith: [...] radians.
         s_direction: [...] radians, the direction perpendicular to the plane of incidence: azimuth + pi/2.
         polarizer: radians, a number or [...].
-        refractive_index: of the surface, more than 1: a number or [...].
+        refractive_index: refractive index of the surface, more than 1: a number or [...].
 
     Returns:
         (specular, diffuse) intensities, each [..., C].
@@ -170,7 +171,7 @@ def predicted_stokes(
         specular, diffuse: [..., C] units of S0, the colors last.
         normals: [..., 3] camera axes; only the direction matters.
         rays: [..., 3] unit camera rays.
-        refractive_index: of the surface, more than 1: a number or [...].
+        refractive_index: refractive index of the surface, more than 1: a number or [...].
 
     Returns:
         [3, ..., C].

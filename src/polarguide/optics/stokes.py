@@ -142,7 +142,7 @@ def filter_analyzer(angle: float | Tensor, rays: Tensor) -> Tensor:
     (x, y) that is up to about ``x y / 2`` radians away from the angle at which the sheet is mounted.
 
     Args:
-        angle: of the transmission axis, radians counter-clockwise as displayed; a number or a tensor of one.
+        angle: angle of the transmission axis, radians counter-clockwise as displayed; a number or a tensor of one.
         rays: [..., 3] unit, camera axes.
 
     Returns:

@@ -65,8 +65,8 @@ def exposures_of_points(values: Array) -> tuple[Array, NDArray[np.int64]]:
     if len(chosen) < 2:
         return logs, numbers
     valid = valid[:, chosen]
-    kept = valid.sum(axis=1) >= 2
-    valid, log = valid[kept], np.log(np.where(valid, values[:, chosen], 1.0))[kept]
+    paired = valid.sum(axis=1) >= 2
+    valid, log = valid[paired], np.log(np.where(valid, values[:, chosen], 1.0))[paired]
     weights = valid.astype(np.float64)
     for _ in range(_ROUNDS):
         total = weights.sum(axis=1)
@@ -74,13 +74,13 @@ def exposures_of_points(values: Array) -> tuple[Array, NDArray[np.int64]]:
         matrix = np.diag(weights.sum(axis=0)) - (weights.T / total) @ weights
         right = (weights * log).sum(axis=0) - weights.T @ ((weights * log).sum(axis=1) / total)
         scale = max(float(np.trace(matrix)) / len(matrix), 1e-12)
-        found = np.linalg.solve(matrix + scale / len(matrix), right)
-        found -= found.mean()
-        bright = (weights * (log - found)).sum(axis=1) / total
-        residual = np.where(valid, log - found - bright[:, None], 0.0)
+        solution = np.linalg.solve(matrix + scale / len(matrix), right)
+        solution -= solution.mean()
+        bright = (weights * (log - solution)).sum(axis=1) / total
+        residual = np.where(valid, log - solution - bright[:, None], 0.0)
         scatter = (residual**2).sum(axis=1) / np.maximum(valid.sum(axis=1) - 1, 1)
         weights = valid / np.maximum(np.abs(residual), _SMALLEST) / np.maximum(scatter, _SMALLEST**2)[:, None]
-    logs[chosen] = found
+    logs[chosen] = solution
     return logs, numbers
 
 
@@ -223,28 +223,28 @@ def _estimate(root: Path, pictures: list[_Exposure], posed: bool, reporter: Repo
     of_view = np.array([float(np.mean((files - within)[rows[view]])) for view in views])
     # Views that were photographed both ways: whatever the shots are compared at, most of it passed the filter.
     bare = np.array([all(pictures[k].record["angle"] == "none" for k in rows[view]) for view in views])
-    found = reconciled(points, of_view, bare)
-    lost = [view for view, log in zip(views, found.logs, strict=True) if not math.isfinite(log)]
-    middle = float(np.nanmean(found.logs)) if len(lost) < len(views) else 0.0
+    estimate = reconciled(points, of_view, bare)
+    lost = [view for view, log in zip(views, estimate.logs, strict=True) if not math.isfinite(log)]
+    middle = float(np.nanmean(estimate.logs)) if len(lost) < len(views) else 0.0
     for place, view in enumerate(views):
-        log = found.logs[place] if math.isfinite(found.logs[place]) else middle
+        log = estimate.logs[place] if math.isfinite(estimate.logs[place]) else middle
         for k in rows[view]:
             pictures[k].log, pictures[k].points = float(log + within[k]), int(numbers[place])
-    _say_how(views, points, of_view, found.scatter, lost, reporter)
-    _warn([views[k] for k in found.contradicted], pictures, of_view, reporter)
+    _say_how(views, points, of_view, estimate.scatter, lost, reporter)
+    _warn([views[k] for k in estimate.contradicted], pictures, of_view, reporter)
 
 
 def _within_views(pictures: list[_Exposure], files: NDArray[np.float64]) -> NDArray[np.float64]:
     """Logarithms of exposures relative to the mean of their view, as the files say; 0 where not all of them do."""
-    found = np.zeros(len(pictures))
+    relative = np.zeros(len(pictures))
     for view in {picture.view for picture in pictures}:
         places = [k for k, picture in enumerate(pictures) if picture.view == view]
         bare = np.array([pictures[k].record["angle"] == "none" for k in places])
         # Beside shots through the filter, one without gets twice the light at the same exposure.
         extra = np.where(bare & (not bare.all()), math.log(2.0), 0.0)
         logs = files[places] + extra if np.isfinite(files[places]).all() else extra
-        found[places] = logs - logs.mean()
-    return found
+        relative[places] = logs - logs.mean()
+    return relative
 
 
 def _values(
@@ -262,8 +262,8 @@ def _values(
     places = model.points.double().numpy()
     with reporter.track("comparing exposures", len(views)) as advance:
         for column, view in enumerate(views):
-            seen = np.flatnonzero(observed[:, column])
-            if len(seen):
+            visible = np.flatnonzero(observed[:, column])
+            if len(visible):
                 files = [root / "polar" / pictures[k].file for k in rows[view]]
                 gray = np.mean(
                     [_gray(path) / math.exp(within[k]) for path, k in zip(files, rows[view], strict=True)],
@@ -271,7 +271,7 @@ def _values(
                 )
                 path = root / "invalid" / f"{view}.png"
                 bad = decode_mask(path, read_picture(path), any_value=True)
-                values[seen, column] = _at(places[seen], model.camera(view), gray, bad)
+                values[visible, column] = _at(places[visible], model.camera(view), gray, bad)
             advance(column + 1)
     return values
 
@@ -292,11 +292,11 @@ def _at(
     row = np.floor(camera.fy * local[:, 1] / depth + camera.cy)
     height, width = gray.shape
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    found = np.full(len(places), math.nan)
+    values = np.full(len(places), math.nan)
     at = row[inside].astype(int), column[inside].astype(int)
     means, spoiled = cv2.blur(gray, _PATCH), cv2.dilate(bad.astype(np.uint8), np.ones(_PATCH, np.uint8)) > 0
-    found[inside] = np.where(spoiled[at] | (means[at] < _DARK), math.nan, means[at])
-    return found
+    values[inside] = np.where(spoiled[at] | (means[at] < _DARK), math.nan, means[at])
+    return values
 
 
 def _apply_given(pictures: list[_Exposure]) -> None:

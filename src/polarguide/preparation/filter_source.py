@@ -146,27 +146,27 @@ class ShotsSource(Source):
 
     def _developed(
         self,
-        found: _Linear,
+        picture: _Linear,
         upright: NDArray[np.float32],
         record: dict[str, Any],
         angles: Sequence[Angle] = ANGLES,
     ) -> DevelopedView:
         """The view of pictures [K, H, W, 3] that are turned for display, with a record of the measurements beside."""
         height, width = upright.shape[1:3]
-        shots = found.shots
+        shots = picture.shots
         return DevelopedView(
             intensities=np.ascontiguousarray(upright),
-            invalid=np.ascontiguousarray(apply_orientation(found.invalid, found.orientation)),
+            invalid=np.ascontiguousarray(apply_orientation(picture.invalid, picture.orientation)),
             geometry=Geometry((width, height), (0, 0), 1, (width, height)),
             record={
-                "orientation": found.orientation,
+                "orientation": picture.orientation,
                 **record,
                 "clipped_share": round(float(shots.clipped.any(axis=0).mean()), 6),
                 "dark_share": round(float(shots.dark.mean()), 6),
-                "invalid_share": round(float(found.invalid.mean()), 6),
+                "invalid_share": round(float(picture.invalid.mean()), 6),
             },
             angles=angles,
-            notes=tuple(found.notes),
+            notes=tuple(picture.notes),
         )
 
 
@@ -195,17 +195,17 @@ class FilterSource(ShotsSource):
         unused = [path.name for path in list_shots(root, nested=True)[1]]
         unused += [path.name for files in shots.values() for a, path in files.items() if a not in ANGLES]
         if unused:
-            found = f"{root} has pictures without an angle in their names, or at other angles than 0, 45, 90 and 135"
-            warnings.warn(f"{found}, which are not used ({listed(unused)}).", PolarguideWarning, stacklevel=2)
+            fault = f"{root} has pictures without an angle in their names, or at other angles than 0, 45, 90 and 135"
+            warnings.warn(f"{fault}, which are not used ({listed(unused)}).", PolarguideWarning, stacklevel=2)
         views = {view: [files[angle] for angle in ANGLES] for view, files in sorted(shots.items())}
         super().__init__([path for files in views.values() for path in files], views, settings)
 
     def measure(self, advance: Advance) -> dict[str, Any]:
         """The transfer of the capture, from a few views spread over it."""
         self._require_memory("four shots")
-        asked = self._settings
-        gains, notes = asked.calibration.gains, []
-        transfer: str = asked.transfer
+        settings = self._settings
+        gains, notes = settings.calibration.gains, []
+        transfer: str = settings.transfer
         if transfer == "auto" and all(map(is_camera_raw, self.paths)):
             transfer, note = transfer_of_kind(CAMERA_RAW, transfer)
             notes.append(note)
@@ -220,14 +220,14 @@ class FilterSource(ShotsSource):
             notes.append(f"Transfer {decision.reason}.")
             if decision.doubt:
                 warnings.warn(decision.doubt, PolarguideWarning, stacklevel=2)
-        stated = stated_exposures(self._of_view, advance) if asked.gains == "auto" else {}
+        stated = stated_exposures(self._of_view, advance) if settings.gains == "auto" else {}
         notes += exposure_notes(stated, len(self.views))
         # One scale for all shots, with room for the largest gain that is corrected.
         room = math.sqrt(1.0 - LARGEST_IMBALANCE)
-        if gains is None and asked.gains == "auto":
+        if gains is None and settings.gains == "auto":
             notes.append(UNIDENTIFIED)
-        scale = min(1.0, *gains) if gains is not None else room if asked.gains == "auto" else 1.0
-        scale /= asked.calibration.peak
+        scale = min(1.0, *gains) if gains is not None else room if settings.gains == "auto" else 1.0
+        scale /= settings.calibration.peak
         smallest = scale / (max(gains) if gains is not None else 1.0 / room)
         every = [value for of_view in stated.values() for value in of_view] or [1.0]
         return {
@@ -245,21 +245,21 @@ class FilterSource(ShotsSource):
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read the four shots: validity, transfer, shifts, exposures, gains, the sense of the angles, then the turn."""
-        asked = self._settings
-        found = self._linear(view, measured, align=asked.align)
-        usable, paths = ~found.invalid, self._of_view[view]
+        settings = self._settings
+        developed = self._linear(view, measured, align=settings.align)
+        usable, paths = ~developed.invalid, self._of_view[view]
         light = [measured["light"].get(self._name(path), 1.0) for path in paths]
         exposed = ShotExposures(UNIT_GAINS)
-        if asked.gains == "auto":
+        if settings.gains == "auto":
             exposed = exposures_of_view(
-                [path.name for path in paths], found.linear.mean(axis=3), usable, light
+                [path.name for path in paths], developed.linear.mean(axis=3), usable, light
             )
         if exposed.warning:
             warnings.warn(f"{view}: {exposed.warning}", PolarguideWarning, stacklevel=2)
-        linear = found.linear / np.asarray(exposed.gains, np.float32)[:, None, None, None]
+        linear = developed.linear / np.asarray(exposed.gains, np.float32)[:, None, None, None]
         ratio = pair_ratio(linear.mean(axis=3), usable)
-        gains = asked.calibration.gains or UNIT_GAINS
-        if asked.calibration.gains is None and asked.gains == "auto":
+        gains = settings.calibration.gains or UNIT_GAINS
+        if settings.calibration.gains is None and settings.gains == "auto":
             balance = balancing_gains(ratio)
             gains = balance or UNIT_GAINS
             if balance is None:
@@ -268,23 +268,23 @@ class FilterSource(ShotsSource):
                     if ratio is None
                     else f"is off by {ratio - 1:+.1%}, too much for gains"
                 )
-                found.notes.append(f"{view}: (I0 + I90)/(I45 + I135) {why}; not corrected.")
+                developed.notes.append(f"{view}: (I0 + I90)/(I45 + I135) {why}; not corrected.")
         # A shot that the pair sums brighten beyond what its file states may exceed full scale: it counts as clipped.
         factors = np.asarray(measured["scale"] / np.asarray(gains), np.float32)
         linear = linear * factors[:, None, None, None]
-        found.invalid |= np.asarray((linear > 1.0).any(axis=(0, 3)))
-        linear = oriented(np.minimum(linear, 1.0), asked.calibration)
-        code = found.orientation
+        developed.invalid |= np.asarray((linear > 1.0).any(axis=(0, 3)))
+        linear = oriented(np.minimum(linear, 1.0), settings.calibration)
+        code = developed.orientation
         turned = np.stack([apply_orientation(picture, code) for picture in linear])
         record = {
-            "shifts": [[shift.x, shift.y] for shift in found.shifts],
-            "warps": [shift.warp for shift in found.shifts],
-            "shifts_corrected": [shift.corrected for shift in found.shifts],
+            "shifts": [[shift.x, shift.y] for shift in developed.shifts],
+            "warps": [shift.warp for shift in developed.shifts],
+            "shifts_corrected": [shift.corrected for shift in developed.shifts],
             "pair_ratio": ratio,
             "light": [round(value, 6) for value in exposed.gains],
             "gains": list(gains),
         }
-        return self._developed(found, oriented(turned, orientation_calibration(code)), record)
+        return self._developed(developed, oriented(turned, orientation_calibration(code)), record)
 
 
 def development_of(paths: Sequence[Path], settings: PrepareSettings) -> tuple[float, float, float]:
@@ -388,12 +388,12 @@ class SinglesSource(ShotsSource):
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read the shots of a view: validity, transfer, shifts of the usual four, the turn of pictures and angles."""
-        asked, mine = self._settings, self._singles[view]
+        settings, mine = self._settings, self._singles[view]
         usual = [shot.angle for shot in mine] == list(ANGLES)
-        found = self._linear(view, measured, align=asked.align and usual)
-        code = found.orientation
+        developed = self._linear(view, measured, align=settings.align and usual)
+        code = developed.orientation
         turn = orientation_calibration(code)
-        angles = [turned(turned(shot.angle, asked.calibration), turn) for shot in mine]
+        angles = [turned(turned(shot.angle, settings.calibration), turn) for shot in mine]
         exposures = [
             {
                 "source": self._name(shot.path),
@@ -403,17 +403,17 @@ class SinglesSource(ShotsSource):
             }
             for shot, angle in zip(mine, angles, strict=True)
         ]
-        upright = np.stack([apply_orientation(picture, code) for picture in found.linear])
-        return self._developed(found, upright, {"exposures": exposures}, angles)
+        upright = np.stack([apply_orientation(picture, code) for picture in developed.linear])
+        return self._developed(developed, upright, {"exposures": exposures}, angles)
 
-    def _require_one(self, found: dict[str, Path], what: str, remedy: str) -> None:
+    def _require_one(self, values: dict[str, Path], what: str, remedy: str) -> None:
         """Refuse photographs of two cameras, sizes or kinds of files: the first photograph of each, by its name.
 
         Raises:
             PolarguideError: there are two.
         """
-        if len(found) > 1:
-            names = [f"{name} ({path.name})" for name, path in list(found.items())[:2]]
+        if len(values) > 1:
+            names = [f"{name} ({path.name})" for name, path in list(values.items())[:2]]
             raise PolarguideError(
                 self._root, expected=f"photographs of one {what}", found=" and ".join(names), remedy=remedy
             )
@@ -422,7 +422,7 @@ class SinglesSource(ShotsSource):
         """How the files are encoded, and why.
 
         Raises:
-            PolarguideError: they are of several kinds.
+            PolarguideError: the files are of several kinds.
         """
         kinds: dict[str, Path] = {}
         for path in self._shots:

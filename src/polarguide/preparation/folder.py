@@ -212,7 +212,7 @@ class SceneFolder:
                 self.root,
                 expected="a folder that nobody else writes",
                 found="another polarguide prepare at work on it",
-                remedy="Wait for it, or give another --out.",
+                remedy="Wait until it has ended, or choose another folder with --out.",
             ) from None
         try:
             yield
@@ -316,7 +316,7 @@ def _require_exposures(journal: Path, view: str, record: _View) -> None:
     """Refuse a journal that does not say what the pictures of a view are.
 
     Raises:
-        PolarguideError: it does not.
+        PolarguideError: the journal lacks it.
     """
     named = picture_names(view, [exposure.angle for exposure in record.exposures])
     pictures = sorted(name for name in record.files if name.startswith("polar/"))
@@ -367,16 +367,16 @@ class Workshop:
             PolarguideError: too few views are registered.
         """
         sizes = {view: geometry.size for view, geometry in self._photographs(self._pictures.views).items()}
-        asked = self._settings
+        settings = self._settings
         return reconstruct(
             self._root,
             sizes,
-            matching=asked.matching,
-            seed=asked.seed,
+            matching=settings.matching,
+            seed=settings.seed,
             reporter=self._reporter,
-            untried=_untried(asked, self._pictures.kind),
-            intrinsics=None if asked.intrinsics is None else known_intrinsics(asked.intrinsics),
-            refine=asked.refine_intrinsics,
+            untried=_untried(settings, self._pictures.kind),
+            intrinsics=None if settings.intrinsics is None else known_intrinsics(settings.intrinsics),
+            refine=settings.refine_intrinsics,
         )
 
     def points(self, poses: Poses) -> tuple[Poses, dict[str, Any]]:
@@ -386,16 +386,16 @@ class Workshop:
             PolarguideError: there is no place that the cameras look at.
         """
         cameras = poses.developed(self._photographs(poses.views))
-        asked = self._settings
-        model, found = add_points(
+        settings = self._settings
+        model, record = add_points(
             self._root,
             cameras,
             poses.folder,
-            matching=asked.matching,
-            seed=asked.seed,
+            matching=settings.matching,
+            seed=settings.seed,
             reporter=self._reporter,
         )
-        return Poses.read(model, self._pictures.views), found
+        return Poses.read(model, self._pictures.views), record
 
     def _photographs(self, views: list[str]) -> dict[str, Geometry]:
         """Tone-mapped pictures and object masks of views, and how they lie in the files."""
@@ -422,12 +422,12 @@ class Workshop:
         return {view: msgspec.convert(known[view], Geometry) for view in views}
 
 
-def _untried(asked: PrepareSettings, kind: str) -> str:
+def _untried(settings: PrepareSettings, kind: str) -> str:
     """The options that change something about structure from motion, for a message."""
-    ways = ["--matching exhaustive (compares all pairs)"] if asked.matching != "exhaustive" else []
-    if asked.sfm_pictures != "minimum" and kind != "singles":  # of one picture, the minimum is the picture
+    ways = ["--matching exhaustive (compares all pairs)"] if settings.matching != "exhaustive" else []
+    if settings.sfm_pictures != "minimum" and kind != "singles":  # of one picture, the minimum is the picture
         ways.append("--sfm-pictures minimum (less glare)")
-    if asked.intrinsics is None:
+    if settings.intrinsics is None:
         ways.append("--intrinsics fx,fy,cx,cy (in pixels of the developed pictures)")
     ways.append("--poses PATH (a COLMAP model, or cameras of another program)")
     return f"Options that may help: {', '.join(ways)}."

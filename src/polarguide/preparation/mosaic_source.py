@@ -51,7 +51,7 @@ class MosaicFiles:
     """How the mosaics of one sensor are read.
 
     Attributes:
-        pattern: of the top-left pixel that is left after ``cut``.
+        pattern: pattern of the top-left pixel that is left after ``cut``.
         crop: columns and rows that ``cut`` takes off.
     """
 
@@ -93,7 +93,7 @@ class MosaicFiles:
         """The values of a whole mosaic in memory, [H, W] uint8 or uint16, as ``read`` gives those of a file.
 
         Raises:
-            PolarguideError: they are too few, or four pictures.
+            PolarguideError: the values are too few, or four pictures side by side.
         """
         require_mosaic(where, values, least=SMALLEST)
         return self._unmirrored(values)
@@ -160,9 +160,9 @@ def block_intensities(
 
     Args:
         samples: ``sample_blocks`` of two periods from each mosaic.
-        levels: of the capture.
+        levels: levels of the capture.
         floor: ``sample_blocks`` of the dark frame, or None.
-        pattern: of the mosaics.
+        pattern: pattern of the mosaics.
         matrices: [4, 4, ...]: ``sample_blocks`` of the corrections of cells, in blocks of one period, or None.
     """
     values = np.concatenate(samples)
@@ -207,7 +207,7 @@ class MosaicSource(Source):
 
         Args:
             root: the folder of mosaics.
-            settings: of the preparation.
+            settings: settings of the preparation.
             dataset: the published dataset of the mosaics, if they belong to one.
 
         Raises:
@@ -273,13 +273,13 @@ class MosaicSource(Source):
             blocks.append(sample_blocks(self._mosaics.cut(values), SIDE))
             advance(count)
         assert shape is not None
-        asked = self._settings
+        settings = self._settings
         occurring = np.flatnonzero(counts)
         levels = estimate_levels(
             int(occurring[-1]), int(np.bitwise_or.reduce(occurring)), container,
-            bits=asked.bits, black=asked.black_level, saturation=asked.saturation, counts=counts,
+            bits=settings.bits, black=settings.black_level, saturation=settings.saturation, counts=counts,
         )  # fmt: skip
-        levels = replace(levels, gamma=asked.gamma if self._dataset is None else self._dataset.gamma)
+        levels = replace(levels, gamma=settings.gamma if self._dataset is None else self._dataset.gamma)
         if self._dataset is None:
             self._mosaics.require_kind(np.concatenate(blocks), levels)
         dark = self._mosaics.dark(shape[0])
@@ -296,12 +296,12 @@ class MosaicSource(Source):
         ratio = pair_ratio(angles, usable)
         gains, notes = self._gains(ratio)
         notes += [] if self._dataset is None else self._dataset.notes
-        notes += level_notes(levels, counts, container, asked.bits)
+        notes += level_notes(levels, counts, container, settings.bits)
         standing_out = int(self._defects(levels).sum())
         if standing_out:
             notes.append(defects_note(standing_out, shape[0][0] * shape[0][1]))
         white = self._white or gray_world(colors[:, usable])
-        peak = max(white) / min(gains) * asked.calibration.peak * brighter
+        peak = max(white) / min(gains) * settings.calibration.peak * brighter
         return {
             "levels": asdict(levels),
             "pattern": self._pattern.rows(),
@@ -339,18 +339,18 @@ class MosaicSource(Source):
         if self._analyzers is not None:
             linear, bad = self._analyzers.apply(linear, offset=self._corner), spread_to_cells(bad)
         linear = linear * self._sample_gains(values.shape, measured)
-        asked = self._settings
+        settings = self._settings
         picture = demosaic(
             linear, bad, self._pattern,
-            mode=asked.demosaic, interpolation=asked.interpolation, registered=asked.register,
+            mode=settings.demosaic, interpolation=settings.interpolation, registered=settings.register,
         )  # fmt: skip
-        intensities = oriented(np.clip(picture.intensities, 0.0, 1.0), asked.calibration)
+        intensities = oriented(np.clip(picture.intensities, 0.0, 1.0), settings.calibration)
         height, width = picture.invalid.shape
         return DevelopedView(
             intensities=intensities,
             invalid=picture.invalid,
             geometry=Geometry(
-                stored.shape[::-1], self._crop, DEMOSAIC_MODES[asked.demosaic], (width, height)
+                stored.shape[::-1], self._crop, DEMOSAIC_MODES[settings.demosaic], (width, height)
             ),
             record={
                 "clipped_share": round(float(saturated.mean()), 6),
@@ -371,19 +371,19 @@ class MosaicSource(Source):
             (height, width), kind = first
             raise PolarguideError(
                 path,
-                expected=f"{width}x{height} pixels of {kind} like the first file",
-                found=f"{values.shape[1]}x{values.shape[0]} of {values.dtype}",
-                remedy="Prepare captures of different size or depth one by one.",
+                expected=f"{width}x{height} pixels of {kind}, as in the first file",
+                found=f"{values.shape[1]}x{values.shape[0]} pixels of {values.dtype}",
+                remedy="Prepare captures that differ in size or bit depth separately, each with its own --out.",
             )
 
     def _gains(self, ratio: float | None) -> tuple[tuple[float, float, float, float], list[str]]:
         """Gains of the angles, and notes about them."""
-        asked = self._settings
+        settings = self._settings
         if self._analyzers is not None:
             return UNIT_GAINS, imbalance_notes(ratio)
-        if asked.calibration.gains is not None:
-            return asked.calibration.gains, []
-        if asked.gains == "none":
+        if settings.calibration.gains is not None:
+            return settings.calibration.gains, []
+        if settings.gains == "none":
             return UNIT_GAINS, []
         if ratio is None:
             return UNIT_GAINS, ["The pictures are too dark to estimate the gains of the angles."]

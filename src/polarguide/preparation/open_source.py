@@ -34,14 +34,14 @@ from polarguide.preparation.source import Source, StokesSource
 
 def _views_of_masks(files: Iterable[Path], views: Sequence[str]) -> dict[str, Path]:
     """Masks by view: called like it, as COLMAP and Metashape name masks (``cup.jpg.png``, ``cup_mask.png``), or so."""
-    found: dict[str, Path] = {}
+    masks: dict[str, Path] = {}
     pictures = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
     for shorten in (str, view_of_name, lambda name: name.removesuffix("_mask")):
         for path in pictures:
             view = shorten(path.stem)
             if view in views:
-                found.setdefault(view, path)
-    return found
+                masks.setdefault(view, path)
+    return masks
 
 
 def _found_masks(folder: Path, views: Sequence[str]) -> dict[str, Path]:
@@ -86,8 +86,8 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
             if kind == "mosaic" and settings.sensor is None:
                 raise _unknown_layout(root)
     check_format(settings, kind)
-    found = _source(root, settings, kind)
-    if not found.views:
+    source = _source(root, settings, kind)
+    if not source.views:
         raise PolarguideError(
             root,
             expected="raw mosaics (PNG, TIFF, .npy, .raw) or shots through a filter (folders 0, 45, 90, 135, ...)"
@@ -97,8 +97,8 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
             remedy="See docs/reference/formats.md for the layouts.",
         )
     if settings.masks is not None:
-        found.masks = _found_masks(settings.masks, found.views)
-    return found
+        source.masks = _found_masks(settings.masks, source.views)
+    return source
 
 
 def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
@@ -115,10 +115,10 @@ def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
     if not files:
         return any(angle not in ANGLES for angle in folders_of_angles(root).values())
     named = angles_of_names([path.stem for path in files])
-    found = [name for name in named if name is not None]
-    if any(angle not in ANGLES for _, angle in found):
+    shots = [name for name in named if name is not None]
+    if any(angle not in ANGLES for _, angle in shots):
         return True
-    return len({view for view, _ in found}) == len(files)
+    return len({view for view, _ in shots}) == len(files)
 
 
 def _unknown_layout(root: Path) -> PolarguideError:
@@ -195,18 +195,18 @@ def _source(root: Path, settings: PrepareSettings, kind: str) -> Source:
     return MosaicSource(dataset.mosaics, settings, dataset)
 
 
-def origin_of_poses(pictures: Source, asked: str) -> str:
+def origin_of_poses(pictures: Source, origin: str) -> str:
     """The origin of the poses: "dataset", "sfm", "none" or a path."""
-    if asked == "auto":
+    if origin == "auto":
         return "sfm" if pictures.cameras is None else "dataset"
-    if asked == "dataset" and pictures.cameras is None:
+    if origin == "dataset" and pictures.cameras is None:
         raise PolarguideError(
             "--poses",
             expected=f"sfm, none or the path of a COLMAP model for the format {pictures.kind}",
             found="dataset",
             remedy="Only published datasets contain poses.",
         )
-    return asked
+    return origin
 
 
 def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto") -> Poses | None:
@@ -229,13 +229,13 @@ def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto
             return stored.turned_first if poses_of == "displayed" else stored.sizes
 
         cameras = read_pose_file(path, pictures.views, sizes)
-        found = Poses.of_cameras(cameras, path, pictures.views, [path])
-        found.assumed_sizes = frozenset(assumed)
-        return found
+        poses = Poses.of_cameras(cameras, path, pictures.views, [path])
+        poses.assumed_sizes = frozenset(assumed)
+        return poses
     return Poses.read(path, pictures.views)
 
 
-def settle_pose_frames(pictures: Source, poses: Poses, asked: str) -> str:
+def settle_pose_frames(pictures: Source, poses: Poses, frame_given: str) -> str:
     """Decide which views are used as stored, because the poses are of the stored pixels, and tell the source.
 
     COLMAP, Metashape and nerfstudio read pixels as stored and leave the orientation tag alone; other programs turn the
@@ -245,7 +245,7 @@ def settle_pose_frames(pictures: Source, poses: Poses, asked: str) -> str:
     Args:
         pictures: the source, which has not developed a view yet.
         poses: from outside; their cameras have sizes.
-        asked: what the user says; ``auto`` decides as above.
+        frame_given: what the user says; ``auto`` decides as above.
 
     Returns:
         One line for the user; empty where no picture has an orientation tag.
@@ -264,23 +264,23 @@ def settle_pose_frames(pictures: Source, poses: Poses, asked: str) -> str:
     if not codes:
         return ""
     alike = set(by_size.values())
-    others = asked == "stored" if asked != "auto" else alike != {False}
-    as_stored = {view: others if asked != "auto" else by_size.get(view, others) for view in codes}
-    kept = [view for view, keep in as_stored.items() if keep]
-    pictures.use_stored(kept)
-    reason = "as --poses-of says" if asked != "auto" else "as the sizes of the cameras tell"
-    if asked == "auto" and not alike:
+    others = frame_given == "stored" if frame_given != "auto" else alike != {False}
+    as_stored = {view: others if frame_given != "auto" else by_size.get(view, others) for view in codes}
+    unturned = [view for view, keep in as_stored.items() if keep]
+    pictures.use_stored(unturned)
+    reason = "as --poses-of says" if frame_given != "auto" else "as the sizes of the cameras tell"
+    if frame_given == "auto" and not alike:
         reason = "as COLMAP, Metashape and nerfstudio read pictures; sizes do not tell"
     counts = Counter(codes.values())
     turns = listed([f"{count} {TURNS[code]}" for code, count in sorted(counts.items())])
-    if len(kept) in (0, len(codes)):
-        frame, other = ("stored", "displayed") if kept else ("displayed", "stored")
+    if len(unturned) in (0, len(codes)):
+        frame, other = ("stored", "displayed") if unturned else ("displayed", "stored")
         text = f"their poses are taken to be of the {frame} pixels, {reason}"
     else:
         frame, other = "stored", "displayed"
-        kind = f"the poses of {len(kept)} are taken to be of the stored pixels"
+        kind = f"the poses of {len(unturned)} are taken to be of the stored pixels"
         text = f"{kind}, {reason}, those of the others of the displayed ones"
-    used = "Those views, their angles and masks are used as stored. " if kept else ""
+    used = "Those views, their angles and masks are used as stored. " if unturned else ""
     return (
         f"EXIF orientation of {len(codes)} of {len(poses.views)} views ({turns}): {text}. {used}"
         f"If the poses are of the {other} pixels: --poses-of {other}."

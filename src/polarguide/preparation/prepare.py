@@ -69,7 +69,7 @@ def prepare_scene(
 ) -> Prepared:
     """Write a scene folder from camera files; see docs/reference/formats.md.
 
-    A call that was stopped is gone on with by the same call. Nothing but unfinished work of the same request
+    The same call resumes a stopped one. Nothing but unfinished work of the same request
     is ever replaced.
 
     Args:
@@ -212,8 +212,8 @@ def _request(root: Path, pictures: Source, settings: PrepareSettings, poses: Pos
     """Settings that must not change between the calls that write one scene."""
 
     def fingerprint(path: Path) -> list[int]:
-        found = path.stat()
-        return [found.st_size, found.st_mtime_ns]
+        status = path.stat()
+        return [status.st_size, status.st_mtime_ns]
 
     request = {
         "source": os.path.realpath(root),

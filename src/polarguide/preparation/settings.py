@@ -171,14 +171,14 @@ class CalibrationOptions:
             PolarguideError: the file or the order is wrong.
         """
         if self.calibration is None or self.analyzers() is not None:
-            found = Calibration()
+            calibration = Calibration()
         else:
-            found = read_calibration(self.calibration)
+            calibration = read_calibration(self.calibration)
         if self.order is not None:
-            found = replace(found, order=_four_angles(self.order))
+            calibration = replace(calibration, order=_four_angles(self.order))
         if self.sense is not None:
-            found = replace(found, sense=self.sense)
-        return found if self.zero is None else replace(found, zero=self.zero)
+            calibration = replace(calibration, sense=self.sense)
+        return calibration if self.zero is None else replace(calibration, zero=self.zero)
 
     def analyzers(self) -> Path | None:
         """The file, if it is one of polarguide calibrate, which ``PrepareSettings.analyzers`` takes; else None."""
@@ -231,7 +231,7 @@ def white_gains(text: str) -> tuple[float, float, float] | None:
     """Gains of R, G and B from a ``--white-balance``; None for "gray", which needs the pictures.
 
     Raises:
-        PolarguideError: it has another form.
+        PolarguideError: the text has another form.
     """
     if text in ("none", "gray", "grey"):
         return (1.0, 1.0, 1.0) if text == "none" else None
@@ -250,7 +250,7 @@ def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
     """COLMAP's camera model and parameters from ``--intrinsics``: PINHOLE of four numbers, OPENCV of eight.
 
     Raises:
-        PolarguideError: it is neither.
+        PolarguideError: the text is neither.
     """
     numbers = decimals(text)
     if len(numbers) not in (4, 8) or not all(map(math.isfinite, numbers)) or min(numbers[:4]) <= 0:
@@ -258,7 +258,7 @@ def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
             "--intrinsics",
             expected="fx,fy,cx,cy or fx,fy,cx,cy,k1,k2,p1,p2 in pixels of the developed pictures",
             found=repr(text),
-            remedy="Correct the value; the center of the first pixel is at 0.5.",
+            remedy="Give four or eight numbers; the center of the first pixel is at 0.5.",
         )
     return ("PINHOLE" if len(numbers) == 4 else "OPENCV"), numbers
 

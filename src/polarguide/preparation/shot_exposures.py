@@ -94,7 +94,7 @@ def exposures_of_view(
     """The exposures of four shots: as their files state, unless their pair sums surely say otherwise.
 
     Args:
-        names: of the shots, for messages.
+        names: names of the shots, for messages.
         gray: linear intensities [4, H, W]. usable: [H, W].
         stated: exposures that the files state, or ones.
     """

@@ -38,7 +38,7 @@ class DevelopedView:
         invalid: pixels that depend on an unusable sample, [H, W].
         geometry: crop and scale relative to the stored picture.
         mask: object mask, [H, W], or None.
-        angles: of the pictures, counter-clockwise as displayed.
+        angles: angles of the pictures, counter-clockwise as displayed.
         record: measurements for ``scene.json``.
         notes: messages for the user.
     """
@@ -196,9 +196,9 @@ class StokesSource(Source):
         self.kind, self.cameras = dataset.name, dataset.cameras
         self.views, self.paths = dataset.views, dataset.paths
         self._dataset = dataset
-        asked = settings.calibration
-        self._given_sense = asked.sense
-        self._calibration = replace(asked, sense=asked.sense or dataset.sense)
+        calibration = settings.calibration
+        self._given_sense = calibration.sense
+        self._calibration = replace(calibration, sense=calibration.sense or dataset.sense)
 
     def stored(self, view: str) -> Stored:
         """By the header of a file that has the size of the Stokes vectors."""
@@ -360,7 +360,7 @@ def rim_agreement(
 
     Args:
         stokes: [3, H, W, C], in the dataset's own sense.
-        mask: of the object, [H, W].
+        mask: mask of the object, [H, W].
         zero: where the angles begin, in radians counter-clockwise from the picture's horizontal.
     """
     area = int(mask.sum())
@@ -391,11 +391,11 @@ def rim_agreement(
     return RimAgreement(ccw, cw)
 
 
-def sense_of_rims(found: Sequence[RimAgreement]) -> Sense | None:
+def sense_of_rims(agreements: Sequence[RimAgreement]) -> Sense | None:
     """The sense that the outlines of most views agree with clearly; None where they do not tell."""
-    if not found:
+    if not agreements:
         return None
-    gains = np.array([view.ccw - view.cw for view in found])
+    gains = np.array([view.ccw - view.cw for view in agreements])
     mean = float(gains.mean())
     agreeing = float((np.sign(gains) == np.sign(mean)).mean())
     if abs(mean) < _CLEAR or agreeing < _MOST:

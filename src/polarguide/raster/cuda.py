@@ -81,7 +81,7 @@ def load_gsplat(say: Callable[[str], None]) -> None:
         say: takes a line for the user once compiling has begun.
 
     Raises:
-        PolarguideError: it is not installed, or its kernels can be neither loaded nor compiled.
+        PolarguideError: gsplat is not installed, or its kernels can be neither loaded nor compiled.
     """
     if not has_gsplat():
         raise PolarguideError(

@@ -117,7 +117,7 @@ def check_shapes(splats: Splats, statistic: ScreenStatistic | None, still: tuple
     """Check that the shapes fit each other, and that the channels of the statistic and the still ones exist.
 
     Raises:
-        PolarguideError: they do not.
+        PolarguideError: a shape does not fit, or a channel does not exist.
     """
     count = splats.means.shape[0] if splats.means.ndim else 0
     channels = splats.features.shape[-1]

@@ -27,7 +27,7 @@ def footprints(means: Tensor, cameras: Iterable[Camera]) -> Tensor:
     """Sides of the smallest pixel at each Gaussian, among the cameras that have its center in the picture.
 
     Args:
-        means: [N, 3] world positions. cameras: of the training views.
+        means: [N, 3] world positions. cameras: cameras of the training views.
 
     Returns:
         [N] in world units; 0 where no camera has it in the picture.
@@ -44,7 +44,7 @@ def as_trained(splats: Splats, camera: Camera, footprints: Tensor) -> Splats:
     """Gaussians with the blur of the training's pixels where those of a camera are smaller; others as they are.
 
     Args:
-        splats: N Gaussians. camera: of the picture. footprints: [N], see above.
+        splats: N Gaussians. camera: camera of the picture. footprints: [N], see above.
 
     Returns:
         With variances along all axes larger by what the blur of the picture's own pixel lacks.

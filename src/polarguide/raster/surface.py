@@ -104,7 +104,7 @@ def alpha_in_front(splats: Splats, camera: Camera, depth: Tensor, rasterize: Ras
 
     Args:
         splats: the Gaussians; features are not read. camera: the view.
-        depth: [H, W] camera depths; pixels with a depth of 0 or less are skipped. rasterize: of the backend.
+        depth: [H, W] camera depths; pixels with a depth of 0 or less are skipped. rasterize: rasterizer of the backend.
 
     Returns:
         [H, W] in [0, 1]; 0 where nothing is blended, and in skipped pixels.

@@ -322,7 +322,7 @@ def recipe_named(name: str) -> Method:
         "recipe",
         expected="one of " + ", ".join(names),
         found=name + broken,
-        remedy="Take one of these; a recipe of a package or of another version needs that one.",
+        remedy="Choose one of these. For a recipe of another package or version, install that package or version.",
     )
 
 
@@ -356,7 +356,7 @@ def _recipes_of(entry: EntryPoint) -> tuple[Method, ...]:
     """The recipes of an entry point.
 
     Raises:
-        PolarguideError: it cannot be loaded, is no recipe, or has the name of a built-in one.
+        PolarguideError: the entry point cannot be loaded, is no recipe, or has the name of a built-in one.
     """
     where = f"plug-in {entry.name} ({entry.value})"
     remedy = "Update or uninstall the package that brings it."
@@ -372,5 +372,5 @@ def _recipes_of(entry: EntryPoint) -> tuple[Method, ...]:
             raise PolarguideError(where, expected="recipes", found=repr(recipe), remedy=remedy)
         if recipe.name in _BUILT_IN:
             found = f"{recipe.name}, which is built in"
-            raise PolarguideError(where, expected="a name of its own", found=found, remedy=remedy)
+            raise PolarguideError(where, expected="a name that no other has", found=found, remedy=remedy)
     return recipes

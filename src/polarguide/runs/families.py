@@ -181,7 +181,7 @@ class Family(ABC):
         """Refuse a checkpoint that does not belong to the settings of its run.
 
         Raises:
-            PolarguideError: it does not.
+            PolarguideError: the checkpoint does not belong to them.
         """
         if state.step > settings.steps:
             raise PolarguideError(
@@ -197,7 +197,7 @@ class Family(ABC):
         """Take a run back to where what was painted over it still counts.
 
         Args:
-            state: of the training; changed. None: it has not begun.
+            state: state of the training; changed. None: it has not begun.
 
         Raises:
             PolarguideError: materials mean nothing to the recipe, or to a training this short.

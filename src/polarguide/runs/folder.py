@@ -60,7 +60,7 @@ class RunConfiguration:
         recipe: its name. recipe_data: all its values, for the record.
         settings: steps, seed, refractive index, with what was taken where nothing was specified.
         downscale: side of the averaged pixel boxes. transfer: how the files were read.
-        device: what it trained on. version: of the program.
+        device: what it trained on. version: version of the program.
         test_views: those held out; None in runs of the first versions, which held out every 8th without a split.json.
         painted: digest of the materials that were painted over the run and are in it, see ``runs.painted``; None: none.
     """
@@ -164,7 +164,7 @@ def save_checkpoint(run: Path, state: AnyState, *, optimizer: bool = True) -> No
             which nothing but a step reads.
 
     Raises:
-        PolarguideError: it cannot be written; the old one stays.
+        PolarguideError: the checkpoint cannot be written; the old one stays.
     """
     tensors = state.tensors()
     if not optimizer:
@@ -218,7 +218,10 @@ def load_checkpoint(run: Path, recipe: Method, device: torch.device | str = "cpu
 
 
 def trained_steps(run: Path) -> int | None:
-    """Number of steps of a run's checkpoint; None if no checkpoint states it."""
+    """Number of training steps completed at a run's checkpoint.
+
+    None if the run has no checkpoint, or if the checkpoint does not record the number.
+    """
     try:
         with safe_open(run / CHECKPOINT, framework="pt") as file:
             record = (file.metadata() or {}).get("polarguide", "")
@@ -243,7 +246,7 @@ def writing_to(run: Path) -> Iterator[None]:
             run,
             expected="a run folder that nobody is writing to",
             found="another training at work in it",
-            remedy="Wait for it, or name another folder.",
+            remedy="Wait until it has ended, or choose another folder.",
         ) from None
     except OSError as error:
         found = error.strerror or str(error)
@@ -265,7 +268,7 @@ class RunLog:
         """Write one line.
 
         Raises:
-            PolarguideError: it cannot be written.
+            PolarguideError: the log cannot be written.
         """
         with writing(self._path), open(self._path, "a", encoding="utf-8") as file:
             file.write(json.dumps(values) + "\n")
@@ -280,7 +283,7 @@ class RunLog:
         """The complete lines of the log; none without a log. A line can be incomplete where a process was killed.
 
         Raises:
-            PolarguideError: it cannot be read.
+            PolarguideError: the log cannot be read.
         """
         return [row for _, row in self._lines()]
 
@@ -332,7 +335,7 @@ def most_gaussians(
     """How many Gaussians there may be for so many pixels of all views; 0 of a field, which has none.
 
     Args:
-        pixels: of the training views. asked, resumed: as for ``resolve``.
+        pixels: pixels of the training views. asked, resumed: as for ``resolve``.
     """
     if isinstance(method, NeuralRecipe):
         return 0
@@ -361,7 +364,7 @@ def resolve(
     """The settings of a training, with nothing left open.
 
     Args:
-        settings: as specified. scene, method: of the training.
+        settings: as specified. scene, method: those of the training.
         resumed: settings of the run that is resumed, whose values come before those of the scene and its size.
         processes: how many share the views of a step.
 

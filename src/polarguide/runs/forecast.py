@@ -73,12 +73,12 @@ class MemoryPlan:
 
     Attributes:
         hold: whether the pictures stay in memory; otherwise views decode theirs again.
-        kept: bytes of what is kept of the views in memory, the rest lies in a file; None: all stays in memory.
+        view_bytes: of what is computed of the views and stays in memory, the rest lies in a file; None: all stays.
         peak: bytes that the process takes at most.
     """
 
     hold: bool
-    kept: int | None
+    view_bytes: int | None
     peak: int
 
 
@@ -88,7 +88,7 @@ def plan_memory(
     """Share out memory among a training's step, its Gaussians and its views.
 
     Args:
-        pixels: of each view as it is trained on. recipe: the method. gaussians: most that there may be.
+        pixels: pixels of each view as it is trained on. recipe: the method. gaussians: most that there may be.
         limit: GiB that the process may take; None: what is free, but a fifth.
         in_memory: whether the pictures are in memory already.
 
@@ -155,7 +155,7 @@ def pixels_of(folder: Path, downscale: int) -> list[int]:
     """Pixels of each view of a scene at the size that is trained on, as the headers of its files state.
 
     Raises:
-        PolarguideError: it is no scene.
+        PolarguideError: the folder is no scene.
     """
     layout = find_layout(folder)
     return [count // downscale**2 for count in stated_pixels(layout, select_views(layout, None))]
@@ -271,7 +271,7 @@ def forecast(
     """Take a few steps of each stage on a state of their own; None for a training that is too short for it.
 
     Args:
-        scene, recipe, settings, backend: of the training. peak: bytes that it will take.
+        scene, recipe, settings, backend: those of the training. peak: bytes that it will take.
     """
     if settings.steps < LEAST_STEPS:
         return None
@@ -300,7 +300,7 @@ class TimeLeft:
     be, times how much longer than expected the last ones of their kind took: with priors to compute, or without.
 
     Args:
-        expected: of the training. recipe: of it.
+        expected: forecast of the training. recipe: its method.
     """
 
     def __init__(self, expected: Forecast, recipe: Recipe) -> None:

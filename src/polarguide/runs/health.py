@@ -140,7 +140,7 @@ class ViewHealth:
     """Facts of one training view.
 
     Attributes:
-        psnr: of what was predicted of its pictures, as shown, in dB; None where no pixel counts.
+        psnr: PSNR of what was predicted of its pictures, as shown, in dB; None where no pixel counts.
         beside: median of those of the views nearest to it; None where there are not enough.
         burned: share of the pixels that are brighter than ``Limits.brighter`` times what was measured anywhere.
         fog: mean share of the light that comes from where no surface can be; None where no points tell that.

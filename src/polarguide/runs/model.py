@@ -119,7 +119,7 @@ def gaussian_colors(gaussians: Parameters, light: Light, shading: ShadingModel, 
     """Linear colors of every Gaussian toward viewing directions, reflections included.
 
     Args:
-        gaussians: the Gaussians. light: learned, by name. shading: of the recipe.
+        gaussians: the Gaussians. light: learned, by name. shading: shading of the recipe.
         directions: [K, 3] unit, from the camera to the Gaussian.
 
     Returns:
@@ -134,14 +134,14 @@ def baked_harmonics(
     light: Light,
     shading: ShadingModel,
     *,
-    shown: Callable[[Tensor], Tensor],
+    present: Callable[[Tensor], Tensor],
     linear: bool,
 ) -> tuple[Tensor, Tensor]:
     """Harmonics, as of ``refit_sh``, of ``gaussian_colors``.
 
     Args:
-        gaussians, light, shading: of the run.
-        shown: what becomes of linear colors. linear: whether they are still linear then.
+        gaussians, light, shading: those of the run.
+        present: what becomes of linear colors. linear: whether they are still linear then.
     """
     known = {
         name: values
@@ -155,7 +155,7 @@ def baked_harmonics(
 
     def colors(part: slice, directions: Tensor) -> Tensor:
         some = {name: values.detach()[part] for name, values in known.items()}
-        return shown(gaussian_colors(some, light, shading, directions))
+        return present(gaussian_colors(some, light, shading, directions))
 
     return refit_sh(colors, normals, srgb_slope if linear else None)
 
@@ -206,7 +206,7 @@ def write_run_ply(
     """Write the trained Gaussians; see the module's text, and ``learned_normals`` for the centers of the cameras.
 
     Args:
-        path: the file. state, shading: of the run. centers: [M, 3] of the cameras.
+        path: the file. state, shading: those of the run. centers: [M, 3] of the cameras.
         color: [3, 3] of a presentation; it holds for the harmonics that other programs show, never for our own fields.
         linear: whether the harmonics are of linear colors, for readers that want them.
     """
@@ -216,7 +216,7 @@ def write_run_ply(
         colors = colored(colors, color).clamp(0, 1)
         return colors if linear else srgb_encode(colors)
 
-    dc, rest = baked_harmonics(gaussians, state.light, shading, shown=shown, linear=linear)
+    dc, rest = baked_harmonics(gaussians, state.light, shading, present=shown, linear=linear)
     plain = {
         name: gaussians[name].detach().cpu()
         for name in ("means", "log_scales", "quaternions", "opacity_logits")

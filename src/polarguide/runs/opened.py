@@ -37,7 +37,7 @@ class OpenedRun:
     """A trained run: what it was trained as, what it learned, and the layers that it renders.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         configuration: what it was trained as. recipe: the method.
         model: what it learned.
         scene: the scene or its folder, where that is not the folder that the configuration names.
@@ -88,7 +88,7 @@ class OpenedRun:
             reporter: receives the progress of long operations.
 
         Raises:
-            PolarguideError: it is no run folder, is damaged, or belongs to another version.
+            PolarguideError: the folder is no run, is damaged, or belongs to another version.
         """
         folder = Path(folder)
         configuration = RunConfiguration.load(folder)
@@ -170,7 +170,7 @@ class OpenedRun:
         """The scene it was trained on, read on first use. Warns if it has changed since.
 
         Raises:
-            PolarguideError: it is not there any more, cannot be read, or was read otherwise than for the training.
+            PolarguideError: the scene was moved or deleted, cannot be read, or was read otherwise for training.
         """
         configuration, scene = self.configuration, self._scene_source
         options = SceneOptions(configuration.downscale, configuration.transfer, split="every-8th")
@@ -270,8 +270,8 @@ class OpenedRun:
             polarized: whether to predict Stokes vectors, where the model can.
         """
         chosen = self.scene.view(camera).camera if isinstance(camera, str) else camera
-        found = self.model.render(chosen, normals=normals, depth=depth, surface=surface)
-        return replace(found, predicted=self.model.stokes(found, chosen)) if polarized else found
+        result = self.model.render(chosen, normals=normals, depth=depth, surface=surface)
+        return replace(result, predicted=self.model.stokes(result, chosen)) if polarized else result
 
     def render(self, camera: Camera | str, layers: Iterable[str] = ("final",)) -> dict[str, Tensor]:
         """Layers of a picture.
@@ -334,11 +334,11 @@ def read_scene(
     """Load a scene, with progress, and hand on its warnings.
 
     Args:
-        folder: of the scene. options: how it is read. reporter: receives progress.
+        folder: folder of the scene. options: how it is read. reporter: receives progress.
         test_views, hold: as for ``load_scene``.
 
     Raises:
-        PolarguideError: it cannot be read.
+        PolarguideError: the scene cannot be read.
     """
     scene = load_scene(
         folder,

@@ -89,7 +89,7 @@ def write_painted(run: Path, numbers: Mapping[str, Tensor]) -> None:
         numbers: [H, W] uint8 of every training view.
 
     Raises:
-        PolarguideError: they cannot be written; those of before stay.
+        PolarguideError: the materials cannot be written; those of before stay.
     """
     with atomic_folder(run / FOLDER) as folder:
         for name, picture in numbers.items():

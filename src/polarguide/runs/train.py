@@ -358,10 +358,10 @@ def expected_memory(
 
 def _store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter) -> ViewStore:
     """Where what is computed of the views is kept. What a GPU reads stays on it."""
-    if plan.kept is None or backend.device.type != "cpu":
+    if plan.view_bytes is None or backend.device.type != "cpu":
         return ViewStore()
     make_folder(out)
-    return ViewStore(plan.kept, out, reporter.warn)
+    return ViewStore(plan.view_bytes, out, reporter.warn)
 
 
 def _check_out(out: Path, resume: bool, ranks: Ranks) -> None:

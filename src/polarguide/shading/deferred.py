@@ -179,7 +179,7 @@ class DeferredShading(ShadingModel):
         return RadianceCubemap("texels", self.radiance, self.raw_texels)
 
     def far_light(self, texels: Tensor, directions: Tensor, level: Tensor | None) -> Tensor:
-        """Radiance [P, 3] from directions [P, 3], blurred by mip levels [P]; None: by none."""
+        """Radiance [P, 3] from far away along directions [P, 3], read at mip levels [P]; None: not blurred."""
         if self.blend == "lerp":
             return self.radiance(cubemap_lookup(texels, directions))
         if level is None:
@@ -352,8 +352,8 @@ class DeferredShading(ShadingModel):
         if not (self.rough or self.metal):
             return {}
         blended = blended_roughness(splatted)
-        shown = torch.zeros_like(splatted.alpha) if blended is None else blended
-        return {"roughness": gltf_roughness(shown, self.environment_resolution)}
+        roughness = torch.zeros_like(splatted.alpha) if blended is None else blended
+        return {"roughness": gltf_roughness(roughness, self.environment_resolution)}
 
     def _index_picture(self, splatted: GBuffer) -> Tensor | None:
         """Refractive indices [H, W]; None: the run's everywhere."""

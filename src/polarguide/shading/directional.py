@@ -64,7 +64,7 @@ class DirectionalShading(ShadingModel):
     """Light of a learned grid of feature vectors that a small network reads; see the module's text.
 
     Attributes:
-        width: of the MLP's two hidden layers.
+        width: width of the MLP's two hidden layers.
         mlp_rate: learning rate of the MLP.
         albedo_rate: learning rate of the albedo. feature_rate: of roughness and features.
         first_albedo: share of the first points' colors that albedo begins with, in (0, 1].

@@ -55,7 +55,7 @@ def splatting(
 
     Args:
         gaussians: with the parameters of the shading model; with ``outward`` where normals are turned to the side from
-            which they are seen. sh_degree: of the base color, 0 to 3.
+            which they are seen. sh_degree: degree of the base color's harmonics, 0 to 3.
 
     Returns:
         Differentiable in the Gaussians; the same bits for any number of threads.
@@ -270,7 +270,7 @@ def split_reference(features: Tensor, alpha: Tensor, layout: Layout) -> Split:
     """Features for the shading model, blended normal [H, W, 3] and camera depth [H, W]; any dtype and device.
 
     Args:
-        features: [H, W, D] blended; the depth is times alpha. alpha: [H, W]. layout: of the features.
+        features: [H, W, D] blended; the depth is times alpha. alpha: [H, W]. layout: layout of the features.
     """
     normal = features[..., layout.channels("normal")] if "normal" in layout else None
     if "depth" not in layout:

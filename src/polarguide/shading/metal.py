@@ -85,7 +85,7 @@ def metal_pixels(
     """Shade what shows metal: the reference implementation of what ``reflect_native`` does of metals.
 
     Args:
-        features: [P, C] blended. layout: of its channels: ``metal`` as of ``metal_channels``.
+        features: [P, C] blended. layout: layout of its channels: ``metal`` as of ``metal_channels``.
         rays: [P, 3] unit, world. normal: [P, 3] blended, world.
         light: [P, 3] that is mirrored.
     """
@@ -131,7 +131,7 @@ def metal_stokes(
 
     Args:
         specular, diffuse, normal: [H, W, 3]. metal: with what it adds to ``specular``.
-        refractive_index: of the rest, a number or [K].
+        refractive_index: refractive index of the rest, a number or [K].
     """
     at = metal.pixels
     rays = camera.rays(device=normal.device).flatten(0, 1)[at]

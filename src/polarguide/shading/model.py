@@ -48,7 +48,7 @@ class Parameter(NamedTuple):
     """A tensor that a shading model trains.
 
     Attributes:
-        shape: of one Gaussian's values; of the whole tensor for a parameter of the light.
+        shape: shape of one Gaussian's values; of the whole tensor for a parameter of the light.
         rate: learning rate (Adam); with 0 it keeps its first values.
         reset_minimum: a reset of the opacities raises values to at least this; None: it leaves them.
     """
@@ -106,7 +106,7 @@ class RadianceCubemap(NamedTuple):
     """A parameter of the light that is radiance from afar: it can be exported, turned and replaced.
 
     Attributes:
-        name: of the parameter, raw texels [6, R, R, 3].
+        name: name of the parameter, raw texels [6, R, R, 3].
         radiance: linear radiance of raw values, [..., 3].
         raw: the inverse, as far as raw values can hold the radiance.
     """
@@ -145,7 +145,7 @@ class ShadingModel(ABC):
     refractive index is the run's own, see ``bind``.
 
     Attributes:
-        refractive_index: of all surfaces.
+        refractive_index: refractive index of all surfaces.
     """
 
     refractive_index: float = field(default=1.5, kw_only=True)
@@ -157,10 +157,10 @@ class ShadingModel(ABC):
     """Whether shading reads the normals, so that they are always splatted."""
 
     def bind(self: Model, refractive_index: float) -> Model:
-        """The same model for surfaces of a refractive index.
+        """A copy of the model with its refractive index set to ``refractive_index``.
 
         Raises:
-            ValueError: it is not over 1.
+            ValueError: the refractive index is 1 or less.
         """
         if not refractive_index > 1:
             raise ValueError(f"refractive index: expected more than 1, found {refractive_index}")

@@ -42,7 +42,7 @@ class RoughnessArguments(NamedTuple):
     """Arguments of the native pass for rough surfaces.
 
     Attributes:
-        channel: of the blended roughness.
+        channel: channel of the blended roughness.
         blur: mip levels from a mirror to a roughness of 1.
         alpha: [P] by which a pixel's blended roughness is divided; without a gradient.
     """
@@ -100,8 +100,8 @@ class _Reflect(torch.autograd.Function):
         _native.reflect_forward(*inputs, *(looked_up or (None, None, None)), *layers)
         metal, outputs, light = given.metal, [], []
         if metal is not None:
-            shown = len(metal.pixels)
-            outputs = [rays.new_empty(shown), rays.new_empty(shown, 3), rays.new_empty(shown, 3)]
+            pixels = len(metal.pixels)
+            outputs = [rays.new_empty(pixels), rays.new_empty(pixels, 3), rays.new_empty(pixels, 3)]
             light = [layers[3]]
             _native.metal_layers(features, rays, *metal, *light, *outputs, *layers[:2])
             ctx.mark_non_differentiable(outputs[0])
@@ -115,12 +115,12 @@ class _Reflect(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        features, rays, directions, level, seen, *saved = ctx.saved_tensors
+        features, rays, directions, level, looked_up, *saved = ctx.saved_tensors
         given, contiguous = ctx.given, [None if g is None else g.contiguous() for g in grads]
         metal = given.metal
         to_layers = contiguous if metal is None else contiguous[:-3]
         to_layers += [None] * (6 - len(to_layers))
-        to_features, to_seen = torch.empty_like(features), torch.empty_like(seen)
+        to_features, to_seen = torch.empty_like(features), torch.empty_like(looked_up)
         if metal is not None:
             light, *saved = saved
             by_layers, by_metal = [*to_layers[:2], to_layers[4]], contiguous[-2:]
@@ -131,8 +131,8 @@ class _Reflect(torch.autograd.Function):
             _native.metal_backward(*inputs)
             to_layers[3] = to_light
         # What comes by the detached layers goes to the light, and not by way of the directions to the normals.
-        to_look_up = None if to_layers[4] is None and to_layers[5] is None else torch.empty_like(seen)
-        inputs = [features, rays, seen, *given.model, *to_layers, to_seen, to_look_up, to_features]
+        to_look_up = None if to_layers[4] is None and to_layers[5] is None else torch.empty_like(looked_up)
+        inputs = [features, rays, looked_up, *given.model, *to_layers, to_seen, to_look_up, to_features]
         _native.reflect_backward_layers(*inputs)
         if metal is not None:
             to_features[:, 3:6].index_add_(0, metal.pixels, to_normal)
@@ -194,8 +194,10 @@ def reflect_arguments(
 def shade_native(
     splatted: GBuffer, textures: Sequence[Tensor], camera: Camera, given: ReflectArguments
 ) -> dict[str, Any]:
-    """The layers of ``reflect_native`` by name, [H, W, 3], those that are detached as ``detached specular`` and
-    ``detached diffuse``; and ``metal``, None where there is none.
+    """The layers of ``reflect_native`` by name, [H, W, 3] each.
+
+    If ``given.detached`` is set, ``detached specular`` and ``detached diffuse`` are among them: the same layers, whose
+    gradient does not reach the normals. ``metal`` is None if no Gaussian is a metal.
     """
     shaded = reflect_native(splatted.features.flatten(0, 1), world_rays_native(camera), textures, given)
     names = ["final", "specular", "diffuse", "reflection"]

@@ -39,7 +39,10 @@ def gltf_roughness(roughness: Tensor, resolution: int) -> Tensor:
 
 
 def blended_roughness(splatted: GBuffer) -> Tensor | None:
-    """Roughness [H, W] of what each pixel shows, 0 where nothing is; None: everything is a mirror."""
+    """Roughness [H, W], blended over the Gaussians of each pixel; 0 for a mirror, and for a pixel without Gaussians.
+
+    None if the shading model has no roughness.
+    """
     if "roughness" not in splatted.layout:
         return None
     return splatted["roughness"][..., 0] / splatted.alpha.detach().clamp(min=1e-6)

@@ -185,7 +185,7 @@ def _cut(part: Part | None, shape: tuple[int, ...], step: int) -> tuple[slice, s
     """The samples of a mosaic that a part of its picture needs: whole superpixels, with ``AROUND`` around them.
 
     Args:
-        part: of the picture. shape: of the mosaic, rows and columns. step: samples of a pixel, each way.
+        part: part of the picture. shape: shape of the mosaic, rows and columns. step: samples of a pixel, each way.
 
     Returns:
         Rows and columns; None for all, where hardly any would be left out.
@@ -206,10 +206,10 @@ def _analyzers(shape: tuple[int, ...], options: ShotOptions) -> AnalyzerCalibrat
     path = options.analyzers
     if path is None:
         return None
-    found = calibration_of(path)
-    found.require_sensor(options.sensor, path)
-    found.require_region((options.offset_x, options.offset_y), (shape[1], shape[0]), path)
-    return found
+    calibration = calibration_of(path)
+    calibration.require_sensor(options.sensor, path)
+    calibration.require_region((options.offset_x, options.offset_y), (shape[1], shape[0]), path)
+    return calibration
 
 
 def calibration_of(path: Path) -> AnalyzerCalibration:
@@ -271,7 +271,7 @@ def develop(shot: ExposureSet, options: ShotOptions, part: Part | None = None) -
 
 
 def set_samples(shot: ExposureSet, options: ShotOptions) -> SetSamples | None:
-    """The samples of a set, or of a view of a scene at other angles; None of a shot that ``develop`` takes.
+    """Samples of a view at any polarizer angles; None for four angles or a mosaic, which ``develop`` reads.
 
     Raises:
         PolarguideError: a file is missing, cannot be read, or does not fit the others or the options.

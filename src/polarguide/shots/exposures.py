@@ -56,12 +56,12 @@ def find_shots(
         raise PolarguideError(
             "paths", expected="at least one file or folder of shots", found="none", remedy="Name some."
         )
-    found = list_shots(paths, options)
-    faults = [shot.fault for shot in found if shot.nothing and shot.fault is not None]
-    if len(faults) < len(found):
-        for kind, shot in {shot.kind: shot for shot in reversed(found) if shot.fault is None}.items():
+    shots = list_shots(paths, options)
+    faults = [shot.fault for shot in shots if shot.nothing and shot.fault is not None]
+    if len(faults) < len(shots):
+        for kind, shot in {shot.kind: shot for shot in reversed(shots) if shot.fault is None}.items():
             options.require_kind(kind, shot.name)
-        return found
+        return shots
     root = Path(paths[0])
     if len(paths) == 1 and len(faults) > 1:
         raise PolarguideError(root, expected=_EXPECTED, found=describe_contents(root), remedy=_REMEDY)
@@ -77,18 +77,18 @@ def list_shots(
         PolarguideError: a path does not exist, or the only one is an empty folder, or one that lacks those of angles.
     """
     options = options or ShotOptions()
-    found: list[ExposureSet] = []
+    shots: list[ExposureSet] = []
     files: list[Path] = []
     for path in map(Path, dict.fromkeys(paths)):
         if path.is_dir():
-            found += _in_folder(path, options) if len(paths) == 1 else _or_fault(path, options, _in_folder)
+            shots += _in_folder(path, options) if len(paths) == 1 else _or_fault(path, options, _in_folder)
         elif path.is_file():
             files.append(path)
         else:
             raise PolarguideError(
                 path, expected="a file or folder of shots", found="none", remedy="Check the path."
             )
-    return _named_apart(_of_files(files, options) + found)
+    return _named_apart(_of_files(files, options) + shots)
 
 
 def mosaics(files: Sequence[Path]) -> list[ExposureSet]:
@@ -103,14 +103,14 @@ def mosaics(files: Sequence[Path]) -> list[ExposureSet]:
 def _of_files(files: list[Path], options: ShotOptions) -> list[ExposureSet]:
     if options.sensor is not None:
         return mosaics(files)
-    found = sets.videos(files)
+    of_videos = sets.videos(files)
     files = [path for path in files if path.suffix.lower() not in VIDEO_SUFFIXES]
     for folder in dict.fromkeys(path.parent for path in files if (path.parent / TABLE).is_file()):
         inside = {path.resolve() for path in files if path.parent == folder}
         for one in sets.by_table(folder)[0]:
             listed = {path.resolve() for path in one.paths if path != one.table}
             if listed & inside:
-                found.append(one)
+                of_videos.append(one)
             inside -= listed
         files = [path for path in files if path.parent != folder or path.resolve() in inside]
     by_root: dict[Path, filter_shots.Candidates] = {}
@@ -123,15 +123,15 @@ def _of_files(files: list[Path], options: ShotOptions) -> list[ExposureSet]:
     # Files of one angle are in folders that are called so by chance.
     in_folders = [c for c in by_root.values() if all(len(angles) > 1 for angles in c.values())]
     placed = {path for c in in_folders for angles in c.values() for same in angles.values() for path in same}
-    found += [shot for candidates in in_folders for shot in _filter_sets(candidates)]
-    return found + _by_names([path for path in files if path not in placed])
+    of_videos += [shot for candidates in in_folders for shot in _filter_sets(candidates)]
+    return of_videos + _by_names([path for path in files if path not in placed])
 
 
 def _by_names(files: Sequence[Path]) -> list[ExposureSet]:
     """The sets, the shots of four and the strangers among files, by their names."""
-    found, rest = sets.by_name(files)
+    named, rest = sets.by_name(files)
     by_name, others = filter_shots.group_files(rest)
-    return [*found, *_filter_sets(by_name), *_strangers(others)]
+    return [*named, *_filter_sets(by_name), *_strangers(others)]
 
 
 def _filter_sets(shots: filter_shots.Candidates) -> list[ExposureSet]:
@@ -176,16 +176,16 @@ def _or_fault(
 
 
 def _in_folder(root: Path, options: ShotOptions) -> list[ExposureSet]:
-    found = _directly_in(root, options)
-    if all(shot.nothing for shot in found):
+    shots = _directly_in(root, options)
+    if all(shot.nothing for shot in shots):
         folders = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
         for folder in folders:
             inside = _or_fault(folder, options, _directly_in)
             alone = len(inside) == 1 and inside[0].name == folder.resolve().name
-            found += inside if alone else [replace(s, name=f"{folder.name}_{s.name}") for s in inside]
-    if not found:
+            shots += inside if alone else [replace(s, name=f"{folder.name}_{s.name}") for s in inside]
+    if not shots:
         raise PolarguideError(root, expected="shots", found=describe_contents(root), remedy=_REMEDY)
-    return found
+    return shots
 
 
 def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
@@ -195,18 +195,18 @@ def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
         files = list_files(root, RAW_SUFFIXES)
         dark = None if options.dark_frame is None else os.path.realpath(options.dark_frame)
         return mosaics([path for path in files if os.path.realpath(path) != dark])
-    found = sets.videos(list_files(root, VIDEO_SUFFIXES))
+    videos = sets.videos(list_files(root, VIDEO_SUFFIXES))
     if (root / TABLE).is_file():
         listed, others = sets.by_table(root)
-        return [*found, *listed, *_strangers(others)]
+        return [*videos, *listed, *_strangers(others)]
     files = list_files(root, filter_shots.SHOT_SUFFIXES)
     in_folders = [] if files else sets.by_folder(root)
     if in_folders:
-        return [*found, *in_folders]
+        return [*videos, *in_folders]
     if not angle_folders(root):
-        return found + _by_names(files)
+        return videos + _by_names(files)
     shots, _ = filter_shots.list_shots(root)
-    return found + _filter_sets(shots)
+    return videos + _filter_sets(shots)
 
 
 def _views(layout: Layout) -> list[ExposureSet]:
@@ -215,7 +215,7 @@ def _views(layout: Layout) -> list[ExposureSet]:
     Raises:
         PolarguideError: there is no other view.
     """
-    found = []
+    shots = []
     for name in layout.names:
         others, fault = layout.others.get(name, ()), None
         if others:
@@ -224,25 +224,25 @@ def _views(layout: Layout) -> list[ExposureSet]:
             except PolarguideError as error:
                 fault = error
         files, more = layout.pictures.get(name, {}), tuple(path for path, _ in others)
-        found.append(ExposureSet(name, "scene", files, layout.root, name, fault, more))
-    if found and all(shot.fault is not None for shot in found):
-        assert found[0].fault is not None
-        raise found[0].fault
-    return found
+        shots.append(ExposureSet(name, "scene", files, layout.root, name, fault, more))
+    if shots and all(shot.fault is not None for shot in shots):
+        assert shots[0].fault is not None
+        raise shots[0].fault
+    return shots
 
 
-def _named_apart(found: list[ExposureSet]) -> list[ExposureSet]:
+def _named_apart(shots: list[ExposureSet]) -> list[ExposureSet]:
     """Sets of one name are called by their folder, too; it is their fault where that does not tell them apart.
 
     So is a name that a folder cannot have.
     """
-    found = [shot if usable_name(shot.name) else _unusable(shot) for shot in found]
-    names = Counter(shot.name for shot in found)
+    shots = [shot if usable_name(shot.name) else _unusable(shot) for shot in shots]
+    names = Counter(shot.name for shot in shots)
     apart = [
         shot
         if names[shot.name] == 1
         else replace(shot, name=f"{(shot.root or shot.paths[0].resolve().parent).name}_{shot.name}")
-        for shot in found
+        for shot in shots
     ]
     named: dict[str, list[ExposureSet]] = {}
     for shot in apart:
@@ -256,10 +256,10 @@ def usable_name(name: str) -> bool:
 
 
 def require_name(shot: ExposureSet) -> None:
-    """Refuse a shot whose files would not be written into a folder of its own.
+    """Raise an error if a shot's name cannot name a folder: its files would be written elsewhere.
 
     Raises:
-        PolarguideError: a folder cannot have its name.
+        PolarguideError: no folder can have the shot's name.
     """
     if not usable_name(shot.name):
         raise PolarguideError(

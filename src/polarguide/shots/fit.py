@@ -93,8 +93,8 @@ class SetModel:
             beyond = np.flatnonzero(far[worst, np.arange(at.size)] > self._limit)
             weights = weights[:, beyond]
             weights[worst[beyond], np.arange(beyond.size)] = 0
-            kept = self._determined((weights > 0).astype(np.float32))
-            weights, beyond = weights[:, kept], beyond[kept]
+            determined = self._determined((weights > 0).astype(np.float32))
+            weights, beyond = weights[:, determined], beyond[determined]
             at, picked = at[beyond], picked[:, beyond]
             if at.size:
                 fit.weights[:, at] = weights
@@ -102,7 +102,7 @@ class SetModel:
 
     def _determined(self, usable: Array) -> NDArray[np.bool_]:
         """Whether the samples that are used, [K, N] of 0 and 1, determine a Stokes vector well, [N]."""
-        found = np.ones(usable.shape[1], bool)
+        determined = np.ones(usable.shape[1], bool)
         some = np.flatnonzero(usable.sum(axis=0) < self._used.sum())
         if some.size:
             sums = self._squares @ usable[:, some]
@@ -110,8 +110,8 @@ class SetModel:
             for (i, j), values in zip(_PAIRS, sums, strict=True):
                 matrices[:, i, j] = matrices[:, j, i] = values
             spectrum = np.linalg.eigvalsh(matrices)
-            found[some] = spectrum[:, 0] > WELL_CONDITIONED**2 * spectrum[:, -1]
-        return found
+            determined[some] = spectrum[:, 0] > WELL_CONDITIONED**2 * spectrum[:, -1]
+        return determined
 
     def _solve(self, weights: Array, values: Array) -> tuple[Array, Array]:
         """Weighted least squares of [K, N]: Stokes vectors [3, N], and the inverse [6, N] of the normal matrix."""

@@ -55,13 +55,13 @@ class _Angle:
     residual: float
 
 
-def chosen_pixels(samples: SetSamples, most: int = _PIXELS) -> tuple[NDArray[Any], NDArray[Any]]:
+def chosen_pixels(samples: SetSamples) -> tuple[NDArray[Any], NDArray[Any]]:
     """Rows and columns of pixels that are good in every picture, spread over the picture."""
     good = ~(samples.dark | samples.masked)
     for lost in samples.lost:
         good &= ~lost
     places = np.flatnonzero(good)
-    places = places[:: max(1, len(places) // most)]
+    places = places[:: max(1, len(places) // _PIXELS)]
     return np.unravel_index(places, good.shape)  # type: ignore[return-value]
 
 
@@ -78,16 +78,16 @@ def judge(samples: SetSamples, gray: Floats) -> Judgment:
     used = np.ones(count, bool)
     reasons: dict[int, str] = {}
     while gray.shape[1] >= _FEWEST:
-        found = {k: _predicted(rows, gray, used, k) for k in np.flatnonzero(used).tolist()}
+        predicted = {k: _predicted(rows, gray, used, k) for k in np.flatnonzero(used).tolist()}
         # The picture without which least is left of the rest, and the one whose angle is off most.
         doubtful = (
-            max(found, key=lambda k: found[k].residual),
-            max(found, key=lambda k: _off(samples, k, found[k])),
+            max(predicted, key=lambda k: predicted[k].residual),
+            max(predicted, key=lambda k: _off(samples, k, predicted[k])),
         )
-        worst = next((k for k in doubtful if _contradicts(samples, gray, used, k, found)), None)
+        worst = next((k for k in doubtful if _contradicts(samples, gray, used, k, predicted)), None)
         if worst is None:
             break
-        used[worst], reasons[worst] = False, _reason(samples, worst, found[worst])
+        used[worst], reasons[worst] = False, _reason(samples, worst, predicted[worst])
     fits = tuple(_picture(samples, k, _predicted(rows, gray, used, k), bool(used[k])) for k in range(count))
     notes = [reasons[k] for k in sorted(reasons)]
     off_by = [abs(_apart(f.looks_like, f.angle)) for f in fits if f.looks_like is not None and not f.left_out]
@@ -104,15 +104,15 @@ def _apart(angle: float, other: float) -> float:
     return (angle - other + 90.0) % 180.0 - 90.0
 
 
-def _off(samples: SetSamples, k: int, found: _Angle) -> float:
+def _off(samples: SetSamples, k: int, predicted: _Angle) -> float:
     """How far a picture's angle is off, degrees; 0 where the light does not tell."""
-    if found.angle is None:
+    if predicted.angle is None:
         return 0.0
-    return abs(_apart(math.degrees(found.angle), samples.exposures[k].angle or 0.0))
+    return abs(_apart(math.degrees(predicted.angle), samples.exposures[k].angle or 0.0))
 
 
 def _contradicts(
-    samples: SetSamples, gray: Floats, used: NDArray[np.bool_], worst: int, found: dict[int, _Angle]
+    samples: SetSamples, gray: Floats, used: NDArray[np.bool_], worst: int, predicted: dict[int, _Angle]
 ) -> bool:
     """Whether the others agree with one another far better than a picture does with them, by angle or residual."""
     rows, rest = samples.rows.astype(np.float64), used.copy()
@@ -122,19 +122,20 @@ def _contradicts(
     others = {k: _predicted(rows, gray, rest, k) for k in np.flatnonzero(rest).tolist()}
     typical = float(np.median([_off(samples, k, other) for k, other in others.items()]))
     left = float(np.median([other.residual for other in others.values()]))
-    by_angle = _off(samples, worst, found[worst]) > max(MARKS, AGAINST * typical)
-    return by_angle or found[worst].residual > AGAINST * left
+    by_angle = _off(samples, worst, predicted[worst]) > max(MARKS, AGAINST * typical)
+    return by_angle or predicted[worst].residual > AGAINST * left
 
 
-def _reason(samples: SetSamples, k: int, found: _Angle) -> str:
+def _reason(samples: SetSamples, k: int, predicted: _Angle) -> str:
     """The reason why a picture is rejected, for the user."""
     head = f"{samples.labels[k]} ({samples.exposures[k].angle or 0.0:g} degrees)"
-    if _off(samples, k, found) > MARKS:
-        looks = f"{math.degrees(found.angle or 0.0) % 180:.0f} degrees"
+    if _off(samples, k, predicted) > MARKS:
+        looks = f"{math.degrees(predicted.angle or 0.0) % 180:.0f} degrees"
         return f"{head} looks like {looks}: its angle is probably wrong. It is left out."
-    if abs(found.gain - 1) > BRIGHTER:
-        way = "brighter" if found.gain > 1 else "darker"
-        return f"{head} is {abs(found.gain - 1):.0%} {way} than the others predict (exposure or light). It is left out."
+    if abs(predicted.gain - 1) > BRIGHTER:
+        way = "brighter" if predicted.gain > 1 else "darker"
+        by = f"{abs(predicted.gain - 1):.0%} {way}"
+        return f"{head} is {by} than the others predict (exposure or light). It is left out."
     return f"{head} contradicts the others (motion, light or a wrong angle). It is left out."
 
 

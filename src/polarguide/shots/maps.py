@@ -87,7 +87,7 @@ class ShotMaps:
     angles and degrees are never averaged. The colors themselves are in ``intensities``.
 
     Attributes:
-        name: of the shot.
+        name: name of the shot.
         files: it was read from, in the order 0, 45, 90, 135 where there are four.
         intensities: [4, H, W, C] float32, linear, at 0, 45, 90 and 135 degrees, counter-clockwise as displayed; 1 is
             full scale; noise about black may be negative. C is 3 (R, G, B) or 1 (monochrome). Of a set at other angles
@@ -101,7 +101,7 @@ class ShotMaps:
         sigma_aolp: [H, W] float32, of ``aolp``, radians, at most ``optics.UNIFORM_SPREAD``.
         reason: [H, W] uint8, a ``Reason``. NOISE pixels do have an S0 and a (small) DoLP: means of these over a region
             take them in; they say nothing of an angle or a normal.
-        noise: of one sample of the sensor.
+        noise: noise of one sample of the sensor.
         pair_ratio: median of (I0 + I90) / (I45 + I135), which is 1 for ideal polarizers; None where it is too dark, and
             of a set at other angles.
         notes: what was assumed, for the user.
@@ -266,8 +266,8 @@ def _variances(sensor: str, x: int, y: int, mode: str) -> tuple[NDArray[np.float
         # Impulses of one position lie so far apart that no pixel sees two.
         squares += response**2
         summed += response[:, inner, inner].sum(axis=(1, 2)) ** 2  # by the only impulse in there
-    found = squares[:, inner, inner]
-    blocks = found.reshape(4, found.shape[1] // period, period, found.shape[2] // period, period)
+    variances = squares[:, inner, inner]
+    blocks = variances.reshape(4, variances.shape[1] // period, period, variances.shape[2] // period, period)
     mean = float(summed.mean()) * step**2 / cell**2
     return np.asarray(blocks.sum(axis=(1, 3)), np.float32), mean
 
@@ -283,7 +283,7 @@ class Developed:
     Attributes:
         intensities: [4, H, W, C] float32, linear; noise about black may be negative.
         dark, saturated, masked: [H, W].
-        noise: of a sample. factors: variance of an intensity (of the luminance) as a multiple of a sample's,
+        noise: noise of a sample. factors: variance of an intensity (of the luminance) as a multiple of a sample's,
             [4, p, p] over a period of pixels.
         mean_variance, pair_ratio, notes, origin, whole: as in ``ShotMaps``.
     """
@@ -316,11 +316,11 @@ def gains_of(
     if ratio is None:
         return UNIT_GAINS, ()
     deviation = f"I0 + I90 is {ratio - 1:+.2%} off I45 + I135"
-    found = balancing_gains(ratio)
-    if found is None:
+    gains = balancing_gains(ratio)
+    if gains is None:
         return UNIT_GAINS, (f"{deviation}: the angles or the encoding are probably wrong.",)
     if options.gains == "auto":
-        return found, (f"{deviation}; corrected.",)
+        return gains, (f"{deviation}; corrected.",)
     if abs(ratio - 1) > _LARGE_IMBALANCE:
         return UNIT_GAINS, (f"{deviation}; not corrected (--gains auto does, a calibration does better).",)
     return UNIT_GAINS, ()

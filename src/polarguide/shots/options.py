@@ -123,7 +123,7 @@ class ShotOptions(MosaicOptions):
         """Refuse options that mean nothing for a kind of shot.
 
         Args:
-            kind: of the shot. name: of the shot.
+            kind: kind of the shot. name: name of the shot.
 
         Raises:
             PolarguideError: one is set.

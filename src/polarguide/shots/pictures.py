@@ -24,13 +24,19 @@ _OF_S0 = "linear radiance in units of S0 (2 is full scale of all four intensitie
 
 @dataclass(frozen=True)
 class MapKind:
-    """One map.
+    """A kind of map of a shot, such as the DoLP: how it is computed, written and drawn.
 
     Attributes:
-        key: its name in files. label: for people. unit: of the numbers in files.
-        look: how it is drawn. values: its numbers. color_map: of a scalar. fixed: its range, None for one that fits.
-        factor: from the file's unit to that of the picture, ``shown_unit``.
-        note: what to know before trusting it.
+        key: name in file names.
+        label: name for people.
+        unit: unit of the values in files.
+        look: way in which it is drawn.
+        values: function that computes it.
+        color_map: color map of a scalar.
+        fixed: range of the colors; None: it fits the values of each map.
+        factor: factor from ``unit`` to ``shown_unit``.
+        shown_unit: unit in the picture.
+        note: limitation that is written beside it.
     """
 
     key: str
@@ -232,9 +238,9 @@ def _mark(kind: MapKind, stretch: Stretch, scale: float) -> Picture:
     if kind.look == "scalar":
         return _bar(kind, stretch, scale)
     if kind.look == "angle":
-        return _wheel(high, scale)
+        return figures.angle_wheel(high / 113)
     if kind.look == "normal":
-        return _ball(high)
+        return figures.normal_ball(high, round(1.2 * high))
     if kind.look == "reason":
         return _patches(high, scale)
     return np.full((high, 1, 3), 255, np.uint8)
@@ -256,39 +262,6 @@ def _bar(kind: MapKind, stretch: Stretch, scale: float) -> Picture:
         x = min(max(x, 2), mark.shape[1] - drawn_width - 2)
         _text(mark, text, x, top + ramp.shape[0] + round(24 * scale), 0.55 * scale, mark.shape[1])
     return mark
-
-
-def _wheel(high: int, scale: float) -> Picture:
-    """Colors by direction of the field, over half a turn, with the angles written to it."""
-    radius, margin = high - round(40 * scale), round(56 * scale)
-    mark: Picture = np.full((high, 2 * (radius + margin), 3), 255, np.uint8)
-    cx, cy = radius + margin, high - round(14 * scale)
-    y, x = np.mgrid[0 : mark.shape[0], 0 : mark.shape[1]]
-    angle, distance = np.arctan2(cy - y, x - cx), np.hypot(cy - y, x - cx)
-    inside = (distance <= radius) & (distance >= 0.35 * radius) & (y <= cy)
-    mark[inside] = figures.aolp_to_rgb(torch.from_numpy(angle))[inside]
-    for degrees in (0, 45, 90, 135, 180):
-        text = str(degrees) if degrees else "0 deg"
-        (wide, tall), _ = cv2.getTextSize(text, FONT, 0.5 * scale, 1)
-        a = math.radians(degrees)
-        px = cx + (radius + 6 * scale) * math.cos(a)
-        py = cy - (radius + 6 * scale) * math.sin(a)
-        px -= wide * (1 - math.cos(a)) / 2
-        _text(
-            mark, text, round(px), round(py + (tall / 2 if degrees in (0, 180) else 0)), 0.5 * scale, wide + 9
-        )
-    return mark
-
-
-def _ball(high: int) -> Picture:
-    """A ball seen from the camera, in the colors of its normals."""
-    radius = 0.42 * high
-    y, x = np.mgrid[0:high, 0 : round(1.2 * high)]
-    right, down = (x - 0.5 * high) / radius, (y - 0.5 * high) / radius
-    inside = right**2 + down**2 <= 1
-    toward = np.sqrt(np.maximum(1 - right**2 - down**2, 0))
-    normals = torch.from_numpy(np.stack((right, down, -toward), axis=-1).astype(np.float32))
-    return np.where(inside[..., None], _normal_colors(normals), 255).astype(np.uint8)
 
 
 def _patches(high: int, scale: float) -> Picture:
@@ -320,9 +293,9 @@ def _text(picture: Picture, text: str, x: int, y: int, size: float, room: int) -
 
 def _quantile(values: NDArray[Any], where: NDArray[np.bool_], q: float = 0.995) -> float:
     step = max(1, math.isqrt(values.size // _SAMPLES))
-    found = values[::step, ::step][where[::step, ::step]]
-    found = found[np.isfinite(found)]
-    return float(np.quantile(found, q)) if found.size else 1.0
+    numbers = values[::step, ::step][where[::step, ::step]]
+    numbers = numbers[np.isfinite(numbers)]
+    return float(np.quantile(numbers, q)) if numbers.size else 1.0
 
 
 def _nice(value: float) -> float:

@@ -58,10 +58,10 @@ def read_shot(
         options: how to read it.
         part: x, y, width and height of what is wanted of the picture of a mosaic: the rest is left out where that saves
             time, as ``ShotMaps.origin`` and ``whole`` say. Noise that is not given is then estimated from the part.
-        angles: of the K pictures of an array, degrees counter-clockwise as displayed; files state theirs.
+        angles: angles of the K pictures of an array, degrees counter-clockwise as displayed; files state theirs.
 
     Raises:
-        PolarguideError: it is not one shot, a file is missing, cannot be read, or does not fit, or an array has
+        PolarguideError: the path is not one shot, a file is missing, cannot be read, or does not fit, or an array has
             another shape or type.
     """
     options = (options or ShotOptions()).checked()
@@ -134,13 +134,13 @@ def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> Sh
         why = reason[part]
         why[degree <= options.snr * spread.dolp] = Reason.NOISE
         why[s[0] <= DARK_SNR / 2 * variances.sum(dim=0).sqrt()] = Reason.DARK
-    found = reason.numpy()
+    codes = reason.numpy()
     for mask, kind in (
         (developed.dark, Reason.DARK),
         (developed.saturated, Reason.SATURATED),
         (developed.masked, Reason.MASKED),
     ):
-        found[mask] = kind
+        codes[mask] = kind
     return ShotMaps(
         name=shot.name,
         files=shot.paths,
@@ -151,7 +151,7 @@ def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> Sh
         aolp=aolp.numpy(),
         sigma_dolp=sigma_dolp.numpy(),
         sigma_aolp=sigma_aolp.numpy(),
-        reason=found,
+        reason=codes,
         noise=developed.noise,
         pair_ratio=developed.pair_ratio,
         notes=developed.notes,
@@ -181,7 +181,7 @@ class SurfaceMaps:
         specular_exact, diffuse_exact: [H, W, C] float32, units of S0: Fresnel's split, which needs the normal, and so
             is as right as the guess above. They add up to S0.
         conditioned: [H, W] bool, where the exact one is well conditioned.
-        refractive_index: of all surfaces.
+        refractive_index: refractive index of all surfaces.
         perspective: whether the rays of the pixels are known; else all are parallel to the axis.
     """
 
@@ -200,7 +200,7 @@ def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
     """A camera of ``fx,fy,cx,cy`` in pixels of a picture of ``size`` (width, height).
 
     Raises:
-        PolarguideError: it is something else.
+        PolarguideError: the text is something else.
     """
     numbers = decimals(text)
     # A center may lie outside of a cut picture; beyond these bounds it is a slip.
@@ -210,7 +210,7 @@ def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
             "--intrinsics",
             expected="fx,fy,cx,cy in pixels of the developed picture",
             found=repr(text),
-            remedy="Correct the value; the center of the first pixel is at 0.5.",
+            remedy="Give four numbers; the center of the first pixel is at 0.5.",
         )
     return Camera(*size, *numbers, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
 
@@ -238,9 +238,9 @@ def surface_maps(
     """Candidates of the normals, one of them, and both separations.
 
     Args:
-        maps: of the shot.
+        maps: maps of the shot.
         camera: of its pixels, for their rays; None takes rays parallel to the axis, which a long lens nearly has.
-        refractive_index: of all surfaces; None: ``INDEX``.
+        refractive_index: refractive index of all surfaces; None: ``INDEX``.
 
     Raises:
         PolarguideError: the refractive index is out of range.
@@ -328,8 +328,8 @@ def array_shot(
     Args:
         array: with a sensor, a raw mosaic [H, W] of uint8 or uint16; else pictures through a filter, [K, H, W] gray or
             [K, H, W, 3] RGB: uint8 or uint16 as stored, or linear floats from 0 to 1. It is not written to.
-        options: how it is read. name: of the shot.
-        angles: of the K pictures in degrees, counter-clockwise as displayed.
+        options: how it is read. name: name of the shot.
+        angles: angles of the K pictures in degrees, counter-clockwise as displayed.
 
     Raises:
         PolarguideError: shape, type or angles do not fit; its ``where`` is the name.
@@ -377,7 +377,7 @@ def stacked_array(shot: Array | Sequence[Array], name: str = NAME) -> Array:
     pictures = [as_numpy(picture) for picture in shot]
     kinds = list(dict.fromkeys(map(kind_of, pictures)))
     if len(kinds) > 1:
-        remedy = "Export the pictures of a shot alike."
+        remedy = "Export all pictures of a shot with the same settings."
         raise PolarguideError(
             name, expected="pictures of one shape and type", found=" and ".join(kinds), remedy=remedy
         )

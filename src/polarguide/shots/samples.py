@@ -40,9 +40,9 @@ class SetSamples:
     """The pictures of a set, before anything is fitted.
 
     Attributes:
-        labels: of the pictures, for messages.
+        labels: labels of the pictures, for messages.
         values: [K, H, W, C] linear, uint16 codes or float32 intensities; C is 1 where all pictures are gray.
-        exposures: of the pictures: the angle in degrees, counter-clockwise as displayed, and the gain.
+        exposures: exposures of the pictures: the angle in degrees, counter-clockwise as displayed, and the gain.
         lost: [K, H, W], samples at full scale.
         dark: [H, W], 0 in all pictures. masked: [H, W].
         step: one stored value as a share of full scale.
@@ -78,8 +78,8 @@ class SetSamples:
 
     def gray(self, at: Any) -> NDArray[np.float32]:
         """The same of the luminance, the plain mean of the colors: [K, ...]."""
-        found = self.intensities(at)
-        return luminance(found)
+        colors = self.intensities(at)
+        return luminance(colors)
 
 
 def luminance(colors: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -128,8 +128,8 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
     read = Shots(values, code, lost, dark)
     angles = [_degrees(picture.angle) for picture in pictures]
     labels = tuple(picture.label for picture in pictures)
-    found = _samples(read, kind, labels, angles, gains, transfer, options)
-    return replace(found, notes=(note, *found.notes, *words, *_unused(unused)))
+    samples = _samples(read, kind, labels, angles, gains, transfer, options)
+    return replace(samples, notes=(note, *samples.notes, *words, *_unused(unused)))
 
 
 def samples_of_arrays(
@@ -138,7 +138,7 @@ def samples_of_arrays(
     """The samples of a set in memory.
 
     Args:
-        name: of the shot. stored: [K, H, W, 3] uint8 or uint16. angles: of the K pictures.
+        name: name of the shot. stored: [K, H, W, 3] uint8 or uint16. angles: angles of the K pictures.
     """
     require_no_order(options.calibration, name)
     places = [k for k, angle in enumerate(angles) if not isinstance(angle, str)]
@@ -149,9 +149,9 @@ def samples_of_arrays(
     transfer = "linear" if options.transfer == "auto" else options.transfer
     labels = tuple(f"picture {k + 1}" for k in places)
     known = [_degrees(angles[k]) for k in places]
-    found = _samples(read, stored.dtype, labels, known, [1.0] * len(places), transfer, options)
+    samples = _samples(read, stored.dtype, labels, known, [1.0] * len(places), transfer, options)
     note = f"Transfer {transfer}, {'as arrays are' if options.transfer == 'auto' else 'as given'}."
-    return replace(found, notes=(note, *found.notes, *_unused(len(angles) - len(places))))
+    return replace(samples, notes=(note, *samples.notes, *_unused(len(angles) - len(places))))
 
 
 def _samples(
@@ -233,7 +233,7 @@ def require_no_order(calibration: Calibration, name: str) -> None:
     """Refuse what a calibration says of pictures called 0, 45, 90 and 135 for pictures at other angles.
 
     Raises:
-        PolarguideError: it has gains or another order.
+        PolarguideError: the calibration has gains or another order.
     """
     for field, given in (("gains", calibration.gains is not None), ("order", calibration.order != ANGLES)):
         if given:
@@ -262,7 +262,7 @@ def _read_each(pictures: Sequence[SetPicture]) -> Iterator[Shots]:
                     path,
                     expected=f"EXIF orientation {first.orientation} like {pictures[0].path.name}",
                     found=str(shot.orientation),
-                    remedy="Keep the camera still between the pictures of a set, or export them all alike.",
+                    remedy="Keep the camera still within a set, or export all with the same orientation.",
                 )
             yield shot
 
@@ -278,11 +278,11 @@ def _video(path: Path, frames: Sequence[int | None]) -> Iterator[Shots]:
         yield Shots(picture[None], 1, clipped[None], ~lit)
 
 
-def _transfer(pictures: Sequence[SetPicture], asked: str) -> tuple[str, str]:
+def _transfer(pictures: Sequence[SetPicture], transfer: str) -> tuple[str, str]:
     """How the files are encoded, and why: as ``prepare`` takes photographs at any angles.
 
     Raises:
-        PolarguideError: they are of several kinds.
+        PolarguideError: the files are of several kinds.
     """
     kinds: dict[str, Path] = {}
     for picture in pictures:
@@ -295,9 +295,9 @@ def _transfer(pictures: Sequence[SetPicture], asked: str) -> tuple[str, str]:
             found=" and ".join(f"{kind} ({path.name})" for kind, path in kinds.items()),
             remedy="Keep one kind: their brightness cannot be compared.",
         )
-    if asked == "auto" and "video" not in kinds:
+    if transfer == "auto" and "video" not in kinds:
         require_known_encoding(pictures[0].path)
-    return transfer_of_kind(next(iter(kinds)), asked)
+    return transfer_of_kind(next(iter(kinds)), transfer)
 
 
 def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:

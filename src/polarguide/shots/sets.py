@@ -43,10 +43,10 @@ class SetPicture:
     """One picture of a set.
 
     Attributes:
-        path: of the picture, or of the video.
+        path: path of the picture, or of the video.
         angle: of the polarizer as the user counts it, degrees; "unknown", or "none" without a polarizer: not used.
         gain: exposure relative to the others, where a table states it.
-        frame: of the video, from 0; None for a picture file.
+        frame: frame of the video, from 0; None for a picture file.
     """
 
     path: Path
@@ -74,7 +74,7 @@ class ExposureSet:
         fault: why it is no shot: ``read_shot`` raises it, and the shots beside it are not concerned.
         others: where there is a fault, files that ``files`` has no place for; or the folder that it is in. Of a view of
             a scene, its pictures where they are not the usual four.
-        pictures: of a set, by angle.
+        pictures: pictures of a set, by angle.
         table: that states their angles; None where names do.
         stored: the pictures of a shot in memory, which has no files: [H, W] of a mosaic, else [K, H, W, 3].
         angles: theirs, as the user counts them; none of a mosaic.
@@ -146,7 +146,7 @@ def known_places(view: str, exposures: Sequence[Exposure]) -> list[int]:
     """The places of the pictures of a view at known angles.
 
     Raises:
-        PolarguideError: they do not determine Stokes vectors.
+        PolarguideError: the angles do not determine Stokes vectors.
     """
     angles: list[Angle] = [
         e.angle if e.angle is not None else "unknown" if e.filtered else "none" for e in exposures
@@ -299,7 +299,7 @@ def _of_lines(root: Path, table: Path, view: str, lines: Sequence[Line]) -> Expo
         table,
         expected=f"the file {missing[0]}",
         found="nothing of this name",
-        remedy="Correct the name, or remove the line.",
+        remedy="Correct the file's name in the table, or remove its line.",
     )
     there = [picture for picture in pictures if picture.path.is_file()]
     return _exposure_set(view, there, table, fault)
@@ -383,7 +383,7 @@ def read_frames(path: Path, frames: Sequence[int]) -> Iterator[NDArray[np.uint8]
                     path,
                     expected=f"a video with frame {frame}, counted from 0",
                     found=found,
-                    remedy="Correct the table, or save the frames as pictures.",
+                    remedy="Remove the frame from the table, or save the frames as pictures.",
                 )
             yield np.ascontiguousarray(picture[..., ::-1])
     finally:

@@ -47,7 +47,7 @@ class WrittenShots:
     """The outcome of several shots.
 
     Attributes:
-        folders: of the shots that were written, by name.
+        folders: folders of the shots that were written, by name.
         faults: the errors of the others, by name.
     """
 
@@ -77,7 +77,7 @@ def write_shots(
         formats: png (with legends), exr and npy (numbers; ``maps.json`` says their units), page.
         intrinsics: ``fx,fy,cx,cy`` of the developed pictures; without them, and without poses of a scene, rays are
             parallel.
-        refractive_index: of all surfaces; None: as ``surface_maps`` takes it.
+        refractive_index: refractive index of all surfaces; None: as ``surface_maps`` takes it.
         reporter: where messages and progress go.
 
     Raises:
@@ -85,15 +85,15 @@ def write_shots(
     """
     options = (options or ShotOptions()).checked()
     check_formats(formats)
-    found = [s for s in paths if isinstance(s, ExposureSet)]
-    if len(found) < len(paths) or not paths:
-        found += find_shots([p for p in paths if not isinstance(p, ExposureSet)], options)
+    shots = [s for s in paths if isinstance(s, ExposureSet)]
+    if len(shots) < len(paths) or not paths:
+        shots += find_shots([p for p in paths if not isinstance(p, ExposureSet)], options)
     require_elsewhere([path for path in paths if not isinstance(path, ExposureSet)], Path(out))
     check_files(options)
     folders: dict[str, Path] = {}
     faults: dict[str, PolarguideError] = {}
-    with reporter.track("shots", len(found)) as advance:
-        for number, shot in enumerate(found, 1):
+    with reporter.track("shots", len(shots)) as advance:
+        for number, shot in enumerate(shots, 1):
             try:
                 require_name(shot)
                 folder = Path(out) / shot.name
@@ -104,7 +104,7 @@ def write_shots(
                 write_maps(maps, surface, folder, formats)
             except UNREADABLE as error:
                 fault = fault_of(shot, error)
-                if len(found) == 1:
+                if len(shots) == 1:
                     raise fault from error
                 faults[shot.name] = fault
                 reporter.warn(str(fault))
@@ -162,7 +162,7 @@ def check_formats(formats: Collection[str]) -> None:
             "formats",
             expected=f"some of {', '.join(FORMATS)}",
             found=", ".join(unknown) or "none",
-            remedy="Correct the name.",
+            remedy=f"Choose from {', '.join(FORMATS)}.",
         )
     if "exr" in formats:
         optional_import("OpenEXR", "EXR files")
@@ -232,7 +232,7 @@ def _write_exr(path: Path, values: NDArray[Any], unit: str, note: str) -> None:
     """One map as 32-bit floats, its unit in the header; one channel Y, or R, G, B (x, y, z of a normal).
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     exr = optional_import("OpenEXR", "EXR files")
     numbers = np.ascontiguousarray(
@@ -263,9 +263,9 @@ def shot_page(maps: ShotMaps, surface: SurfaceMaps) -> str:
     nothing is averaged.
     """
     step = max(1, math.ceil(max(maps.size) / SIDE))
-    shown = [kind for kind in kinds_of(maps) if kind.key not in _HIDDEN]
+    kinds = [kind for kind in kinds_of(maps) if kind.key not in _HIDDEN]
     layers, stretches = [], []
-    for kind in shown:
+    for kind in kinds:
         values = kind.values(maps, surface)
         stretch = stretch_of(kind, values, maps)
         picture = drawn(kind, values, maps, stretch, step)
@@ -283,9 +283,9 @@ def shot_page(maps: ShotMaps, surface: SurfaceMaps) -> str:
         script=page_part(_PACKAGE, "shot.js").replace("$data", script_json(data)),
         title=maps.name,
         summary=f"{w} x {h} pixels" + (f"; every {step}. pixel each way is on this page" if step > 1 else ""),
-        shown=list(zip(shown, stretches, strict=True)),
+        shown=list(zip(kinds, stretches, strict=True)),
         gradient=figures.color_gradient,
-        wheel=figures.aolp_wheel(),
+        wheel=data_uri(figures.angle_wheel(), "aolp", SIDE),
         reasons={code.name.lower(): color for code, color in REASON_COLORS.items()},
         width=width,
         height=height,

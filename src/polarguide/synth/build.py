@@ -236,9 +236,9 @@ def environment_dict(panorama: Array, channel: int | None) -> dict[str, Any]:
             "to_world": mi.ScalarTransform4f(axes)}  # fmt: skip
 
 
-def shown_dict(spec: SceneSpec, shown: bool) -> dict[str, Any]:
+def shown_dict(spec: SceneSpec, visible: bool) -> dict[str, Any]:
     """The attribute of a shape that says whether the camera sees it; nothing where it sees all."""
-    return {SHOWN: {"type": "uniform", "value": float(shown)}} if spec.object_only else {}
+    return {SHOWN: {"type": "uniform", "value": float(visible)}} if spec.object_only else {}
 
 
 def area_light_dict(light: dict[str, Any], channel: int | None, where: str) -> dict[str, Any]:
@@ -285,7 +285,7 @@ class BuiltScene:
         scenes: Mitsuba's scenes, one or three (see ``film.render_lobes``).
         shapes: Mitsuba's shape of every object in the first scene, in the order of the data.
         panorama: the environment, [H, W, 3].
-        textures: of every object, [H, W, 3] with rows from the top down, or None where it has one color.
+        textures: textures of every object, [H, W, 3] with rows from the top down, or None where it has one color.
     """
 
     spec: SceneSpec

@@ -79,7 +79,7 @@ class SparsePoints:
 
     Attributes:
         points: [M, 3]. colors: [M, 3] display-encoded.
-        tracks: of each point, (view, x, y) of each observation.
+        tracks: tracks of each point, (view, x, y) of each observation.
     """
 
     points: Array
@@ -94,10 +94,10 @@ def sample_sparse_points(
 
     Args:
         built: the scene.
-        cameras: of the views.
+        cameras: cameras of the views.
         pictures: their photographs, display-encoded [H, W, 3].
         count: number of points.
-        seed: of the random numbers.
+        seed: seed of the random numbers.
     """
     random = np.random.default_rng((seed, 23))
     origins, rays, colors, home = [], [], [], []

@@ -206,11 +206,11 @@ def _render_all(job: Job, reporter: Reporter) -> None:
     with reporter.track(f"rendering {job.built.spec.name}", len(job.names)) as progress:
         progress(len(job.names) - len(left))
         for count, number in enumerate(left, 1):
-            _render_view(job, number)
+            render_view(job, number)
             progress(len(job.names) - len(left) + count)
 
 
-def _render_view(job: Job, number: int) -> None:
+def render_view(job: Job, number: int) -> None:
     """Render one view and write its files."""
     settings, name, camera = job.settings, job.names[number], job.cameras[number]
     samples = settings.samples * (TEST_SAMPLES if name in job.tests else 1)
@@ -294,7 +294,7 @@ def parse_sweep(text: str) -> Sweep:
     """``noise=0,1,2`` -> Sweep.
 
     Raises:
-        PolarguideError: it has another form.
+        PolarguideError: the text has another form.
     """
     parameter, _, listed = text.partition("=")
     try:

@@ -54,7 +54,7 @@ def check_file_name(name: str, where: str) -> None:
     """Refuse a name that is no name of a file: its mesh is written under it.
 
     Raises:
-        PolarguideError: it would lead elsewhere, or cannot be written.
+        PolarguideError: the name leads to another folder, or no file can have it.
     """
     plain = name.isprintable() and not set(name) & set('/\\:*?"<>|') and not name.startswith(".")
     if not (plain and 0 < len(name) <= LONGEST_NAME):
@@ -66,7 +66,7 @@ def require_unicode(path: Path) -> None:
     """Refuse a name of a file whose bytes are no UTF-8: the renderer ends the process over one.
 
     Raises:
-        PolarguideError: it is one.
+        PolarguideError: the name is no UTF-8.
     """
     try:
         os.fspath(path).encode("utf-8")
@@ -91,7 +91,7 @@ def check_color(color: Any, where: str) -> None:
     """Refuse what is no color: three numbers from 0 to 1, "own", or a texture, which is checked where it is made.
 
     Raises:
-        PolarguideError: it is something else.
+        PolarguideError: the value is no color.
     """
     if color == "own" or isinstance(color, dict):
         return
@@ -106,7 +106,7 @@ def require_light(panorama: NDArray[Any], where: str) -> None:
     """Refuse an environment that is no light.
 
     Raises:
-        PolarguideError: it has values that are negative or not finite.
+        PolarguideError: the environment has values that are negative or not finite.
     """
     if panorama.ndim != 3 or not np.isfinite(panorama).all() or panorama.min() < 0:
         raise _fault(where, "finite radiance of 0 or more in three channels", "something else")
@@ -116,7 +116,7 @@ def require_solid(points: NDArray[Any], where: str) -> None:
     """Refuse the vertices [V, 3] of an object that is not there.
 
     Raises:
-        PolarguideError: they are not finite, or all in one place.
+        PolarguideError: the vertices are not finite, or all in one place.
     """
     if not (len(points) and np.isfinite(points).all() and np.ptp(points, axis=0).max() > 0):
         raise _fault(f"{where} shape", "an object with an extent", "one without, or one that is not finite")
@@ -278,7 +278,7 @@ def read_scene_file(path: Path) -> SceneSpec:
     """Read a scene file.
 
     Raises:
-        PolarguideError: it cannot be read, lacks a field, has an unknown one or a value out of range.
+        PolarguideError: the file cannot be read, lacks a field, has an unknown one or a value out of range.
     """
     return parse_scene(read_record(path, Data, remedy=REMEDY), str(path), folder=path.parent)
 
@@ -287,7 +287,7 @@ def parse_scene(data: Any, where: str, *, folder: Path) -> SceneSpec:
     """A scene from JSON data; ``where`` names it in messages.
 
     Raises:
-        PolarguideError: it lacks a field, has an unknown one or a value out of range.
+        PolarguideError: the scene lacks a field, has an unknown one or a value out of range.
     """
     spec = decode(with_current_keys(data), SceneSpec, where, remedy=REMEDY)
     for number, ring in enumerate(spec.camera.rings):

@@ -43,7 +43,7 @@ class Sensor:
         full_well: electrons at full scale.
         read_noise: standard deviation of the read noise in electrons.
         extinction: extinction ratio of the polarizers.
-        gains: of the samples behind polarizers at 0, 45, 90 and 135 degrees.
+        gains: gains of the samples behind polarizers at 0, 45, 90 and 135 degrees.
         bits: bits of a stored value.
         black: black level in stored values.
     """
@@ -106,13 +106,13 @@ _TURNS = (1, 1, 1, 6, 8, 3)
 
 @dataclass(frozen=True)
 class FilterShot:
-    """How a view is photographed.
+    """A simulated photograph of a view through a filter.
 
     Attributes:
-        angle: of the filter's axis, degrees counter-clockwise as displayed from the picture's horizontal.
-        stops: how much more light than the mean the automatic exposure lets in, as a power of two.
+        angle: transmission axis of the filter, degrees counter-clockwise from the horizontal of the displayed picture.
+        stops: exposure relative to the mean one, in stops: 1 is twice the light.
         orientation: EXIF orientation of the stored picture: 1, 3, 6 or 8.
-        noted: whether the file says the exposure time.
+        noted: whether the file records the exposure time.
     """
 
     angle: float
@@ -229,8 +229,8 @@ def render_lobes(
             share their random numbers, so that the noise has no color.
         camera: pose and intrinsics; the reconstruction filter is a box of one pixel.
         samples: paths per pixel and lobe.
-        seed: of the view.
-        limits: of the paths.
+        seed: seed of the view.
+        limits: limits of the paths.
         center: send all rays through the centers of pixels.
     """
     pixels = camera.width * camera.height

@@ -76,7 +76,7 @@ def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
     """
     with _silent_stderr():
         mi.variant()  # imports it
-        missing = _missing_llvm()
+        missing = missing_llvm()
     if not missing:
         mi.set_variant("llvm_ad_mono_polarized" if color == "rgb" else "llvm_ad_spectral_polarized")
         if threads:
@@ -106,7 +106,7 @@ def _silent_stderr() -> Iterator[None]:
         os.close(nowhere)
 
 
-def _missing_llvm() -> str:
+def missing_llvm() -> str:
     """Why LLVM cannot be used; empty if it can."""
     path = os.environ.get("DRJIT_LIBLLVM_PATH")
     if path and not os.path.exists(path):  # otherwise the library prints messages
@@ -251,8 +251,8 @@ def find_scene(name: str) -> SceneSpec:
     if not Path(name).is_file():
         raise PolarguideError(
             name,
-            expected=f"a scene file, or one of {', '.join(PRESETS)}",
-            found="nothing of this name",
-            remedy="docs/reference/scene-files.md describes scene files.",
+            expected=f"a scene file, or the name of a preset ({', '.join(PRESETS)})",
+            found="neither",
+            remedy="Check the spelling or the path. docs/reference/scene-files.md describes scene files.",
         )
     return read_scene_file(Path(name))

@@ -175,7 +175,7 @@ def trace_paths(
         scene: Mitsuba scene, of a polarized variant.
         ray: primary rays, with wavelengths in a spectral variant.
         sampler: random numbers of every ray.
-        limits: of the paths.
+        limits: limits of the paths.
 
     Returns:
         (specular, diffuse, emitted): [S0, S1, S2] of either lobe in Mitsuba's frame of the direction ``-ray.d``; the

@@ -83,7 +83,7 @@ def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: 
     A camera sees it where its center lies in the picture and not behind the rendered depth.
 
     Args:
-        gaussians: the Gaussians. views: with the cameras. rasterize: of the backend.
+        gaussians: the Gaussians. views: with the cameras. rasterize: rasterizer of the backend.
 
     Returns:
         [N, 3]; zero where no camera sees it.
@@ -118,7 +118,7 @@ def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: 
     """Pixels of each Gaussian in pictures from some cameras.
 
     Args:
-        gaussians: the Gaussians. cameras: of the pictures. rasterize: of the backend.
+        gaussians: the Gaussians. cameras: cameras of the pictures. rasterize: rasterizer of the backend.
     """
     splatted = splats(gaussians)
     views = torch.zeros(len(splatted.means), device=splatted.means.device)
@@ -145,7 +145,7 @@ class DensityControl:
         memory: gives back what was freed between two views. black: whether nothing is behind the subject.
 
     Attributes:
-        extent: of the scene, to which distances are relative.
+        extent: extent of the scene, to which distances are relative.
     """
 
     def __init__(

@@ -193,7 +193,7 @@ def _loss(found: str, world: int, out: Path) -> PolarguideError:
         "training",
         expected=f"{world} processes",
         found=found,
-        remedy=f"The last checkpoint in {out} is whole; go on with --resume, on any number of processes.",
+        remedy=f"The last checkpoint in {out} is complete; go on with --resume, on any number of processes.",
     )
 
 

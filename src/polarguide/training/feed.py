@@ -97,7 +97,7 @@ def unpack_priors(entry: Entry, camera: Camera, settings: Priors) -> ViewPriors:
     """The priors again; what was not kept is not a number, in its shape.
 
     Args:
-        entry: by ``pack_priors``. camera: of the view. settings: that they were computed with.
+        entry: by ``pack_priors``. camera: camera of the view. settings: that they were computed with.
     """
     values = {name: unpacked(stored) for name, stored in entry.items()}
     device = next(iter(values.values())).device
@@ -149,7 +149,7 @@ class ViewStore:
         warn: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._limit, self._folder, self._warn = limit, folder, warn
-        self._held: dict[tuple[str, str], Entry] = {}
+        self._entries: dict[tuple[str, str], Entry] = {}
         self._places: dict[tuple[str, str], _Place] = {}
         self._file: IO[bytes] | None = None
         self.in_memory, self.in_file = 0, 0
@@ -161,7 +161,7 @@ class ViewStore:
             kind, view: its name. make: makes it. disposable: over the limit it is made again, not put into the file.
         """
         key = (kind, view)
-        entry = self._held.get(key) or self._read(key)
+        entry = self._entries.get(key) or self._read(key)
         if entry is None:
             entry = make()
             self._keep(key, entry, disposable)
@@ -173,15 +173,15 @@ class ViewStore:
         An entry that is made again takes its old place in the file if it still fits there. A larger one is put at the
         end, and its old place stays empty: entries only grow when a stage reads more than the one before.
         """
-        for key in [key for key in self._held if key[0] == kind and view in (None, key[1])]:
-            self.in_memory -= _size(self._held.pop(key))
+        for key in [key for key in self._entries if key[0] == kind and view in (None, key[1])]:
+            self.in_memory -= _size(self._entries.pop(key))
         for key, place in self._places.items():
             if key[0] == kind and view in (None, key[1]):
                 place.parts = None
 
     def close(self) -> None:
         """Forget everything."""
-        self._held.clear()
+        self._entries.clear()
         self._places.clear()
         self.in_memory = self.in_file = 0
         if self._file is not None:
@@ -191,7 +191,7 @@ class ViewStore:
     def _keep(self, key: tuple[str, str], entry: Entry, disposable: bool) -> None:
         size = _size(entry)
         if self._limit is None or self.in_memory + size <= self._limit:
-            self._held[key] = entry
+            self._entries[key] = entry
             self.in_memory += size
         elif self._folder is not None and not disposable:
             try:
@@ -257,7 +257,7 @@ class Feed:
 
     Args:
         backend: device and rasterizer. recipe: the method. index: of refraction.
-        store: keeps what is computed of the views. views: that are trained on. steps: of the training.
+        store: keeps what is computed of the views. views: that are trained on. steps: steps of the training.
         black: whether nothing is behind the subject.
         memory: gives back what was freed before and after the priors of a view are made.
 
@@ -310,7 +310,7 @@ class Feed:
         """Targets of the rendering of one of a step's views.
 
         Args:
-            weights: of the stage, which say what its terms read.
+            weights: weights of the stage, which say what its terms read.
             guide: Gaussians whose normals resolve what polarization leaves open; needed where a term reads priors.
         """
         size, priors = self._size(step), None

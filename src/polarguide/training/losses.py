@@ -123,7 +123,7 @@ def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
 
     Args:
         depth: [H, W] camera depth, positive.
-        camera: of the picture.
+        camera: camera of the picture.
 
     Returns:
         [H, W, 3] in world axes, differentiable; zero on the border and where three points lie on a line.
@@ -144,7 +144,7 @@ def consistency_loss(result: RenderResult, camera: Camera, weight: Tensor | None
 
     Args:
         result: with the blended normal ``n`` (unit normals times weights that add up to alpha) and the depth.
-        camera: of the view.
+        camera: camera of the view.
         weight: [H, W] where it counts; None: everywhere.
     """
     assert result.normal is not None
@@ -207,7 +207,7 @@ def stokes_loss(result: RenderResult, priors: ViewPriors, shading: ShadingModel)
     geometry and layers has to fit the polarization of all views. See ``ViewPriors.stokes_weight`` for the root.
 
     Args:
-        result: with both layers and the normal. shading: of the recipe, for the run's refractive index.
+        result: with both layers and the normal. shading: shading of the recipe, for the run's refractive index.
     """
     predicted = shading.predicted_stokes(result, priors.camera)
     distance = (predicted[1:] - priors.stokes[1:]).abs().mean(dim=(0, -1))
@@ -245,7 +245,7 @@ def flatness_loss(log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
     On the CPU in float32 it is a native pass; ``flatness_loss_reference`` is the reference implementation.
 
     Args:
-        log_scales: [N, 3]. radii: [N], 0 where not visible. extent: of the scene.
+        log_scales: [N, 3]. radii: [N], 0 where not visible. extent: extent of the scene.
     """
     if not fits(log_scales, radii):
         return flatness_loss_reference(log_scales, radii, extent)
@@ -402,7 +402,7 @@ def step_loss(step: Step, weights: Weights) -> StepLoss:
     """The weighted sum of a stage's terms, and how far the picture is from the photograph.
 
     Args:
-        step: what the terms read; priors are needed where a weight asks for them. weights: of the stage.
+        step: what the terms read; priors are needed where a weight asks for them. weights: weights of the stage.
 
     Raises:
         PolarguideError: the loss is not finite (on the CPU; see ``refuse_diverged``).

@@ -24,7 +24,7 @@ from polarguide.core.native import fits
 from polarguide.optics.color import srgb_encode
 from polarguide.training.targets import Step
 
-_WINDOW = 11
+SSIM_WINDOW = 11
 _SIGMA = 1.5
 _C1, _C2 = 0.01**2, 0.03**2
 
@@ -57,18 +57,28 @@ class _Clip(torch.autograd.Function):
 
 
 @lru_cache(maxsize=4)
-def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """The Gaussian window, [11], adding up to 1."""
-    offsets = torch.arange(_WINDOW, dtype=dtype, device=device) - _WINDOW // 2
+def gaussian_window(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Weights [11] of SSIM's Gaussian window along one axis, which add up to 1."""
+    offsets = torch.arange(SSIM_WINDOW, dtype=dtype, device=device) - SSIM_WINDOW // 2
     window = torch.exp(-(offsets**2) / (2 * _SIGMA**2))
     return window / window.sum()
 
 
+def structural_similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> Tensor:
+    """SSIM [...] of two pictures in [0, 1] (Wang et al. 2004, Eq. 13), K1 = 0.01, K2 = 0.03, population covariance.
+
+    Args:
+        x, y, xx, yy, xy: [...] means under the window of both pictures, their squares and their product.
+    """
+    numerator = (2 * x * y + _C1) * (2 * (xy - x * y) + _C2)
+    return numerator / ((x * x + y * y + _C1) * ((xx - x * x) + (yy - y * y) + _C2))
+
+
 def _blur(planes: Tensor) -> Tensor:
     """Gaussian window over planes [K, H, W], zero beyond the border."""
-    window = _window(planes.dtype, planes.device)
-    stack = conv2d(planes[:, None], window[None, None, None], padding=(0, _WINDOW // 2))
-    return conv2d(stack, window[None, None, :, None], padding=(_WINDOW // 2, 0))[:, 0]
+    window = gaussian_window(planes.dtype, planes.device)
+    stack = conv2d(planes[:, None], window[None, None, None], padding=(0, SSIM_WINDOW // 2))
+    return conv2d(stack, window[None, None, :, None], padding=(SSIM_WINDOW // 2, 0))[:, 0]
 
 
 def photometric_terms_reference(
@@ -78,10 +88,8 @@ def photometric_terms_reference(
     encoded = srgb_encode(_Clip.apply(prediction))
     weight = (torch.ones_like(prediction[..., 0]) if weight is None else weight)[..., None]
     x, y = encoded.permute(2, 0, 1), target.permute(2, 0, 1)
-    mx, my, xx, yy, xy = _blur(torch.cat((x, y, x * x, y * y, x * y))).split(3)
-    numerator = (2 * mx * my + _C1) * (2 * (xy - mx * my) + _C2)
-    denominator = (mx * mx + my * my + _C1) * ((xx - mx * mx) + (yy - my * my) + _C2)
-    ssim = (numerator / denominator).permute(1, 2, 0)
+    means = _blur(torch.cat((x, y, x * x, y * y, x * y))).split(3)
+    ssim = structural_similarity(*means).permute(1, 2, 0)
     per_value = (1 - ssim_weight) * (encoded - target).abs() + ssim_weight * (1 - ssim)
     total = 3 * weight.sum()
     count = torch.where(total > 0, total, torch.ones_like(total))

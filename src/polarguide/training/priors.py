@@ -77,9 +77,13 @@ def debiased_dolp(luminance: Tensor, noise: Tensor | float) -> Tensor:
 
 
 def guide_normals(normal: Tensor, rays: Tensor, least: float) -> tuple[Tensor, Tensor]:
-    """Unit normals facing the camera from blended ones [H, W, 3], and where they are longer than ``least`` [H, W].
+    """Unit normals [H, W, 3] that face the camera, and a mask [H, W] of the reliable ones.
 
-    A blended normal that faces away (by up to a pixel's slant) is brought to grazing.
+    Args:
+        normal: [H, W, 3] normals, blended over the Gaussians of each pixel. One that points away from the camera is
+            turned until it is perpendicular to the ray.
+        rays: [H, W, 3] unit directions from the camera.
+        least: length above which a blended normal is reliable.
     """
     reliable = dot(normal, normal) > least**2
     facing = unit(normal)
@@ -103,7 +107,7 @@ def view_priors(
         view: the capture; its pictures have to determine the Stokes vector.
         normal: [H, W, 3] normals rendered from the frozen Gaussians, world axes, any length; its device does the work.
         settings: which candidates and which separation.
-        refractive_index: of all surfaces, or [H, W] of each pixel.
+        refractive_index: refractive index of all surfaces, or [H, W] of each pixel.
         precomputed: ``unguided`` of the view, where it is at hand; needed with the index of each pixel.
         metal: [H, W] share of metals, where what holds for dielectrics alone does not count; None: no metal.
         flat: a flat surface, whose normal replaces the guide and the color differences where the guide is far from it.

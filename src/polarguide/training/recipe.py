@@ -31,7 +31,7 @@ class Repeat:
 
     Attributes:
         action: what.
-        fraction: of all steps, the distance between two of them.
+        fraction: fraction of all steps, the distance between two of them.
         minimum: never closer than this many steps.
     """
 
@@ -49,7 +49,7 @@ class Rounds:
 
     Attributes:
         actions: what, in turn.
-        fraction: of all steps, the least distance between two turns.
+        fraction: fraction of all steps, the least distance between two turns.
         minimum: nor closer than this many steps. A stage too short for one such round has one all the same.
     """
 
@@ -73,7 +73,7 @@ class Stage:
         name: shown while it runs.
         fraction: its share of all steps.
         reflection: whether the picture is shaded with deferred reflection.
-        weights: of the losses.
+        weights: weights of the losses.
         densify: whether the density control runs.
         repeats: what happens every so often in it.
         rounds: what happens in turns in it.
@@ -205,8 +205,8 @@ class Coarse:
     """Smaller pictures for the first steps, in which large ones show nothing that the Gaussians could take up yet.
 
     Attributes:
-        share: of all steps. factor: side of the boxes of pixels that are averaged.
-        pixels: of the largest training view, from which on there are such steps.
+        share: share of all steps. factor: side of the boxes of pixels that are averaged.
+        pixels: pixels of the largest training view, from which on there are such steps.
     """
 
     share: float = 0.5

@@ -57,14 +57,14 @@ class TrainingState:
     Attributes:
         step: the next step, 0-based.
         gaussians: the Gaussians.
-        environment: the learned light, None for a shading model without.
-        statistics: of the density control.
+        environment: the learned light; None if the shading model has none.
+        statistics: sums over steps from which the density control decides.
         frozen: copy of the Gaussians from which the present priors were computed; None before the first refresh.
-        opacity_frozen_until: first step at which opacities train again (after a normal propagation).
-        angles: [F, P, ``ANGLE_COLUMNS``] float64, F fits of the polarizers of P pictures, see ``angles.polarizers``;
-            None: nothing yet.
-        footprints: [N] of a finished training, see ``raster.magnification``; None before its end, and of trainings of
-            earlier versions.
+        opacity_frozen_until: first step at which opacities train again after surface normals were propagated.
+        angles: [F, P, ``ANGLE_COLUMNS``] float64, polarizers of P pictures in F successive fits, see
+            ``angles.polarizers``; None before the first fit.
+        footprints: [N] size of a training pixel at each Gaussian, see ``raster.magnification``; None before the end of
+            the training, and in runs of earlier versions.
     """
 
     step: int
@@ -157,8 +157,8 @@ def first_state(
     """The state before the first step; drawn on the CPU, so that every device begins with the same.
 
     Args:
-        scene, recipe, settings: of the training.
-        device: of the Gaussians.
+        scene, recipe, settings: those of the training.
+        device: device of the Gaussians.
         surroundings: whether there are any, for which far Gaussians are added.
     """
     initialization = recipe.initialization if surroundings else replace(recipe.initialization, shell=0)

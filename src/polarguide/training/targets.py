@@ -29,7 +29,7 @@ class ViewPriors:
         weight: [H, W] weight of ``normal`` and ``plane``, in [0, 1].
         chromatic: [H, W, 3] normal from the polarization of color differences, world axes, or of a flat surface.
         chromatic_weight: [H, W] its weight, in [0, 1]; 0 where the settings do not ask for it.
-        camera: of the view.
+        camera: camera of the view.
         stokes: [3, H, W, 3] as measured.
         stokes_weight: [H, W] weight of S1 and S2, see ``stokes_weight``.
         surface: [H, W] weight of the agreement of normals and depth, see ``surface_weight``.
@@ -141,7 +141,7 @@ class StepTargets:
     """Targets of the rendering of one view.
 
     Attributes:
-        camera: of the view.
+        camera: camera of the view.
         picture: [H, W, 3] the photograph as displayed (sRGB).
         valid: [H, W] 1 where the photograph counts; None: everywhere.
         empty: [H, W] 1 where the view shows nothing; None: not known.
@@ -163,8 +163,8 @@ class Step:
 
     Attributes:
         result: the rendered layers. targets: what they are compared with.
-        shading: of the stage, for the run's refractive index.
-        log_scales: [N, 3] of the Gaussians. extent: of the scene.
+        shading: shading of the stage, for the run's refractive index.
+        log_scales: [N, 3] of the Gaussians. extent: extent of the scene.
         ssim_weight: lambda of the image terms.
     """
 

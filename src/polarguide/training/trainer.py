@@ -52,7 +52,7 @@ class Trainer:
     Attributes:
         shading: the recipe's, for the run's refractive index.
         black: whether nothing is behind the subject.
-        schedule: of the stages.
+        schedule: schedule of the stages.
         whole: whether the state is one between two steps; an exception may leave it in the middle of a change.
     """
 

@@ -115,7 +115,7 @@ class ViewPose:
         """Whether a browser's camera has this pose, or may still be moving to it.
 
         Args:
-            camera: viser's. now: time in seconds. distance: of the cameras from the scene's center.
+            camera: viser's. now: time in seconds. distance: distance of the cameras from the scene's center.
         """
         turned = 1 - abs(float(np.dot(self.wxyz, camera.wxyz)))
         moved = float(np.linalg.norm(self.position - camera.position)) / distance
@@ -213,7 +213,7 @@ class Frusta:
     """Clickable camera frusta with their photographs.
 
     Args:
-        scene: viser's scene handle of one session. photographs: to be shown. scene_frame: of the scene.
+        scene: viser's scene handle of one session. photographs: to be shown. scene_frame: frame of the scene.
         go: called with a view's name when its frustum is clicked.
     """
 

@@ -128,7 +128,7 @@ def guarded(gate: Gate, check: Check) -> Iterator[None]:
     """A context in which viser starts to listen behind a gate.
 
     Raises:
-        PolarguideError: it has not listened with what was wrapped; whoever started it has to end it.
+        PolarguideError: viser did not listen through the gate; the caller has to end viser.
     """
     sockets = optional_import("websockets.asyncio.server", "the viewer")
     listen, opened = sockets.serve, []
@@ -153,9 +153,9 @@ def guarded(gate: Gate, check: Check) -> Iterator[None]:
     if not opened:
         raise PolarguideError(
             "the viewer",
-            expected="a viser whose connections can be checked",
-            found="one that listens in another way",
-            remedy=f"Install the version that was tested with {install_package('viser')} and repeat the command.",
+            expected="a version of viser whose connections polarguide can check",
+            found="a version that accepts connections in another way",
+            remedy=f"Install the tested version ({install_package('viser')}) and repeat the command.",
         )
 
 

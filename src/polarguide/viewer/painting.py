@@ -58,7 +58,7 @@ class Materials:
         kinds: [N] uint8: 0 nothing, 1 dielectric, 2 metal, from 3 on the dielectrics of ``scene.json``.
 
     Args:
-        gaussians: of the model. rasterize: of its backend.
+        gaussians: Gaussians of the model. rasterize: rasterizer of its backend.
         kinds: what was painted before, as ``kinds_of`` reads it; called once.
     """
 
@@ -78,7 +78,7 @@ class Materials:
             camera: of the picture. place: its middle, in shares of width and height. size: radius in percent of the
                 height. kind: the number of the material.
         """
-        inside, all_of_it = self._seen(camera, place, size)
+        inside, all_of_it = self._painted(camera, place, size)
         return self._paint((all_of_it > SMALLEST) & (inside >= 0.5 * all_of_it), kind)
 
     def surface(self, camera: Camera, place: Sequence[float], size: float, reach: float, kind: int) -> int:
@@ -89,7 +89,7 @@ class Materials:
         Args:
             reach: the longest path.
         """
-        inside, _ = self._seen(camera, place, size)
+        inside, _ = self._painted(camera, place, size)
         hit = (inside > SHARE * inside.max()).nonzero()[:, 0].numpy()
         if not len(hit):
             return 0
@@ -120,7 +120,7 @@ class Materials:
         self.kinds = torch.where(which, torch.tensor(kind, dtype=torch.uint8), self.kinds)
         return int(which.sum())
 
-    def _seen(self, camera: Camera, place: Sequence[float], size: float) -> tuple[Tensor, Tensor]:
+    def _painted(self, camera: Camera, place: Sequence[float], size: float) -> tuple[Tensor, Tensor]:
         """Pixels that each Gaussian fills in a disc of a picture, and in the whole picture: [N] both."""
         scale = min(1.0, LOOKED_AT / camera.height)
         small = camera.scaled(
@@ -240,7 +240,7 @@ class Painting:
     """One session's painting. Callbacks only record; the rendering thread calls ``act``.
 
     Args:
-        client: viser's handle. controls: of its panel. paintable: of the run.
+        client: viser's handle. controls: controls of its panel. paintable: what can be painted.
         changed: called when there is something to do. noted: with a note for the visitor.
         caught: makes callbacks whose faults cost only this browser. busy: whether another tool takes clicks.
     """
@@ -274,7 +274,7 @@ class Painting:
         """Do what was asked for.
 
         Args:
-            camera: of the picture that was clicked into.
+            camera: camera of the picture that was clicked into.
         """
         todo, self._todo = self._todo, []
         for each in todo:

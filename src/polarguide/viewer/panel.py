@@ -27,7 +27,7 @@ class PanelOptions:
     """The controls that a panel has.
 
     Attributes:
-        layers: of the shading model. turns: whether the environment can be rotated.
+        layers: layers of the shading model. turns: whether the environment can be rotated.
         views: names of the photographs.
         trains: whether a training runs, which can be paused.
         presentation: as it was saved. saves: whether it can be saved to the run, rather than downloaded.

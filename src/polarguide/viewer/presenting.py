@@ -117,9 +117,9 @@ class Presenting:
         note: what the visitor should do or know next, without any name from files.
 
     Args:
-        client: viser's handle. controls: of its panel. presentation: as it was saved.
+        client: viser's handle. controls: controls of its panel. presentation: as it was saved.
         gray_world: gives the gains of the photographs' mean. save: writes what was chosen, and says what it did.
-        distance: of the cameras.
+        distance: distance of the cameras.
         changed: called after every change that affects the picture, and when a click waits. noted: when there is
             another note.
         caught: makes callbacks whose faults cost only this browser.

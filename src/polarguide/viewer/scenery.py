@@ -53,7 +53,7 @@ class Scenery(Protocol):
         *,
         depth: bool,
         surface: bool = False,
-        kept: Callable[[Tensor], Tensor] | None = None,
+        within: Callable[[Tensor], Tensor] | None = None,
         turn: Tensor | None = None,
     ) -> RenderResult:
         """All layers, on the CPU: see ``GaussianScenery.render``."""
@@ -68,7 +68,7 @@ class GaussianScenery:
 
     Attributes:
         gaussians: the Gaussians. light: learned, by name.
-        shading: as it is now. rasterize: of the backend. sh_degree: of the base color.
+        shading: as it is now. rasterize: rasterizer of the backend. sh_degree: degree of the base color's harmonics.
         status: a line about it.
         footprints: [N] of a finished training, see ``raster.magnification``.
     """
@@ -88,7 +88,7 @@ class GaussianScenery:
         *,
         depth: bool,
         surface: bool = False,
-        kept: Callable[[Tensor], Tensor] | None = None,
+        within: Callable[[Tensor], Tensor] | None = None,
         turn: Tensor | None = None,
     ) -> RenderResult:
         """All layers, on the CPU.
@@ -96,13 +96,13 @@ class GaussianScenery:
         Args:
             camera: with the size of the picture. depth: whether depth is one of them.
             surface: whether normals and depth are those of the surface at the pixel's median depth.
-            kept: which places [N, 3] of the scene are shown, [N] bool; None: all.
+            within: which places [N, 3] of the scene are shown, [N] bool; None: all.
             turn: rotation [3, 3] of the light from afar, where it is radiance; None: as learned.
         """
         gaussians: Parameters = self.gaussians
         footprints = self.footprints
-        if kept is not None:
-            inside = kept(self.gaussians["means"].detach())
+        if within is not None:
+            inside = within(self.gaussians["means"].detach())
             gaussians = {name: self.gaussians[name].detach()[inside] for name in self.gaussians.names}
             footprints = None if footprints is None else footprints[inside]
         return render(
@@ -142,7 +142,7 @@ class FieldScenery:
         *,
         depth: bool,
         surface: bool = False,
-        kept: Callable[[Tensor], Tensor] | None = None,
+        within: Callable[[Tensor], Tensor] | None = None,
         turn: Tensor | None = None,
     ) -> RenderResult:
         """All layers, on the CPU: see ``GaussianScenery.render``. There is no light from afar to be turned."""
@@ -156,7 +156,9 @@ class FieldScenery:
             cx=camera.cx * small[0] / camera.width,
             cy=camera.cy * small[1] / camera.height,
         )
-        return self.model.render(view, depth=depth, kept=kept).to("cpu").resized(camera.width, camera.height)
+        return (
+            self.model.render(view, depth=depth, within=within).to("cpu").resized(camera.width, camera.height)
+        )
 
     def stokes(self, result: RenderResult, camera: Camera) -> None:
         """It predicts none."""
@@ -343,13 +345,13 @@ class Painter:
     def _result(self, scenery: Scenery, camera: Camera, appearance: Appearance) -> RenderResult:
         crop, turn = appearance.crop, None
         strength = 1.0 if appearance.layer in POLARIZED else appearance.strength
-        kept = None if crop is None else lambda means: crop.inside(means, self.around)
+        within = None if crop is None else lambda means: crop.inside(means, self.around)
         if appearance.turn % 360:
             presented = Presentation(up_axis=appearance.up_axis)
             turn = presented.upright(self.around).turn(appearance.turn)
         surface = appearance.layer in ("normal", "depth")
         result = scenery.render(
-            camera, depth=appearance.layer == "depth", surface=surface, kept=kept, turn=turn
+            camera, depth=appearance.layer == "depth", surface=surface, within=within, turn=turn
         )
         if result.specular is None or result.diffuse is None or strength == 1.0:
             return result
@@ -364,7 +366,7 @@ class Painter:
         if values is None:
             return None
         if layer in RADIANCE:
-            return figures.radiance_to_rgb(_shown(values, appearance))
+            return figures.radiance_to_rgb(_exposed(values, appearance))
         if layer == "depth" and (settled or self._depths is None):
             self._depths = depth_range(values, result.alpha > 0.5)
         return layer_picture(result, layer, camera, self._depths)
@@ -373,14 +375,14 @@ class Painter:
         """A picture of the photograph's size."""
         brighter = 2.0**appearance.exposure
         if appearance.layer == "photograph":
-            return figures.radiance_to_rgb(_shown(view.photograph(), appearance))
+            return figures.radiance_to_rgb(_exposed(view.photograph(), appearance))
         if appearance.layer == "error":
             final = self._result(scenery, view.camera, appearance).final
             return figures.error_to_rgb(final * brighter, view.photograph() * brighter)
         return polarization_picture(OF_POLARIZATION[appearance.layer], view.stokes())
 
 
-def _shown(radiance: Tensor, appearance: Appearance) -> Tensor:
+def _exposed(radiance: Tensor, appearance: Appearance) -> Tensor:
     """Radiance [H, W, 3] as bright and in the color that is wanted, linear."""
     white, chart, exposure = appearance.white_balance, appearance.chart, appearance.exposure
     return colored(radiance, Presentation(white_balance=white, chart=chart, exposure=exposure).color)

@@ -63,7 +63,7 @@ class Viewer:
 
     Args:
         current: returns the scene as it is now.
-        photographs: of the scene by name, at least one; sessions start at the first one.
+        photographs: photographs of the scene by name, at least one; sessions start at the first one.
         shading: model of the recipe. trains: whether the panel can pause a training.
         host, port: address to listen at; another port is used if this one is taken.
         visitors: who may look besides pages of this machine.

@@ -106,8 +106,8 @@ class Session:
     Callbacks only record changes; the rendering thread calls ``draw``.
 
     Args:
-        client: viser's handle. photographs: by name. scene_frame: of the scene.
-        options: of the panel. wake: called when a picture may be due.
+        client: viser's handle. photographs: by name. scene_frame: frame of the scene.
+        options: options of the panel. wake: called when a picture may be due.
         gray_world: gives the gains of the photographs' mean.
         save: writes a presentation to the run, and returns a message; None: the browser downloads it.
         drop: called with what a callback has raised, to let the browser go. beside: as of ``Painter``.
@@ -134,7 +134,7 @@ class Session:
         self.pacing = FramePacing()
         self._view_pose: ViewPose | None = None
         self._last_pose: ViewPose | None = None  # of the view that was asked for last, left or not
-        self._screenshot, self._asked = False, dict[str, float]()
+        self._screenshot, self._written_at = False, dict[str, float]()
         self._playing: tuple[float, list[Camera]] | None = None
         first = next(iter(photographs.values())).view.camera
         self._size = first.width, first.height
@@ -213,9 +213,9 @@ class Session:
         """Whether the same was requested less than ``BETWEEN_FILES`` ago; such a request is ignored."""
         now = time.monotonic()
         with self._lock:
-            soon = now - self._asked.get(what, -BETWEEN_FILES) < BETWEEN_FILES
+            soon = now - self._written_at.get(what, -BETWEEN_FILES) < BETWEEN_FILES
             if not soon:
-                self._asked[what] = now
+                self._written_at[what] = now
         return soon
 
     def _changed(self) -> None:

@@ -250,27 +250,6 @@ def aolp_to_rgb(aolp: Tensor, dolp: Tensor | None = None) -> Picture:
     return _to_uint8(color * value[..., None])
 
 
-def aolp_wheel() -> str:
-    """The color code of the AoLP as an SVG half disc: 0 degrees to the right, counter-clockwise."""
-    count, cx, cy, radius = 36, 66.0, 58.0, 40.0
-    angles = (torch.arange(count, dtype=torch.float64) + 0.5) * math.pi / count
-    colors = aolp_to_rgb(angles[None])[0].tolist()
-    wedges = []
-    for k, (r, g, b) in enumerate(colors):
-        (x1, y1), (x2, y2) = (
-            (cx + radius * math.cos(a), cy - radius * math.sin(a))
-            for a in (k * math.pi / count, (k + 1.15 if k < count - 1 else k + 1) * math.pi / count)
-        )
-        wedges.append(f'<path fill="rgb({r},{g},{b})" d="M{cx} {cy}L{x1:.2f} {y1:.2f}L{x2:.2f} {y2:.2f}Z"/>')
-    texts = "".join(
-        f'<text x="{cx + (radius + 12) * math.cos(math.radians(a)):.1f}" '
-        f'y="{cy - (radius + 8) * math.sin(math.radians(a)) + 2:.1f}">{a}°</text>'
-        for a in (0, 45, 90, 135, 180)
-    )
-    drawing = "".join(wedges) + texts
-    return f'<svg class="wheel" viewBox="-4 0 140 70" role="img" aria-label="AoLP by color">{drawing}</svg>'
-
-
 LARGE_ERROR = 0.25
 """Difference of shown pictures that is brightest."""
 
@@ -292,30 +271,37 @@ def scale_bar(low: float, high: float, colormap: str, unit: str = "", *, middle:
     return _bar(scalar_to_rgb(ramp, low, high, colormap), *texts)
 
 
-def angle_wheel() -> Picture:
-    """The colors of ``aolp_to_rgb`` by the direction of the field, darker inward as with less DoLP: [110, 256, 3]."""
-    drawn: Picture = np.full((110, 256, 3), BACKGROUND, np.uint8)
-    center_x, center_y, radius = 128, 100, 74
-    y, x = np.mgrid[0:110, 0:256]
+def angle_wheel(scale: float = 1.0) -> Picture:
+    """The colors of ``aolp_to_rgb`` by the direction of the field, darker inward as with less DoLP: [110, 256, 3].
+
+    Args:
+        scale: factor on the size.
+    """
+    high, wide, radius = round(110 * scale), round(256 * scale), 74 * scale
+    size = max(0.45 * scale, SMALLEST_FONT_SCALE)
+    drawn: Picture = np.full((high, wide, 3), BACKGROUND, np.uint8)
+    center_x, center_y = round(128 * scale), round(100 * scale)
+    y, x = np.mgrid[0:high, 0:wide]
     angle, distance = np.arctan2(center_y - y, x - center_x), np.hypot(center_y - y, x - center_x)
     inside = (distance <= radius) & (y <= center_y)
     colors = aolp_to_rgb(torch.from_numpy(angle), torch.from_numpy(distance / radius))
     drawn[inside] = colors[inside]
     for degrees in (0, 45, 90, 135, 180):
-        text = f"{degrees}" if degrees else "0 deg"
-        (width, height), _ = cv2.getTextSize(text, FONT, 0.45, 1)
+        text = f"{degrees}" if degrees or scale < 1 else "0 deg"
+        (width, height), _ = cv2.getTextSize(text, FONT, size, 1)
         cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-        left = center_x + (radius + 6) * cosine - width * (1 - cosine) / 2
-        low = center_y - (radius + 6) * sine + (0 if sine > 0.5 else height / 2)
-        cv2.putText(drawn, text, (round(left), round(low)), FONT, 0.45, INK, 1, cv2.LINE_AA)
+        left = center_x + (radius + 6 * scale) * cosine - width * (1 - cosine) / 2
+        low = center_y - (radius + 6 * scale) * sine + (0 if sine > 0.5 else height / 2)
+        cv2.putText(drawn, text, (round(left), round(low)), FONT, size, INK, 1, cv2.LINE_AA)
     return drawn
 
 
-def normal_ball() -> Picture:
-    """A ball seen from the camera, in the colors of ``normal_to_rgb``: [64, 256, 3]."""
-    drawn: Picture = np.full((64, 256, 3), BACKGROUND, np.uint8)
-    y, x = np.mgrid[0:64, 0:256]
-    right, down = (x - 128) / 30, (y - 32) / 30
+def normal_ball(high: int = 64, width: int = 256) -> Picture:
+    """A ball seen from the camera, in the colors of ``normal_to_rgb``: [high, width, 3]."""
+    drawn: Picture = np.full((high, width, 3), BACKGROUND, np.uint8)
+    y, x = np.mgrid[0:high, 0:width]
+    radius = high * 30 / 64
+    right, down = (x - width / 2) / radius, (y - high / 2) / radius
     squared = right**2 + down**2
     normals = np.stack((right, -down, np.sqrt(np.maximum(1 - squared, 0))), axis=-1)
     inside = squared <= 1
@@ -368,12 +354,12 @@ def write_png(
     """Write a uint8 RGB [H, W, 3] picture in one step: a reader sees the old file or the whole new one.
 
     Args:
-        path: of the file. rgb8: the picture. alpha8: [H, W] uint8 how opaque it is; None: wholly.
+        path: path of the file. rgb8: the picture. alpha8: [H, W] uint8 how opaque it is; None: wholly.
         about: texts in ASCII by keyword, which go into the file, see ``with_texts``.
 
     Raises:
         ValueError: not such a picture.
-        PolarguideError: it cannot be written.
+        PolarguideError: the file cannot be written.
     """
     check_picture(rgb8, "picture")
     write_whole(Path(path), with_texts(png_bytes(rgb8, alpha8), about))
@@ -383,7 +369,7 @@ def png_bytes(rgb8: Picture, alpha8: Picture | None = None) -> bytes:
     """A uint8 RGB [H, W, 3] picture as a PNG file, with how opaque it is [H, W] where that is given.
 
     Raises:
-        ValueError: it cannot be encoded.
+        ValueError: the picture cannot be encoded.
     """
     stored = rgb8[..., ::-1] if alpha8 is None else np.dstack((rgb8[..., ::-1], alpha8))
     encoded, data = cv2.imencode(".png", stored)

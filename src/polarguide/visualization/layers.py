@@ -42,9 +42,9 @@ def layer_picture(
     """One layer as an 8-bit picture, or None where the recipe has no such layer.
 
     Args:
-        result, camera: the rendering. name: of the layer. depths: nearest and farthest, for depth's colors.
+        result, camera: the rendering. name: name of the layer. depths: nearest and farthest, for depth's colors.
         exposed: show radiance darker where more than 1 % of the pixels would clip.
-        color: of the presentation, [3, 3], of layers of radiance.
+        color: color of the presentation, [3, 3], of layers of radiance.
     """
     if name in POLARIZED:
         return None if result.predicted is None else polarization_picture(name, result.predicted)
@@ -100,7 +100,9 @@ def layer_scale(name: str, depths: Depths | None = None) -> Picture | None:
         return figures.scale_bar(0.0, DOLP_HIGH, "inferno")
     if name == "stokes":
         return figures.color_patch(128, f"0; red S1, green S2, to {STOKES_HIGH:g} S0")
-    return {"aolp": figures.angle_wheel, "normal": figures.normal_ball}.get(name, lambda: None)()
+    if name == "aolp":
+        return figures.angle_wheel()
+    return figures.normal_ball() if name == "normal" else None
 
 
 def clipping_exposure(values: Tensor) -> float:

@@ -106,7 +106,7 @@ class EmbeddedView:
     """One view of a scene with all its tiles as data URIs.
 
     Attributes:
-        scene, view: names. width, height: of the captured pictures, for the shape of the tiles.
+        scene, view: names. width, height: those of the captured pictures, for the shape of the tiles.
         tiles: for each its name, its layers as data URIs, and its lines of scores.
     """
 

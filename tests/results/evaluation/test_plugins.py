@@ -76,8 +76,8 @@ SEVERAL = lambda: [GOOD, Metric("best", "best", "", 1, None, measure=measure)]
     [
         ({"a": "GOOD"}, ["good"], None),
         ({"a": "SEVERAL"}, ["best", "good"], None),
-        ({"a": "GOOD", "b": "GOOD"}, ["good"], "good, which there is"),
-        ({"a": "TAKEN", "b": "GOOD"}, ["good"], "psnr, which there is"),
+        ({"a": "GOOD", "b": "GOOD"}, ["good"], "good"),
+        ({"a": "TAKEN", "b": "GOOD"}, ["good"], "psnr"),
         ({"a": "OF_RUN"}, [], "'late'"),
         ({"a": "STRANGE"}, [], "'two words'"),
         ({"a": "MISSING", "b": "GOOD"}, ["good"], "AttributeError"),

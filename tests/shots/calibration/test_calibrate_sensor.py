@@ -360,7 +360,7 @@ REFUSED = {
     nameless: ("shot_last", "a name that ends in the angle"),
     color_of_gray: ("--sensor", "the Bayer pattern of color filters"),
     odd_block: ("--block", "a multiple of 2"),
-    faint: ("shot_", "a mean of at least 2%"),
+    faint: ("shot_", "a mean intensity of at least 2%"),
 }
 
 

@@ -71,13 +71,13 @@ def write_cameras(
     Args:
         folder: exists.
         cameras: by view name; may not be empty.
-        numbers: of each view's image and camera; counted from 1 if None.
+        numbers: numbers of each view's image and camera; counted from 1 if None.
     """
-    found: dict[tuple[object, ...], int] = {}
+    number_of: dict[tuple[object, ...], int] = {}
     used: dict[int, tuple[Any, ...]] = {}
     images = []
     for number, (view, camera) in enumerate(sorted(cameras.items()), 1):
-        of_camera = found.setdefault(camera.intrinsics, len(found) + 1)
+        of_camera = number_of.setdefault(camera.intrinsics, len(number_of) + 1)
         if numbers is not None:
             number, of_camera = numbers[view]
         used[of_camera] = camera.intrinsics

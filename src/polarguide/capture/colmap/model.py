@@ -228,7 +228,7 @@ def load_model(folder: Path, kind: str) -> Any:
     """The model in a folder, as pycolmap's ``Reconstruction``; without points if it has no file of them.
 
     Raises:
-        PolarguideError: pycolmap refuses it.
+        PolarguideError: pycolmap cannot read the model.
     """
     import pycolmap  # here, because importing it is slow
 
@@ -250,7 +250,7 @@ def load_model(folder: Path, kind: str) -> Any:
         raise PolarguideError(
             folder,
             expected="a readable COLMAP model",
-            found=f"a model that pycolmap refuses ({str(error).strip().splitlines()[0]})",
+            found=f"a model that pycolmap cannot read ({str(error).strip().splitlines()[0]})",
             remedy="Export the model again; text files need two lines per image.",
         ) from error
     return model

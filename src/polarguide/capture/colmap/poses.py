@@ -228,15 +228,15 @@ class Poses:
     def others(self) -> list[tuple[Path, int]]:
         """Models beside this one (``sparse/1`` beside ``sparse/0``), and how many of the views each has poses of."""
         names = {*self.views, *self.missing}
-        found = []
+        counts = []
         for folder in sorted(self.folder.parent.glob("[0-9]*")) if self.folder.name.isdigit() else []:
             if folder != self.folder and any(
                 (folder / f"images{kind}").exists() for kind in (".bin", ".txt")
             ):
                 with contextlib.suppress(PolarguideError):
                     model = load_model(*find_model(folder, points=False))
-                    found.append((folder, len(names & posed_images(model, names).keys())))
-        return [(folder, count) for folder, count in found if count]
+                    counts.append((folder, len(names & posed_images(model, names).keys())))
+        return [(folder, count) for folder, count in counts if count]
 
     @property
     def points(self) -> int:
@@ -256,12 +256,12 @@ class Poses:
         Raises:
             PolarguideError: as in ``warp``.
         """
-        found = {}
+        cameras = {}
         for view in self.views:
             image = self._images[view]
             camera = self.warp(view, geometries[view]).source
             pose = image.cam_from_world()
-            found[view] = PosedCamera(
+            cameras[view] = PosedCamera(
                 camera.width,
                 camera.height,
                 camera.model_name,
@@ -269,7 +269,7 @@ class Poses:
                 np.asarray(pose.rotation.matrix(), np.float64),
                 np.asarray(pose.translation, np.float64),
             )
-        return found
+        return cameras
 
     def warp(self, view: str, geometry: Geometry) -> Undistortion:
         """The undistortion of a view's picture.

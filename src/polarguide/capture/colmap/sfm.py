@@ -60,7 +60,7 @@ def match_features(
         images: folder of ``<view>.png``.
         sizes: width and height of every picture, by view.
         matching: "exhaustive" or "sequential".
-        seed: of all random draws.
+        seed: seed of all random draws.
         reporter: for progress.
         cameras: intrinsics by view, where they are known.
         masks: folder of ``<view>.png``; features are extracted in white parts only. Views without a file have no mask.
@@ -171,7 +171,7 @@ def run_step(
         done: returns the number of finished units.
 
     Raises:
-        PolarguideError: it failed.
+        PolarguideError: the step failed.
     """
     outcome: dict[str, Any] = {}
 
@@ -254,8 +254,8 @@ def log_false_alarms(matches: int, agreeing: int, share: float) -> float:
     """Natural logarithm of the number of geometries expected by chance that fit as many of the matches.
 
     Args:
-        matches: of the two pictures. agreeing: those of them that fit.
-        share: of the picture's area that fits an epipolar line, at most: the probability that a wrong match does.
+        matches: matches of the two pictures. agreeing: those of them that fit.
+        share: share of the picture's area that fits an epipolar line, at most: the probability that a wrong match does.
     """
     if agreeing <= SAMPLE:
         return math.inf
@@ -339,7 +339,7 @@ def reconstruct(
         folder: holds the pictures; the database and the model are written there.
         sizes: width and height of every picture, by view.
         matching: "exhaustive", or "sequential" for views taken in the order of their names.
-        seed: of the random numbers.
+        seed: seed of the random numbers.
         reporter: for progress and messages.
         untried: the options that may connect more views, for messages.
         intrinsics: model and parameters of all pictures, where they are known.
@@ -372,7 +372,7 @@ def reconstruct(
         )
         others = _map(database, images, trial, len(sizes), seed, reporter, free, weak=True)
         models = max(models, others, key=_registered)
-    best = max(models.values(), key=lambda found: found.num_reg_images(), default=None)
+    best = max(models.values(), key=lambda candidate: candidate.num_reg_images(), default=None)
     registered = _registered(models)
     by_chance = best is not None and connected_views(database, sizes) < LEAST_VIEWS
     if best is None or registered < LEAST_VIEWS or by_chance:
@@ -400,7 +400,7 @@ def reconstruct(
 
 def _registered(models: dict[int, Any]) -> int:
     """Views of the largest model."""
-    return max((found.num_reg_images() for found in models.values()), default=0)
+    return max((model.num_reg_images() for model in models.values()), default=0)
 
 
 def _map(
@@ -429,8 +429,8 @@ def _map(
     options.ba_refine_focal_length = options.ba_refine_extra_params = free
     placed: list[None] = []
     step = functools.partial(placed.append, None)
-    found: dict[int, Any] = run_step(
+    models: dict[int, Any] = run_step(
         lambda: pycolmap.incremental_mapping(database, images, trial, options, next_image_callback=step),
         seed, reporter, "registering images", count, lambda: len(placed) + 2 if placed else 0,
     )  # fmt: skip
-    return found
+    return models

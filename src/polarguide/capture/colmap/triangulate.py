@@ -57,19 +57,19 @@ def sample_visual_hull(
     center, reach = _nearest_to_axes(list(used.values()))
     low, high = center - reach, center + reach
 
-    def kept(batch: int) -> Points:
+    def samples_inside(batch: int) -> Points:
         places = rng.uniform(low, high, (batch, 3))
         return places[_seen_by_most(places, used, pixels, masks)]
 
     for _ in range(_ROUNDS):
-        found = kept(_BATCH)
-        if len(found) == 0:
-            return found
-        margin = 0.05 * (found.max(axis=0) - found.min(axis=0)) + 0.01 * reach
-        low, high = np.maximum(low, found.min(axis=0) - margin), np.minimum(high, found.max(axis=0) + margin)
+        inner = samples_inside(_BATCH)
+        if len(inner) == 0:
+            return inner
+        margin = 0.05 * (inner.max(axis=0) - inner.min(axis=0)) + 0.01 * reach
+        low, high = np.maximum(low, inner.min(axis=0) - margin), np.minimum(high, inner.max(axis=0) + margin)
     parts, total = [], 0
     for _ in range(_BATCHES):
-        parts.append(kept(_BATCH))
+        parts.append(samples_inside(_BATCH))
         total += len(parts[-1])
         if total >= count:
             break
@@ -134,10 +134,10 @@ def add_points(
 
     Args:
         folder: working folder; results of an earlier call in it are used.
-        cameras: of the pictures in it, by view.
+        cameras: cameras of the pictures in it, by view.
         where: the origin of the poses, for messages.
         matching: "exhaustive" or "sequential".
-        seed: of all random draws.
+        seed: seed of all random draws.
         reporter: for progress and messages.
 
     Returns:
@@ -156,11 +156,11 @@ def add_points(
     with writing(start):
         write_cameras(start, cameras)
     count, error = _triangulated(folder, start, trial, cameras, matching, seed, reporter)
-    found: dict[str, Any] = {"from": "triangulation with fixed poses", "count": count}
+    record: dict[str, Any] = {"from": "triangulation with fixed poses", "count": count}
     if error is not None:
-        found["reprojection_error_pixels"] = round(error, 3)
+        record["reprojection_error_pixels"] = round(error, 3)
     if count < FEWEST:
-        found = _sample(folder, start, trial, cameras, count, where, seed, reporter)
+        record = _sample(folder, start, trial, cameras, count, where, seed, reporter)
     else:
         reporter.say(
             f"The poses came without points: {count} were triangulated, mean reprojection error {error:.2f} pixels."
@@ -168,8 +168,8 @@ def add_points(
     with writing(model):
         shutil.rmtree(model, ignore_errors=True)
         trial.rename(model)
-    write_whole(note, (json.dumps(found) + "\n").encode())
-    return model, found
+    write_whole(note, (json.dumps(record) + "\n").encode())
+    return model, record
 
 
 def _triangulated(

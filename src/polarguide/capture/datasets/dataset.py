@@ -27,9 +27,9 @@ StokesImage = tuple[NDArray[np.float32], NDArray[np.bool_]]
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """An object mask [H, W] from a picture: where it reaches half of its maximum.
+    """An object mask [H, W] from a picture: pixels of at least half its largest value.
 
-    Of a cut-out, a picture of the object that is transparent around it, the mask is where it is at least half opaque.
+    If the picture is transparent around the object, the mask has the pixels that are at least half opaque.
     """
     data = read_picture(path)
     pixels = decode_stored(path, data)
@@ -86,15 +86,15 @@ def masks_beside(root: Path, views: Mapping[str, int]) -> dict[str, Path]:
         views: view -> its number.
     """
     pictures = index_files(root / "mask", SUFFIXES) or index_files(root / "masks", SUFFIXES)
-    found = {view: pictures[view] for view in views if view in pictures}
+    masks = {view: pictures[view] for view in views if view in pictures}
     by_number = {number: pictures[stem] for stem, number in numbered_views(set(pictures)).items()}
-    if not found and set(views.values()) <= by_number.keys():
-        found = {view: by_number[number] for view, number in views.items()}
-    without = [view for view in views if view not in found]
+    if not masks and set(views.values()) <= by_number.keys():
+        masks = {view: by_number[number] for view, number in views.items()}
+    without = [view for view in views if view not in masks]
     if pictures and without:
         text = f"{next(iter(pictures.values())).parent} has no mask called like {len(without)} of {len(views)} views"
         warnings.warn(f"{text} ({listed(without)}).", PolarguideWarning, stacklevel=2)
-    return found
+    return masks
 
 
 def not_as_published(where: object, expected: str, found: str) -> PolarguideError:
@@ -198,15 +198,15 @@ def cameras_of_views(
     return {view: cameras[number] for view, number in numbers.items()}
 
 
-def require_same_shape(path: Path, found: tuple[int, ...], first: tuple[int, ...], like: Path) -> None:
+def require_same_shape(path: Path, shape: tuple[int, ...], first: tuple[int, ...], like: Path) -> None:
     """Check that a file has the size of another one of its view.
 
     Raises:
         PolarguideError: the sizes differ.
     """
-    if found[:2] != first[:2]:
+    if shape[:2] != first[:2]:
         expected = f"{first[1]}x{first[0]} pixels like {like.name}"
-        raise not_as_published(path, expected, f"{found[1]}x{found[0]}")
+        raise not_as_published(path, expected, f"{shape[1]}x{shape[0]}")
 
 
 def numbered_views(stems: set[str]) -> dict[str, int]:
@@ -279,14 +279,14 @@ def read_projections(path: Path) -> Projections:
             to other units than pixels.
     """
     arrays = read_arrays(path)
-    found: dict[int, tuple[Matrix, Matrix, Matrix]] = {}
+    parts: dict[int, tuple[Matrix, Matrix, Matrix]] = {}
     padded = False
     for key in arrays:
         match = re.fullmatch(r"world_mat_(\d{1,6})", key)
         if match is None:
             continue
         number = int(match[1])
-        if number in found:
+        if number in parts:
             raise wrong_camera(
                 path, f"one camera of the number {number}", "two, with and without zeros before it"
             )
@@ -303,11 +303,11 @@ def read_projections(path: Path) -> Projections:
             np.linalg.norm(scale[:3, :3], 2)
         ):  # of a rotation and one scale: nothing is stretched
             checked_pose(f"{path} ({scale_key})", scale[:3] / size)
-        found[number] = decompose_projection(f"{path} ({key} @ {scale_key})", (world @ scale)[:3])
-    if not found:
+        parts[number] = decompose_projection(f"{path} ({key} @ {scale_key})", (world @ scale)[:3])
+    if not parts:
         raise missing_entry(path, "world_mat_<i>", arrays)
     require_known_names(path, (key for key in arrays if _IDR_ENTRY.fullmatch(key) is None))
-    return Projections(found, padded)
+    return Projections(parts, padded)
 
 
 def _is_identity(matrix: NDArray[Any]) -> bool:
@@ -328,7 +328,7 @@ def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Mat
     """K, R and t of a 3x4 matrix s K [R | t] of any scale s.
 
     Raises:
-        PolarguideError: it is singular, or its pixels are skewed.
+        PolarguideError: the matrix is singular, or its pixels are skewed.
     """
     left = projection[:, :3]
     if not np.linalg.cond(left) < 1e10:
@@ -360,7 +360,7 @@ def checked_pose(where: object, matrix: Matrix) -> tuple[Matrix, Matrix]:
     """Rotation and translation of a rigid [3 or 4, 4] matrix; rounding errors of the rotation are removed.
 
     Raises:
-        PolarguideError: it is not rigid.
+        PolarguideError: the matrix is not rigid.
     """
     u, spread, vt = np.linalg.svd(matrix[:3, :3])
     if not (np.abs(spread - 1) < 1e-2).all() or np.linalg.det(u @ vt) < 0:
@@ -396,8 +396,8 @@ def distorted_camera(
     return PosedCamera(*size, "FULL_OPENCV", tuple(float(p) for p in parameters), rotation, translation)
 
 
-def missing_entry(path: Path, key: str, found: Mapping[str, object]) -> PolarguideError:
+def missing_entry(path: Path, key: str, entries: Mapping[str, object]) -> PolarguideError:
     """The error that a file lacks an entry."""
-    names = sorted(found)
+    names = sorted(entries)
     listing = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
     return not_as_published(path, f"the entry {key}", listing or "no entry")

@@ -63,8 +63,8 @@ def open_pandora(root: Path) -> Dataset:
         offsets = (0,) if first == 0 else None
         light = files[views[0]][0] if views else None
         by_number = {view: int(view) for view in views}
-        found, numbers = _cameras(root, cameras_file, by_number, pictures, light, offsets)
-        cameras, posed_by = cameras_of_views(cameras_file, numbers, found, "world_mat_"), cameras_file
+        parts, numbers = _cameras(root, cameras_file, by_number, pictures, light, offsets)
+        cameras, posed_by = cameras_of_views(cameras_file, numbers, parts, "world_mat_"), cameras_file
         shift = next(iter(numbers.values())) - int(next(iter(numbers))) if numbers else 0
         notes = (f"Files count from {first}, cameras from {first + shift}.",)
     masks, read = _masks(root, {view: int(view) for view in views}, first)
@@ -97,8 +97,8 @@ def open_nersp(root: Path) -> Dataset:
     views = numbered_views(stems)
     pictures = index_files(_folder(root, _PICTURES), SUFFIXES)
     light = None if archives else next(iter(sorted((root / _NERSP_PARTS[0]).glob("*.npy"))), None)
-    found, numbers = _cameras(root, cameras_file, views, pictures, light, (0,))
-    cameras = cameras_of_views(cameras_file, numbers, found, "world_mat_")
+    parts, numbers = _cameras(root, cameras_file, views, pictures, light, (0,))
+    cameras = cameras_of_views(cameras_file, numbers, parts, "world_mat_")
     masks, read = _masks(root, views, 0)
     if archives:
         return _archived(archives, cameras_file, cameras, masks, read)
@@ -145,7 +145,7 @@ def _read_archive(path: Path) -> NDArray[np.float32]:
     """Stokes vectors [3, H, W, 3] from the entries S0, S1 and S2 of an archive.
 
     Raises:
-        PolarguideError: it cannot be read, lacks one, or they are no pictures of one size.
+        PolarguideError: the file cannot be read, lacks an entry, or its entries are no pictures of one size.
     """
     data = read_file(path)
     try:
@@ -211,13 +211,13 @@ def _size_of(path: Path, inner: Sequence[NDArray[np.float64]], size: Size, light
     Args:
         path: their file, for messages.
         inner: their intrinsics.
-        size: of the pictures. light: a file of Stokes vectors.
+        size: size of the pictures. light: a file of Stokes vectors.
     """
     centers = [(float(matrix[0, 2]), float(matrix[1, 2])) for matrix in inner]
     other = None if light is None else stated_size(light)
-    for asked in (size, *([] if other is None else [other])):
-        if all(is_centered(asked, center) for center in centers):
-            return asked
+    for candidate in (size, *([] if other is None else [other])):
+        if all(is_centered(candidate, center) for center in centers):
+            return candidate
     warnings.warn(
         f"{path.name}: principal points lie far from the middle of the pictures, {size[0]}x{size[1]}, as "
         "those of pictures that were cropped or resized do. The size is taken as it is.",

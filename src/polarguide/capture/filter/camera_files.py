@@ -266,15 +266,15 @@ def read_exposure_data(path: Path) -> ExposureData:
     """
     raw = is_camera_raw(path)
     data = read_file(path) if raw else read_picture(path)
-    found = exif_data(data)
-    if not raw or found.light is not None or data[:4] in TIFF:
-        return found
+    exposure = exif_data(data)
+    if not raw or exposure.light is not None or data[:4] in TIFF:
+        return exposure
     libraw = optional_import("rawpy", str(path))
     # LibRaw's errors: whoever develops the file says what is wrong with it.
     with contextlib.suppress(Exception), libraw.imread(io.BytesIO(data)) as opened:
         other = opened.other  # which some versions of rawpy do not have
         return ExposureData("", _light(other.shutter, other.iso_speed, other.aperture))
-    return found
+    return exposure
 
 
 def exif_data(data: bytes) -> ExposureData:

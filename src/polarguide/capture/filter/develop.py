@@ -35,10 +35,10 @@ class Shift:
     """How a shot lies relative to the first.
 
     Attributes:
-        x, y: shift in pixels right and down; of the middle of the picture where there is a ``warp``.
+        x, y: shift in pixels, right and down; with a ``warp``, that of the picture's center.
         trusted: whether the estimate is reliable.
-        warp: where the camera was turned between the shots: the matrix [2, 3] from pixels of the first shot to those of
-            this one (the middle of the first pixel is 0), row by row.
+        warp: affine matrix [2, 3], row by row, that maps pixels of the first shot to this one; None: the camera did not
+            turn between them. In it, unlike elsewhere, the center of the first pixel is (0, 0).
     """
 
     x: float
@@ -97,7 +97,7 @@ def align_shots(
     Args:
         linear: [4, H, W, 3] linear intensities.
         clipped: unusable pixels of each shot, [4, H, W].
-        shifts: of the four shots.
+        shifts: shifts of the four shots.
 
     Returns:
         The moved intensities; and pixels for which an unusable one or one outside the picture was used, [4, H, W].
@@ -148,12 +148,12 @@ def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
     warp = np.array([[1, 0, x], [0, 1, y]], np.float32)
     try:
         everywhere = np.ones(reference.shape, np.uint8)
-        score, found = cv2.findTransformECC(
+        score, moved = cv2.findTransformECC(
             reference, other, warp, cv2.MOTION_TRANSLATION, _CRITERIA, everywhere, 5
         )
     except cv2.error:  # it does not converge where there is no detail to compare
         return Shift(0.0, 0.0, False)
-    x, y = (float(value) for value in np.asarray(found)[:, 2])
+    x, y = (float(value) for value in np.asarray(moved)[:, 2])
     trusted = score > 0.3 and max(abs(x), abs(y)) <= limit and bool(np.isfinite([x, y]).all())
     return Shift(round(x, 3), round(y, 3), trusted)
 
@@ -232,12 +232,12 @@ def kind_of_file(path: Path) -> str:
     return CAMERA_RAW if is_camera_raw(path) else LOSSY if is_lossy(path) else PLAIN
 
 
-def transfer_of_kind(kind: str, asked: str) -> tuple[str, str]:
-    """How files of a kind are usually encoded, and why; ``asked``: as specified, or auto."""
+def transfer_of_kind(kind: str, transfer: str) -> tuple[str, str]:
+    """How files of a kind are usually encoded, and why; ``transfer``: as specified, or auto."""
     if kind == CAMERA_RAW:
         return "linear", "Transfer linear: camera raw, developed without tone curve, alike for all shots."
-    if asked != "auto":
-        return asked, f"Transfer {asked}, as given."
+    if transfer != "auto":
+        return transfer, f"Transfer {transfer}, as given."
     usual = "linear" if kind == PLAIN else "srgb"
     return usual, f"Transfer {usual}, as {kind} files usually are (--transfer sets it)."
 
@@ -250,7 +250,7 @@ def require_known_encoding(path: Path) -> None:
     """Refuse a photograph whose color profile states an encoding that is neither linear nor like sRGB.
 
     Raises:
-        PolarguideError: it does.
+        PolarguideError: the profile states such an encoding.
     """
     exponent = None if is_camera_raw(path) else stated_exponent(read_picture(path))
     if exponent is None or any(abs(exponent / known - 1) <= _NEAR for known in (1.0, _SRGB_EXPONENT)):
@@ -272,12 +272,12 @@ def decide_transfer(shots: Sequence[Shots], *, lossy: bool) -> TransferDecision:
         lossy: whether the files are JPEG, WebP or HEIC, for the default where the curvature does not decide.
     """
     slope = _slope(shots, "linear")
-    found = checks.encoding(slope)
+    encoding = checks.encoding(slope)
     evidence = "too few pixels are polarized to tell"
     if slope is not None:
         evidence = f"the curvature of the response is {slope:+.2f}; linear files have 0, sRGB about -0.6"
-    if found is not None:
-        return TransferDecision(found, f"{found}: {evidence}", _doubt(shots, found))
+    if encoding is not None:
+        return TransferDecision(encoding, f"{encoding}: {evidence}", _doubt(shots, encoding))
     fallback = "srgb" if lossy else "linear"
     kind = "JPEG, WebP and HEIC files" if lossy else "PNG, TIFF and BMP files"
     reason = f"{fallback}, as {kind} usually are: {evidence} (--transfer sets it)"

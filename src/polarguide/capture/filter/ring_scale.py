@@ -22,7 +22,7 @@ def ring_scale(diameter: float) -> str:
     reads the scale, they count clockwise, from the left; 0 and 180 are the same angle, so that the ring has each twice.
 
     Args:
-        diameter: of the hole, the outer diameter of the filter's turning ring, in mm.
+        diameter: diameter of the hole, the outer diameter of the filter's turning ring, in mm.
     """
     inner = diameter / 2
     outer = inner + BAND

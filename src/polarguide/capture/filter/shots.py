@@ -230,7 +230,7 @@ def read_stack(
                 path,
                 expected=f"EXIF orientation {codes[0]} like {paths[0].name}",
                 found=str(codes[-1]),
-                remedy="Keep the camera still between the shots of a view, or export them all alike.",
+                remedy="Keep the camera still between the shots of a view, or export all with the same settings.",
             )
     return stacked(np.stack(pictures), codes[0], lossy=is_lossy(paths[0]), levels=levels)
 
@@ -270,7 +270,7 @@ class SingleShot:
     Attributes:
         path: the file.
         view: its view; photographs of one view share their pose.
-        angle: of the filter, as the user counts it.
+        angle: angle of the filter, as the user counts it.
         gain: exposure relative to the others, if the user knows it.
     """
 
@@ -325,7 +325,7 @@ def find_single_shots(root: Path, angles: str | None = None) -> tuple[list[Singl
         path: None if name is None or not (name[0] or alone) else (name[0] or root.resolve().name, name[1])
         for path, name in zip(files, names, strict=True)
     }
-    without = [path.name for path, found in named.items() if found is None]
+    without = [path.name for path, shot in named.items() if shot is None]
     if without:
         raise PolarguideError(
             root,
@@ -333,29 +333,29 @@ def find_single_shots(root: Path, angles: str | None = None) -> tuple[list[Singl
             found=f"{len(without)} of {len(files)} without an angle in their names ({listed(without)})",
             remedy=NAMING,
         )
-    shots = [SingleShot(path, *found) for path, found in named.items() if found is not None]
+    shots = [SingleShot(path, *shot) for path, shot in named.items() if shot is not None]
     return _checked(root, shots), []
 
 
 def _all_alike(root: Path, angles: str) -> list[SingleShot]:
     """Photographs whose angles an option says: one word for all, or numbers that repeat."""
-    found = [parse_angle(part) for part in angles.split(",")]
-    if any(angle is None for angle in found):
+    repeating = [parse_angle(part) for part in angles.split(",")]
+    if any(angle is None for angle in repeating):
         raise PolarguideError(
             "--angles",
-            expected="unknown, none, angles in the order of the files such as 0,60,120, or the path of a .csv table",
+            expected="'unknown', 'none', angles in the order of the files ('0,60,120'), or the path of a .csv table",
             found=repr(angles),
-            remedy="Correct the value.",
+            remedy="Give one of these four.",
         )
     files = list(index_files(root, SHOT_SUFFIXES).values())
-    if len(files) % len(found):
+    if len(files) % len(repeating):
         raise PolarguideError(
             "--angles",
-            expected=f"a multiple of {len(found)} photographs, as these angles repeat",
+            expected=f"a number of photographs divisible by {len(repeating)}, because these angles repeat",
             found=f"{len(files)} in {root}",
-            remedy=f"One is missing or too many: say each angle in {TABLE}.",
+            remedy=f"Add or remove photographs, or list the angle of each in {TABLE}.",
         )
-    repeated = [found[number % len(found)] for number in range(len(files))]
+    repeated = [repeating[number % len(repeating)] for number in range(len(files))]
     return [
         SingleShot(path, path.stem, angle)
         for path, angle in zip(files, repeated, strict=True)
@@ -388,9 +388,9 @@ def _by_table(root: Path, table: Path, lines: Sequence[Line]) -> list[SingleShot
         if path.suffix.lower() not in SHOT_SUFFIXES:
             raise PolarguideError(
                 table,
-                expected=f"pictures ({', '.join(SHOT_SUFFIXES)})",
+                expected=f"names of pictures ({', '.join(SHOT_SUFFIXES)})",
                 found=line.file,
-                remedy="Remove the line, or convert the file.",
+                remedy="Remove its line from the table, or convert the file to one of these formats.",
             )
         if line.view is None and path.stem in alone:
             raise ambiguous(root, f"one photograph called {path.stem}", alone[path.stem], path)

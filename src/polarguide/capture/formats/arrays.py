@@ -65,7 +65,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays in an ``.npz`` file, by name.
 
     Raises:
-        PolarguideError: the file cannot be read, is damaged or unfolds to more than cameras need.
+        PolarguideError: the file cannot be read, is damaged, or decompresses to more data than a file of
+            cameras may have.
     """
     data = read_file(path)
     try:
@@ -73,7 +74,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
             size = sum(entry.file_size for entry in archive.infolist())
             if size > _LARGEST_ARCHIVE:
-                raise ValueError(f"an archive that unfolds to {size} bytes")
+                raise ValueError(f"an archive that decompresses to {size} bytes")
             return {name: _array(_member(archive, entry)) for name, entry in members.items()}
     except BROKEN as error:
         what = "one that cannot be unpacked" if isinstance(error, zipfile.BadZipFile) else "a damaged one"
@@ -85,27 +86,27 @@ def unpacked(data: bytes, names: Collection[str], largest: int) -> dict[str, NDA
     """Arrays of an ``.npz`` file by name, those that are there; the others in it are not looked at.
 
     Args:
-        data: the whole file. names: of the arrays. largest: bytes that any of them may take.
+        data: the whole file. names: names of the arrays. largest: bytes that any of them may take.
 
     Raises:
         One of ``BROKEN``: it is damaged, encrypted, or one of them is larger or holds no numbers.
     """
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        found = {}
+        arrays = {}
         for entry in archive.infolist():
             name = entry.filename.removesuffix(".npy")
             if name in names and entry.filename.endswith(".npy"):
                 if entry.file_size > largest + _LARGEST_HEADER:
                     raise ValueError(f"{name} of {entry.file_size} bytes")
-                found[name] = _array(_member(archive, entry), "biufcSU")
-        return found
+                arrays[name] = _array(_member(archive, entry), "biufcSU")
+        return arrays
 
 
 def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
-    """A member of an archive. It may unfold to more than it says, so no more than that is ever unfolded.
+    """A member of an archive. It may decompress to more than it states; no more than that is ever decompressed.
 
     Raises:
-        One of ``BROKEN``: it is damaged, or packed otherwise than NumPy packs: others unfold without a bound.
+        One of ``BROKEN``: it is damaged, or packed otherwise than NumPy packs: others decompress without a bound.
     """
     if entry.compress_type not in _METHODS:
         raise ValueError(f"{entry.filename} is packed in a way that NumPy does not use")
@@ -117,18 +118,18 @@ def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], 
     """An array of finite numbers in one of the shapes, as float64.
 
     Raises:
-        PolarguideError: it has another shape or type, or values that are not finite.
+        PolarguideError: the array has another shape or type, or values that are not finite.
     """
     expected = f"finite numbers in shape {' or '.join('x'.join(map(str, shape)) for shape in shapes)}"
     try:
-        found = np.asarray(array, dtype=np.float64)
+        numbers = np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise wrong_camera(where, expected, f"something else ({error})") from None
-    if found.shape not in shapes:
-        raise wrong_camera(where, expected, array_size(found))
-    if not np.isfinite(found).all():
+    if numbers.shape not in shapes:
+        raise wrong_camera(where, expected, array_size(numbers))
+    if not np.isfinite(numbers).all():
         raise wrong_camera(where, expected, "values that are not finite")
-    return found
+    return numbers
 
 
 def array_header(stream: io.BytesIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -260,7 +261,7 @@ def exr_size(data: bytes) -> tuple[int, int]:
         raise ValueError("no OpenEXR file")
     width = height = 0
     (version,) = struct.unpack_from("<I", data, 4)
-    at, found = 8, False
+    at, windowed = 8, False
     while data[at : at + 1] not in (b"\0", b""):
         while data[at : at + 1] not in (b"\0", b""):
             name = data.index(b"\0", at)
@@ -268,13 +269,13 @@ def exr_size(data: bytes) -> tuple[int, int]:
             (size,) = struct.unpack_from("<I", data, kind + 1)
             if data[at:name] == b"dataWindow":
                 left, top, right, bottom = struct.unpack_from("<4i", data, kind + 5)
-                width, height, found = right - left + 1, bottom - top + 1, True
+                width, height, windowed = right - left + 1, bottom - top + 1, True
                 if min(width, height) < 1 or width * height > LARGEST_PIXELS:
                     raise ValueError(f"{width}x{height} pixels")
             at = kind + 5 + size
         at += 1
         if not version & _EXR_PARTS:
             break
-    if not found:
+    if not windowed:
         raise ValueError("no size")
     return width, height

@@ -316,7 +316,7 @@ def decode_tiff(data: bytes) -> tuple[NDArray[Any], int]:
         floating-point numbers; and the bits of a sample, which may be fewer than those of the array.
 
     Raises:
-        UnreadableTiffError: it has several pictures, or samples that mean something else.
+        UnreadableTiffError: the file has several pictures, or samples that mean something else.
         Exception: of a dozen kinds, where the file is damaged.
     """
     with tifffile.TiffFile(io.BytesIO(data)) as file:

@@ -128,19 +128,15 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
         yield kind, data[start:end]
 
 
-def tiff_entries(data: bytes, start: int | None = None) -> Iterator[tuple[int, int, int, int]]:
-    """Tag, type and count of the entries in a directory of a TIFF or BigTIFF file, and where their values stand.
-
-    Args:
-        data: the file. start: where the directory stands; the first one's place if None.
+def tiff_entries(data: bytes) -> Iterator[tuple[int, int, int, int]]:
+    """Tag, type and count of the entries in the first directory of a TIFF or BigTIFF file, and places of their values.
 
     Raises:
         struct.error, OverflowError: the file is too short.
     """
     order, big = tiff_order(data), data[:4] in BIG_TIFF  # places and counts of BigTIFF have 64 bits
     head, counter, place = ("HHQ", "Q", 12) if big else ("HHI", "H", 8)
-    if start is None:
-        (start,) = struct.unpack_from(order + head[2:], data, 8 if big else 4)
+    (start,) = struct.unpack_from(order + head[2:], data, 8 if big else 4)
     (count,) = struct.unpack_from(order + counter, data, start)
     first, size = start + struct.calcsize(counter), 20 if big else 12
     for at in range(first, first + size * min(count, MOST_ENTRIES), size):

@@ -171,7 +171,7 @@ def _require_one_mask(path: Path, pixels: NDArray[Any], mask: NDArray[np.bool_])
     """Refuse a picture that is one mask by its colors, and another by its transparency.
 
     Raises:
-        PolarguideError: it is.
+        PolarguideError: colors and transparency contradict one another.
     """
     if pixels.shape[2:] != (4,) or pixels.dtype.kind != "u":
         return

@@ -75,7 +75,7 @@ def write_analyzers(path: Path, calibration: AnalyzerCalibration) -> str:
     """Write the file of a calibration, which is the same bytes for the same content; returns the checksum.
 
     Raises:
-        PolarguideError: it cannot be written.
+        PolarguideError: the file cannot be written.
     """
     vectors = np.ascontiguousarray(calibration.vectors, np.float32)
     metadata = _Metadata(
@@ -93,7 +93,7 @@ def read_analyzers(path: Path) -> AnalyzerCalibration:
     """Read the file that ``polarguide calibrate`` wrote.
 
     Raises:
-        PolarguideError: it cannot be read, is cut short, damaged, or of another kind or version.
+        PolarguideError: the file cannot be read, is cut short, damaged, or of another kind or version.
     """
     require_file(path, expected="a calibration of polarguide calibrate", remedy=_REMEDY)
     try:
@@ -114,38 +114,45 @@ def read_analyzers(path: Path) -> AnalyzerCalibration:
             found="other content: the file is damaged, or was changed",
             remedy=_REMEDY,
         )
-    found = AnalyzerCalibration(
+    calibration = AnalyzerCalibration(
         metadata.sensor, metadata.lens, (metadata.offset_x, metadata.offset_y), (metadata.width, metadata.height),
         metadata.block, vectors, metadata.reference, metadata.polarizer_extinction, metadata.sha256,
     )  # fmt: skip
-    _require_sound(path, found)
-    return found
+    _require_sound(path, calibration)
+    return calibration
 
 
-def _require_sound(path: Path, found: AnalyzerCalibration) -> None:
+def _require_sound(path: Path, calibration: AnalyzerCalibration) -> None:
     """Refuse content that fits its checksum and still makes no sense.
 
     Raises:
         PolarguideError: an unknown sensor, vectors of another shape, or that no polarizer has.
     """
-    if found.sensor not in SENSORS:
-        raise _damaged(path, f"one of the sensor {found.sensor!r}, which is unknown")
-    period = found.pattern.period
-    shape = (*grid_shape(found.offset, found.size, found.block), period, period, 3)
-    if found.block % period or found.vectors.shape != shape or found.vectors.dtype != np.float32:
+    if calibration.sensor not in SENSORS:
+        raise _damaged(path, f"one of the sensor {calibration.sensor!r}, which is unknown")
+    period = calibration.pattern.period
+    shape = (*grid_shape(calibration.offset, calibration.size, calibration.block), period, period, 3)
+    if (
+        calibration.block % period
+        or calibration.vectors.shape != shape
+        or calibration.vectors.dtype != np.float32
+    ):
         raise _damaged(
-            path, f"vectors {list(found.vectors.shape)} of {found.vectors.dtype} instead of {list(shape)}"
+            path,
+            f"vectors {list(calibration.vectors.shape)} of {calibration.vectors.dtype} instead of {list(shape)}",
         )
-    gain = found.vectors[..., 0]
-    if not (np.isfinite(found.vectors).all() and (gain > 0).all()):
+    gain = calibration.vectors[..., 0]
+    if not (np.isfinite(calibration.vectors).all() and (gain > 0).all()):
         raise _damaged(path, "vectors that are not finite, or have no throughput")
     if gain.min() < 1 / MOST_THROUGHPUT or gain.max() > MOST_THROUGHPUT:
         throughputs = f"throughputs of {gain.min():g} to {gain.max():g}, whose mean is 1/2 in such a file"
         raise _damaged(path, throughputs)
-    if (np.hypot(found.vectors[..., 1], found.vectors[..., 2]) < LEAST_DIATTENUATION * gain).any():
+    if (
+        np.hypot(calibration.vectors[..., 1], calibration.vectors[..., 2]) < LEAST_DIATTENUATION * gain
+    ).any():
         raise _damaged(path, "vectors of pixels that hardly polarize")
-    nominal = 2 * np.radians(found.pattern.angles)
-    angles = np.arctan2(found.vectors[..., 2], found.vectors[..., 1])
+    nominal = 2 * np.radians(calibration.pattern.angles)
+    angles = np.arctan2(calibration.vectors[..., 2], calibration.vectors[..., 1])
     # Four that are alike could not be solved for light.
     if (np.cos(angles - nominal) < np.cos(2 * FARTHEST_ANGLE)).any():
         raise _damaged(path, "vectors of polarizers far from the sensor's angles")

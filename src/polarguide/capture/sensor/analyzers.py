@@ -132,7 +132,7 @@ class AnalyzerCalibration:
             sensor: the sensor of what is to be corrected; None where nobody knows. where: for messages.
 
         Raises:
-            PolarguideError: it is another one.
+            PolarguideError: the calibration is of another sensor.
         """
         if sensor is not None and sensor != self.sensor:
             raise PolarguideError(
@@ -146,10 +146,10 @@ class AnalyzerCalibration:
         """Refuse a region that the calibration does not hold.
 
         Args:
-            offset, size: of the region, in columns and rows of the sensor. where: for messages.
+            offset, size: those of the region, in columns and rows of the sensor. where: for messages.
 
         Raises:
-            PolarguideError: it is not inside.
+            PolarguideError: the region is not inside the calibrated one.
         """
         inside = all(
             mine <= start and start + length <= mine + whole
@@ -312,8 +312,8 @@ class AnalyzerCalibration:
     ) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
         """Matrices [4, 4, R, C] of the different cells, and which of these each row and column of cells has."""
         key = (offset, size)
-        found = self._matrices.get(key)
-        if found is None:
+        grid = self._matrices.get(key)
+        if grid is None:
             rows, columns = (self._places(axis, offset[1 - axis], size[1 - axis]) for axis in (0, 1))
             (y, which_row), (x, which_column) = rows, columns
             nominal = self.pattern.shifted(*offset).angles[:2, :2].ravel()
@@ -325,10 +325,10 @@ class AnalyzerCalibration:
                     for r, c in np.ndindex(2, 2)
                 ]
                 matrices[:, :, first : first + _AT_ONCE] = correction_matrices(analyzers, nominal)
-            found = matrices, which_row, which_column
+            grid = matrices, which_row, which_column
             self._matrices.clear()
-            self._matrices[key] = found
-        return found
+            self._matrices[key] = grid
+        return grid
 
     def _places(self, axis: int, start: int, length: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """The different rows (axis 0) or columns (1) of cells, and which of them each one is.

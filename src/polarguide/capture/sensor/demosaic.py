@@ -156,7 +156,7 @@ def demosaic(
     Args:
         values: linear intensities [H, W], black level and gains already applied.
         bad: unusable samples, [H, W].
-        pattern: of the top-left pixel, which starts a whole polarizer cell.
+        pattern: pattern of the top-left pixel, which starts a whole polarizer cell.
         mode: a key of ``DEMOSAIC_MODES``.
         interpolation: ``bilinear`` or ``guided``; ``quarter`` and a monochrome ``half`` interpolate no colors.
         registered: whether ``half`` brings the four angles to one place.
@@ -169,18 +169,18 @@ def demosaic(
     step = 4 if mode == "quarter" else 2
     values = values[: values.shape[0] // step * step, : values.shape[1] // step * step]
     if mode == "quarter":
-        found = _superpixels(values, pattern)
+        picture = _superpixels(values, pattern)
     else:
         cells = _cells(values, pattern, interpolation)
         if mode == "full":
-            found = _full(cells, pattern, interpolation)
+            picture = _full(cells, pattern, interpolation)
         else:
-            found = _half_size(cells, pattern)
+            picture = _half_size(cells, pattern)
             if registered:
-                found = _registered(found, _full(cells, pattern, interpolation), interpolation)
-    if colored and found.shape[-1] == 1:
-        found = np.repeat(found, 3, axis=-1)
-    return DemosaicedPicture(found, invalid)
+                picture = _registered(picture, _full(cells, pattern, interpolation), interpolation)
+    if colored and picture.shape[-1] == 1:
+        picture = np.repeat(picture, 3, axis=-1)
+    return DemosaicedPicture(picture, invalid)
 
 
 def spoiled(bad: Mask, pattern: Pattern, *, mode: str, interpolation: str, registered: bool = True) -> Mask:

@@ -137,7 +137,7 @@ def sensor_pattern(sensor: str) -> Pattern:
             "--sensor",
             expected=f"one of {', '.join(SENSORS)}",
             found=repr(sensor),
-            remedy="Cameras with the same pattern as one of them are read under its name.",
+            remedy="Give one of these names: of your camera's sensor, or of a sensor with the same pattern.",
         )
     if not SENSORS[sensor]:
         return Pattern(_CELL.copy(), None)
@@ -287,7 +287,7 @@ def unusable_samples(
 
     Args:
         values: [H, W] stored values, H and W even.
-        levels: of the capture.
+        levels: levels of the capture.
         dark: dark frame in stored values, [H, W].
 
     Returns:
@@ -350,13 +350,13 @@ def require_kind(sensor: str, blocks: NDArray[Any], levels: Levels) -> None:
     """Refuse mosaics of the other kind of sensor: nothing later would tell.
 
     Args:
-        sensor: its name, a key of ``SENSORS``. blocks: as for ``color_filters``. levels: of the stored values.
+        sensor: its name, a key of ``SENSORS``. blocks: as for ``color_filters``. levels: levels of the stored values.
 
     Raises:
         PolarguideError: the samples say that it is another one.
     """
-    found = color_filters(blocks, levels.saturation, levels.black)
-    if found is None or (found == "color") == SENSORS[sensor]:
+    filters = color_filters(blocks, levels.saturation, levels.black)
+    if filters is None or (filters == "color") == SENSORS[sensor]:
         return
     other = next(name for name, colored in SENSORS.items() if colored != SENSORS[sensor])
     raise PolarguideError(

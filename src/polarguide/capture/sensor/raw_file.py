@@ -107,7 +107,7 @@ def require_mosaic(where: Path | str, values: NDArray[Any], *, least: int) -> No
     """Refuse values [H, W] that no sensor delivers; ``least``: pixels that the shorter side must have.
 
     Raises:
-        PolarguideError: they are too few, or four pictures.
+        PolarguideError: the values are too few, or four pictures side by side.
     """
     if min(values.shape) < least:
         raise PolarguideError(

@@ -173,15 +173,16 @@ def _tenth_above(values: Tensor) -> float:
 
 @torch.no_grad()
 def cross_fitted(view: View, final: Tensor, stokes: Tensor | None) -> Tensor:
-    """The picture that a model predicts of ``view.photograph()``, behind an analyzer that is fitted on the other half.
+    """Predicted photograph of a view whose pictures were taken through a filter and do not measure S0.
 
-    Gain, angle and strength of the analyzer are fitted on the left half of the picture for the right one, and on the
-    right one for the left (``training.angles.fit``), so that no pixel takes part in the fit that it is scored by.
+    Gain, angle and strength of the analyzer are not known, so they are fitted (``training.angles.fit``): on the left
+    half of the picture to predict the right one, and on the right half to predict the left one. No pixel is scored by
+    a fit that used it.
 
     Args:
-        view: whose pictures do not measure S0.
-        final: [H, W, 3] rendered, S0/2.
-        stokes: [3, H, W, 3] as predicted; None: no prediction, the gain alone is fitted.
+        view: the view.
+        final: [H, W, 3] rendered S0/2.
+        stokes: [3, H, W, 3] predicted Stokes vectors; None: the gain alone is fitted.
 
     Returns:
         [H, W, 3] linear, on the device of ``final``.

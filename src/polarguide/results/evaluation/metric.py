@@ -78,7 +78,7 @@ def plugged_metrics(known: Collection[str]) -> tuple[Metric, ...]:
         try:
             for metric in _loaded(entry):
                 if metric.key in plugged or metric.key in known:
-                    raise _unusable(entry, "a key of its own", f"{metric.key}, which there is")
+                    raise _unusable(entry, "a key that no other metric has", metric.key)
                 plugged[metric.key] = metric
         except PolarguideError as error:
             warnings.warn(f"{error} Its metrics are left out.", PolarguideWarning, stacklevel=2)
@@ -89,7 +89,7 @@ def _loaded(entry: EntryPoint) -> tuple[Metric, ...]:
     """The metrics of an entry point.
 
     Raises:
-        PolarguideError: it cannot be loaded, or is something else.
+        PolarguideError: the entry point cannot be loaded, or is no metric.
     """
     try:
         loaded: Any = entry.load()

@@ -16,6 +16,7 @@ import torch.nn.functional as functional
 from torch import Tensor
 
 from polarguide.optics.color import shown
+from polarguide.training.photometric import SSIM_WINDOW, gaussian_window, structural_similarity
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +44,6 @@ class Selection:
 
 
 Keep = Tensor | Selection | None
-SSIM_WINDOW = 11
-SSIM_SIGMA = 1.5
-SSIM_C1 = 0.01**2
-SSIM_C2 = 0.03**2
 REFLECTIVE_SHARE = 0.3
 CLOSE_NORMAL_DEG = 11.25
 SHORTEST = 1e-12
@@ -76,7 +73,7 @@ def squared_error(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None) -
     Raises:
         ValueError: shapes that do not fit.
     """
-    return _shown_error(*_kept(pred_linear, true_linear, keep))
+    return _shown_error(*_selected_values(pred_linear, true_linear, keep))
 
 
 def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: Keep = None) -> Tensor:
@@ -112,13 +109,7 @@ def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: K
         for picture in (pred_linear, true_linear)
     )
     weight = _blur(selected.to(torch.float64)[None]).clamp(min=torch.finfo(torch.float64).tiny)
-    mean_x, mean_y = _blur(x) / weight, _blur(y) / weight
-    variance_x = _blur(x * x) / weight - mean_x**2
-    variance_y = _blur(y * y) / weight - mean_y**2
-    covariance = _blur(x * y) / weight - mean_x * mean_y
-    similarity = ((2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)) / (
-        (mean_x**2 + mean_y**2 + SSIM_C1) * (variance_x + variance_y + SSIM_C2)
-    )
+    similarity = structural_similarity(*(_blur(plane) / weight for plane in (x, y, x * x, y * y, x * y)))
     counted = _selected(window_centers(selected) if windows is None else windows, similarity[0])
     return similarity.flatten(1).index_select(1, counted.places).mean()
 
@@ -168,12 +159,12 @@ def normal_mae_deg(pred: Tensor, true: Tensor, keep: Keep = None) -> Tensor:
     Returns:
         [] degrees; NaN where no pixel counts.
     """
-    return _kept_angles(pred, true, keep).mean()
+    return _selected_angles(pred, true, keep).mean()
 
 
 def normal_within_11(pred: Tensor, true: Tensor, keep: Keep = None) -> Tensor:
     """Share in [0, 1] of the pixels whose normal is under 11.25 degrees off, else as ``normal_mae_deg``."""
-    return (_kept_angles(pred, true, keep) < CLOSE_NORMAL_DEG).to(torch.float64).mean()
+    return (_selected_angles(pred, true, keep) < CLOSE_NORMAL_DEG).to(torch.float64).mean()
 
 
 def layer_error(contribution: Tensor, true_s0: Tensor, keep: Keep, *, aligned: bool = False) -> Tensor:
@@ -189,7 +180,7 @@ def layer_error(contribution: Tensor, true_s0: Tensor, keep: Keep, *, aligned: b
     Returns:
         [], as ``squared_error``.
     """
-    pred, true = _kept(contribution, true_s0 / 2, keep)
+    pred, true = _selected_values(contribution, true_s0 / 2, keep)
     return _shown_error(pred * _channel_scales(pred, true) if aligned else pred, true)
 
 
@@ -218,14 +209,14 @@ def _shown_error(pred: Tensor, true: Tensor) -> Tensor:
     return ((shown(pred) - shown(true)) ** 2).mean()
 
 
-def _kept_angles(pred: Tensor, true: Tensor, keep: Keep) -> Tensor:
+def _selected_angles(pred: Tensor, true: Tensor, keep: Keep) -> Tensor:
     if not isinstance(keep, Selection):
         directed = has_direction(true)
         keep = directed if keep is None else directed & keep.to(directed.device)
     return _selected(keep, pred).pick(normal_angles_deg(pred, true))
 
 
-def _kept(pred: Tensor, true: Tensor, keep: Keep) -> tuple[Tensor, Tensor]:
+def _selected_values(pred: Tensor, true: Tensor, keep: Keep) -> tuple[Tensor, Tensor]:
     """The pixels that count as [P, C] float64, on the device of the prediction."""
     _check_pair(pred, true)
     selection = _selected(keep, pred)
@@ -251,9 +242,7 @@ def _check_pair(pred: Tensor, true: Tensor) -> None:
 
 def _blur(channels: Tensor) -> Tensor:
     """[C, H, W] averaged under the Gaussian window, where it lies inside the picture: [C, H - 10, W - 10]."""
-    offset = torch.arange(SSIM_WINDOW, dtype=torch.float64, device=channels.device) - SSIM_WINDOW // 2
-    kernel = torch.exp(-(offset**2) / (2 * SSIM_SIGMA**2))
-    kernel = kernel / kernel.sum()
+    kernel = gaussian_window(channels.dtype, channels.device)
     rows = functional.conv2d(channels[:, None], kernel.view(1, 1, -1, 1))
     return functional.conv2d(rows, kernel.view(1, 1, 1, -1))[:, 0]
 

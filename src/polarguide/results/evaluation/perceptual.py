@@ -86,11 +86,11 @@ def places(name: str) -> list[Path]:
     """
     if folder := os.environ.get(FOLDER):
         return [Path(folder) / name]
-    found = [Path(torch.hub.get_dir()) / "checkpoints" / name]
+    paths = [Path(torch.hub.get_dir()) / "checkpoints" / name]
     package = find_spec("torchmetrics") if name == CHANNELS else None
     if package is not None and package.origin is not None:
-        found.append(Path(package.origin).parent / "functional" / "image" / "lpips_models" / name)
-    return found
+        paths.append(Path(package.origin).parent / "functional" / "image" / "lpips_models" / name)
+    return paths
 
 
 def load_lpips() -> tuple[Lpips | None, str | None]:

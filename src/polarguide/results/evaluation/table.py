@@ -227,7 +227,7 @@ def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> li
     """The metrics of a run as people read them.
 
     Args:
-        record: of a run, as ``metrics.json`` has it.
+        record: record of a run, as ``metrics.json`` has it.
         scores_only: leave out what belongs to the run alone (times, counts) and what has no value.
 
     Returns:

@@ -175,7 +175,7 @@ class ViewTarget:
         smooth: valid pixels with a true depth at least 2 pixels from any jump of it.
         mask: [H, W] float64, 1 in the foreground; None unless the pictures show nothing else.
         beyond: valid pixels more than 3 pixels outside the mask; None likewise.
-        extent: of the scene, world units.
+        extent: extent of the scene, world units.
     """
 
     photograph: Tensor

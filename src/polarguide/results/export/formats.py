@@ -89,7 +89,7 @@ def export(
             panorama (EXR, HDR and PNG); cameras are a COLMAP model and transforms.json.
         out: folder to write; ``export`` in the run's folder by default.
         resolution: voxels of the mesh along its longest side, 16 to 1024.
-        spz_version: of the SPZ file, 3 or 4; readers are split between them.
+        spz_version: version of the SPZ file, 3 or 4; readers are split between them.
         model: options of the textured model.
         reporter: receives progress.
 
@@ -193,7 +193,7 @@ def _ply(
         model = run.gaussian_model("format ply")
         color = presented.presentation.color
         write_run_ply(whole, model.state, model.shading, _camera_centers(run), color=color, linear=linear)
-        selected = None if presented.kept is None else presented.kept.cpu()
+        selected = None if presented.inside is None else presented.inside.cpu()
         rewrite_splats(path, whole, placement or presented.placement, selected, presented.comments)
     return path
 
@@ -214,7 +214,7 @@ def _camera_centers(run: OpenedRun) -> Tensor | None:
 
 
 def _spz(run: OpenedRun, presented: Presented, path: Path, version: int) -> Path:
-    """From a PLY that is gone afterwards. In units of the scene: its positions are multiples of 1/4096 of a unit."""
+    """From a PLY that is then deleted. In units of the scene: its positions are multiples of 1/4096 of a unit."""
     with temporary_folder(path.with_suffix(".ply")) as place:
         ply = _ply(
             run, presented, place / "splats.ply", replace(presented.placement, scale=1.0, metric=False)
@@ -224,7 +224,7 @@ def _spz(run: OpenedRun, presented: Presented, path: Path, version: int) -> Path
 
 
 def _sog(run: OpenedRun, presented: Presented, path: Path) -> Path:
-    """From a PLY that is gone afterwards."""
+    """From a PLY that is then deleted."""
     credit = presented.presentation.credit
     about = {"extras": {**presented.origin.record(), **presented.placement.record()}}
     with temporary_folder(path.with_suffix(".ply")) as place:
@@ -245,7 +245,7 @@ def _splat_glb(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]
 
 
 def _splat_usdz(run: OpenedRun, presented: Presented, path: Path) -> list[Path]:
-    """From a PLY that is gone afterwards; colors are encoded, as USD leaves open."""
+    """From a PLY that is then deleted; colors are encoded, as USD leaves open."""
     place = presented.upright(run)
     with temporary_folder(path.with_suffix(".ply")) as parts:
         ply = _ply(run, presented, parts / "splats.ply", place)
@@ -263,8 +263,8 @@ def _mesh(
     if (crop := presented.presentation.crop) is not None:
         inside = crop.inside(torch.from_numpy(mesh.surface.vertices), run.camera_frame).numpy()
         mesh = mesh.within(inside)
-    shown = colored(torch.from_numpy(mesh.colors), presented.presentation.color).clamp(max=1)
-    mesh = replace(mesh, colors=shown.numpy())
+    colors = colored(torch.from_numpy(mesh.colors), presented.presentation.color).clamp(max=1)
+    mesh = replace(mesh, colors=colors.numpy())
     paths = [folder / "mesh.glb", folder / "mesh.ply"]
     for path in paths:
         write_mesh(path, mesh, run.frame, presented.placement, presented.origin)
@@ -370,8 +370,8 @@ def _all(
         if radiant:
             _environment(run, presented, parts, reporter)
         view = (run.scene.test_views + run.scene.train_views)[0]
-        shown = colored(run.result(view.camera).to("cpu").final, presented.presentation.color)
-        figures.write_png(parts / "preview.png", figures.radiance_to_rgb(shown))
+        picture = colored(run.result(view.camera).to("cpu").final, presented.presentation.color)
+        figures.write_png(parts / "preview.png", figures.radiance_to_rgb(picture))
         names = sorted(path.name for path in parts.iterdir())
         record = package_record(
             run, presented.upright(run), presented.origin, BASE_COLORS[lit.resolved_base_color]

@@ -59,11 +59,11 @@ class Binary:
         """Write the file of one primitive.
 
         Args:
-            path: the file. asset: whom and what made it, without the version. primitive: of the only mesh.
+            path: the file. asset: whom and what made it, without the version. primitive: primitive of the only mesh.
             more: further fields of the tree.
 
         Raises:
-            PolarguideError: it cannot be written.
+            PolarguideError: the file cannot be written.
         """
         self._data += bytes(-len(self._data) % 4)
         tree = {

@@ -44,7 +44,7 @@ def write_mesh(
 
     Args:
         path: the file, .ply or .glb. mesh: in the scene's axes. around: its frame.
-        placement: of the PLY; the GLB has its units alone. origin: whom the file is owed to.
+        placement: placement of the PLY; the GLB has its units alone. origin: whom the file is owed to.
 
     Raises:
         PolarguideError: trimesh is not installed.

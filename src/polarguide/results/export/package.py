@@ -31,7 +31,7 @@ def package_record(run: OpenedRun, placement: Placement, origin: Origin, base_co
     """The record, without files.
 
     Args:
-        run: the run; its scene is read. placement: of the files, upright (+y). origin: whom they are owed to.
+        run: the run; its scene is read. placement: placement of the files, upright (+y). origin: whom they are owed to.
         base_color: what that of the model is.
     """
     unknown = [

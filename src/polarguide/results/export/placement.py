@@ -188,16 +188,16 @@ def with_comments(ply: bytes, lines: list[str]) -> bytes:
 
 
 def rewrite_splats(
-    path: Path, ply: Path, placement: Placement, kept: Tensor | None, lines: list[str]
+    path: Path, ply: Path, placement: Placement, mask: Tensor | None, lines: list[str]
 ) -> None:
     """Write a PLY of Gaussians as it is exported.
 
     Args:
         path: the file to write. ply: as ``write_run_ply`` wrote it.
-        kept: [N] bool, which Gaussians are kept; None: all. lines: comments.
+        mask: [N] bool, which Gaussians are kept; None: all. lines: comments.
     """
     element = PlyData.read(ply)["vertex"]
-    table = np.array(element.data if kept is None else element.data[kept.numpy()])
+    table = np.array(element.data if mask is None else element.data[mask.numpy()])
     placement.place(table)
     vertices = PlyElement.describe(table, "vertex", comments=[*element.comments, *lines])
     with atomic(path) as temporary:
@@ -248,7 +248,7 @@ def _require_whole(folder: Path, images: int, points: int) -> None:
     """Read a model back: pycolmap does not say where the disk was full.
 
     Raises:
-        OSError: it is not whole.
+        OSError: the model is incomplete.
     """
     try:
         model = pycolmap.Reconstruction()

@@ -31,18 +31,18 @@ class Presented:
         gaussians = model.state.gaussians if isinstance(model, GaussianModel) else None
         self.gaussians: Parameters | None = gaussians
         self.footprints = model.state.footprints if isinstance(model, GaussianModel) else None
-        self.kept: Tensor | None = None
+        self.inside: Tensor | None = None
         if gaussians is not None and (crop := self.presentation.crop) is not None:
-            self.kept = crop.inside(gaussians["means"].detach(), run.camera_frame)
-            if not bool(self.kept.any()):
+            self.inside = crop.inside(gaussians["means"].detach(), run.camera_frame)
+            if not bool(self.inside.any()):
                 raise PolarguideError(
                     "the crop box",
                     expected="Gaussians in it",
-                    found=f"none of {len(self.kept)}",
+                    found=f"none of {len(self.inside)}",
                     remedy="Move it: polarguide present RUN --crop, or in polarguide view.",
                 )
-            self.gaussians = {name: gaussians[name].detach()[self.kept] for name in gaussians.names}
-            self.footprints = None if self.footprints is None else self.footprints[self.kept]
+            self.gaussians = {name: gaussians[name].detach()[self.inside] for name in gaussians.names}
+            self.footprints = None if self.footprints is None else self.footprints[self.inside]
         around = run.frame if self.presentation.up_axis is not None else None
         self.placement = Placement.of(self.presentation, around)
         scene = run.configuration.scene_digest[:12]

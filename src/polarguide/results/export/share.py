@@ -78,15 +78,15 @@ the last of them needs.
 def records(
     gaussians: Parameters, values: Mapping[str, Tensor], footprints: Tensor | None = None
 ) -> NDArray[Any]:
-    """Quantize Gaussians; those too faint to be drawn at all are left out.
+    """Quantized Gaussians for the page, without those that are too faint to be drawn.
 
     Args:
-        gaussians: the Gaussians. values: the shading model's, [N, ...] by the names of ``SLOTS``.
-        footprints: [N] of the training, see ``raster.magnification``; None: not known.
+        gaussians: parameters of the Gaussians.
+        values: parameters of the shading model, [N, ...], by the names of ``SLOTS``.
+        footprints: [N] size of a training pixel at each Gaussian, see ``raster.magnification``; None: not known.
 
     Returns:
-        [K] records of whole texels, with named fields; in the order of a curve that fills space, so that neighbors
-        in it are alike.
+        [K] structured records, each padded to whole texels, along a space-filling curve, so that neighbors are alike.
     """
     opacity = torch.sigmoid(gaussians["opacity_logits"])
     indices = (opacity >= MINIMUM_ALPHA).nonzero()[:, 0]
@@ -141,14 +141,14 @@ def harmonics_steps(rest: Tensor) -> tuple[NDArray[np.int8], NDArray[np.float16]
     return steps.astype(np.int8), step
 
 
-def _axes(gaussians: Parameters, kept: Tensor) -> tuple[Tensor, Tensor]:
+def _axes(gaussians: Parameters, mask: Tensor) -> tuple[Tensor, Tensor]:
     """Normal axes [K, 3], and 1 [K] where they are turned outward, 0 where the camera alone decides."""
-    means, origin = gaussians["means"][kept], torch.zeros(3)
-    axes = shortest_axis_normals(means, gaussians["quaternions"][kept], gaussians["log_scales"][kept], origin)
+    means, origin = gaussians["means"][mask], torch.zeros(3)
+    axes = shortest_axis_normals(means, gaussians["quaternions"][mask], gaussians["log_scales"][mask], origin)
     outward = gaussians.get("outward")
     if outward is None:
-        return axes, torch.zeros(len(kept))
-    along = (axes * outward[kept]).sum(dim=1)
+        return axes, torch.zeros(len(mask))
+    along = (axes * outward[mask]).sum(dim=1)
     return torch.where(along < 0, -1.0, 1.0)[:, None] * axes, (along != 0).float()
 
 
@@ -225,7 +225,7 @@ def share_page(
 
     Args:
         gaussians: the Gaussians.
-        light: parameters of the learned light by name. shading: of the recipe, for the run's refractive index.
+        light: parameters of the learned light by name. shading: shading of the recipe, for the run's refractive index.
         cameras: poses to choose from by name, at least one. first: name of the one to begin with.
         title, caption: any text; it is escaped.
         metrics: labels and values, any text. notes: paragraphs before them, any text.
@@ -287,7 +287,7 @@ def share_page(
 
 def baked_page(gaussians: Parameters, light: Light, shading: ShadingModel) -> PageShading:
     """The page of a model for which there are no shaders: linear harmonics of its Gaussians' own colors, and a note."""
-    dc, rest = baked_harmonics(gaussians, light, shading, shown=lambda colors: colors, linear=True)
+    dc, rest = baked_harmonics(gaussians, light, shading, present=lambda colors: colors, linear=True)
     return PageShading("plain", {"color": dc[:, 0], "harmonics": rest}, notes=[BAKED])
 
 

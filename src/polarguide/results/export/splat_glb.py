@@ -25,10 +25,10 @@ def write_splat_glb(path: Path, ply: Path, asset: dict[str, Any], encoding: Enco
 
     Args:
         path: the file to write. ply: as ``write_run_ply`` writes it. asset: glTF's record of whom and what made it.
-        encoding: of the colors in the PLY.
+        encoding: encoding of the colors in the PLY.
 
     Raises:
-        PolarguideError: it cannot be written.
+        PolarguideError: the file cannot be written.
     """
     gaussians = read_ply(ply)
     fields = {

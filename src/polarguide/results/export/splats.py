@@ -32,16 +32,18 @@ _HALF_TURN_HARMONICS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
 
 
 def write_spz(path: Path, ply: Path, version: int = 3) -> None:
-    """Convert a PLY of Gaussians; our own fields in it are left out, as the format has no place for them.
+    """Convert a PLY of Gaussians to SPZ, which has no place for the fields that only polarguide reads.
 
-    SPZ is in its own axes (right, up, back), so half a turn about x from ours; readers turn it back. Positions in it
-    are multiples of 1/4096 of the world's unit; colors and scales keep 8 bits, harmonics 5 or 4.
+    The axes of SPZ are right, up and back: the scene is turned by 180 degrees about x, and readers of SPZ turn it back.
+    Positions are rounded to 1/4096 of the world's unit. Colors and scales keep 8 bits, harmonics 5 or 4 by degree.
 
     Args:
-        path: the file to write. ply: as ``write_run_ply`` writes it. version: 3, or 4 (zstd in place of gzip).
+        path: file to write.
+        ply: file as ``write_run_ply`` writes it.
+        version: 3, or 4 (zstd in place of gzip).
 
     Raises:
-        PolarguideError: the converter is not installed, or refuses.
+        PolarguideError: the converter is not installed, or cannot convert the file.
     """
     converter = optional_import("gaussforge", "--format spz").GaussForge()
     converted = converter.convert(_half_turned(ply).read_bytes(), "ply", "spz", spz_version=version)

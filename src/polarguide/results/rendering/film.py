@@ -128,7 +128,7 @@ def write_film(
     Args:
         run: the run; its scene is read.
         out: MP4 file to write, or a folder for PNG files.
-        path, frames: of the cameras; see ``path_cameras``.
+        path, frames: those of the cameras; see ``path_cameras``.
         layers: names of layers.
 
     Raises:

@@ -120,12 +120,15 @@ def fuse(box: Box, views: Iterable[tuple[Camera, Tensor, Tensor]]) -> tuple[Tens
     return total / weight.clamp(min=1), weight
 
 
-def surface_of(box: Box, field: Tensor, weight: Tensor, *, least: int = 2, smallest: float = 0.01) -> Surface:
+LEAST_VIEWS, SMALLEST_PIECE = 2, 0.01
+"""Views that must have seen a voxel. Pieces with fewer faces than this share of the largest are dropped."""
+
+
+def surface_of(box: Box, field: Tensor, weight: Tensor) -> Surface:
     """The zero set where enough views looked, without small loose pieces (marching cubes, Lewiner et al. 2003).
 
     Args:
-        field, weight: as of ``fuse``. least: views that must have seen a voxel.
-        smallest: pieces with fewer faces than this share of the largest are dropped.
+        field, weight: as of ``fuse``.
 
     Raises:
         PolarguideError: scikit-image is not installed, or there is no surface.
@@ -133,7 +136,7 @@ def surface_of(box: Box, field: Tensor, weight: Tensor, *, least: int = 2, small
     marching_cubes: Callable[..., tuple[NDArray, NDArray, NDArray, NDArray]] = optional_import(
         "skimage.measure", "a mesh"
     ).marching_cubes
-    certain = (weight >= least).numpy()
+    certain = (weight >= LEAST_VIEWS).numpy()
     try:
         # Its normals point to smaller values, into the surface; with "descent" its faces turn outward.
         vertices, faces, inward, _ = marching_cubes(
@@ -144,7 +147,7 @@ def surface_of(box: Box, field: Tensor, weight: Tensor, *, least: int = 2, small
             "mesh", expected="a surface that several views see", found="none", remedy="Train for more steps."
         ) from None
     world = vertices.astype(np.float64) * box.size + box.low.numpy() + 0.5 * box.size
-    return largest_pieces(Surface(world, faces.astype(np.int64), -inward.astype(np.float64)), smallest)
+    return largest_pieces(Surface(world, faces.astype(np.int64), -inward.astype(np.float64)), SMALLEST_PIECE)
 
 
 def largest_pieces(surface: Surface, smallest: float) -> Surface:
@@ -174,13 +177,13 @@ class ColoredMesh:
     surface: Surface
     colors: NDArray[np.float64]
 
-    def within(self, kept: NDArray[np.bool_]) -> ColoredMesh:
+    def within(self, vertices: NDArray[np.bool_]) -> ColoredMesh:
         """The faces all of whose vertices are kept, [V] bool.
 
         Raises:
             PolarguideError: there are none.
         """
-        faces = self.surface.faces[kept[self.surface.faces].all(axis=1)]
+        faces = self.surface.faces[vertices[self.surface.faces].all(axis=1)]
         if not len(faces):
             raise PolarguideError(
                 "the crop box", expected="a surface in it", found="none", remedy="Make it larger, or move it."
@@ -193,14 +196,15 @@ class ColoredMesh:
 def scene_mesh(
     cameras: Mapping[str, Camera], render: Callable[[Camera], RenderResult], *, resolution: int
 ) -> ColoredMesh:
-    """Fuse the depth that a scene's cameras see.
+    """Colored mesh of a scene, fused from depth maps of its cameras.
 
     Args:
-        cameras: at least two. render: gives a view with depth and normals.
-        resolution: voxels along the longest side of what the cameras see.
+        cameras: at least two cameras.
+        render: function that renders a camera's depth and normals.
+        resolution: number of voxels along the longest side of the box that the cameras see.
 
     Raises:
-        PolarguideError: there is no surface, or a library is missing.
+        PolarguideError: the depth maps have no surface, or a library for meshes is not installed.
     """
     surface, views, box = fused_surface(cameras, render, resolution=resolution)
     return painted(surface, views, box)
@@ -212,7 +216,7 @@ def fused_surface(
 ) -> tuple[Surface, list[tuple[Camera, DepthSamples]], Box]:
     """The surface of ``scene_mesh`` before it is painted, what each camera saw of it, and the grid it was fused in."""
     optional_import("skimage.measure", "a mesh")
-    views = [(camera, _kept(render(camera).to("cpu"), camera)) for camera in cameras.values()]
+    views = [(camera, _depth_samples(render(camera).to("cpu"), camera)) for camera in cameras.values()]
     around = scene_frame(list(cameras.values()))
     points = [
         _some(seen_points(camera, samples.depth, samples.mask), _BOX_POINTS // len(views))
@@ -232,7 +236,7 @@ def implicit_surface(cameras: Mapping[str, Camera], model: FieldModel, *, resolu
     """The zero set of a model's distance, where at least two cameras may see it: nearer than their own distance.
 
     Args:
-        cameras: at least two. model: of the run. resolution: voxels along the longest side.
+        cameras: at least two. model: model of the run. resolution: voxels along the longest side.
 
     Raises:
         PolarguideError: there is no surface, or a library is missing.
@@ -283,7 +287,7 @@ class DepthSamples:
     normal: Tensor
 
 
-def _kept(result: RenderResult, camera: Camera) -> DepthSamples:
+def _depth_samples(result: RenderResult, camera: Camera) -> DepthSamples:
     assert result.depth is not None
     assert result.normal is not None
     normal = unit(result.normal, 1e-3)

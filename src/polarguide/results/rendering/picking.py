@@ -65,7 +65,7 @@ def photograph_color(view: View, x: float, y: float, where: str) -> Tensor:
     """The mean color [3] of a photograph's valid pixels around a place, see ``surface_at``.
 
     Raises:
-        PolarguideError: it lies outside, or no pixel there is valid; ``where`` names the option.
+        PolarguideError: the place lies outside, or no pixel there is valid; ``where`` names the option.
     """
     camera = view.camera
     if not (0 <= x < camera.width and 0 <= y < camera.height):
@@ -97,7 +97,7 @@ def gains_of(color: Tensor, where: str = "white_balance") -> Vector:
     """Gains that make a linear color [3] gray and leave green as it is, as cameras state their white balance.
 
     Raises:
-        PolarguideError: it is too dark, clips, or is no gray under any usual light; ``where`` names the option.
+        PolarguideError: the color is too dark, clips, or is no gray under any usual light; ``where`` names the option.
     """
     values = [float(value) for value in color]
     if not (min(values) > 0 and max(values) >= DARKEST and max(values) <= BRIGHTEST):
@@ -119,11 +119,11 @@ def gains_of(color: Tensor, where: str = "white_balance") -> Vector:
     return gains[0], 1.0, gains[2]
 
 
-def gray_world(views: Iterable[View], where: str = "white_balance") -> Vector:
+def gray_world(views: Iterable[View]) -> Vector:
     """Gains after which the photographs' mean is gray (Buchsbaum 1980), over valid pixels; green stays.
 
     Raises:
-        PolarguideError: there are no such pixels, or all are black; ``where`` names the option.
+        PolarguideError: there are no such pixels, or all are black.
     """
     total, count = torch.zeros(3, dtype=torch.float64), 0
     for view in views:
@@ -132,4 +132,4 @@ def gray_world(views: Iterable[View], where: str = "white_balance") -> Vector:
         count += int(valid.sum())
     mean = total / max(count, 1)
     # The gains do not depend on how bright the pictures are: black around an object changes nothing.
-    return gains_of(0.5 * mean / max(float(mean.max()), 1e-12), where)
+    return gains_of(0.5 * mean / max(float(mean.max()), 1e-12))

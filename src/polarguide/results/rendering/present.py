@@ -64,7 +64,7 @@ def present(
     run shows at a pixel of a photograph, counted from the top left corner.
 
     Args:
-        folder: of a scene, whose runs then have it from there, or of a run.
+        folder: folder of a scene, whose runs then have it from there, or of a run.
         white_balance: ``none``, ``gray`` (the mean of the photographs becomes gray), gains of R, G and B such as
             ``1.9,1,1.6``, or VIEW,X,Y: a place in a photograph that should be white or gray.
         chart: ``none``, or VIEW,X,Y,X,Y,X,Y,X,Y: the centers of the corner patches of a 24-patch color chart, around
@@ -109,8 +109,8 @@ def present(
         name: "" if (text := texts[name]) == "none" else text for name in CREDITS if texts[name] is not None
     }
     place.refuse_inherited(name for name, value in changes.items() if value in (None, ""))
-    kept = {name: value for name, value in own.to_record().items() if name not in _replaced(changes)}
-    record = {**kept, **{name: msgspec.to_builtins(value) for name, value in changes.items()}}
+    unchanged = {name: value for name, value in own.to_record().items() if name not in _replaced(changes)}
+    record = {**unchanged, **{name: msgspec.to_builtins(value) for name, value in changes.items()}}
     decoded = decode(record, Presentation, "presentation", remedy="Correct the value; nothing was written.")
     if changes:
         write_presentation(place.folder, decoded)

@@ -42,7 +42,7 @@ def write_priors(
         out: folder to write.
         run: a run trained on this scene at this size, whose normals resolve the ambiguity.
         views: ``test``, ``train``, ``all``, or names separated by commas.
-        refractive_index: of the surfaces; None: that of the scene.
+        refractive_index: refractive index of the surfaces; None: that of the scene.
         threshold: DoLP above which a pixel's normal is used.
 
     Returns:
@@ -93,7 +93,7 @@ def prior_pictures(view: View, run: OpenedRun | None, index: float, threshold: f
     luminance = optics.luminance(stokes)
     dolp, aolp = optics.dolp(luminance), optics.aolp(luminance)
     zenith = optics.diffuse_zenith(dolp, index)
-    guide, source = _guide(view, run, rays, luminance, index)
+    guide, source = resolving_normals(view, run, rays, luminance, index)
     mask = optics.polarization_mask(
         luminance, threshold=threshold, invalid=view.invalid, saturated=view.saturated
     )
@@ -123,7 +123,7 @@ def prior_pictures(view: View, run: OpenedRun | None, index: float, threshold: f
     }
 
 
-def _guide(
+def resolving_normals(
     view: View, run: OpenedRun | None, rays: Tensor, luminance: Tensor, index: float
 ) -> tuple[Tensor, str]:
     """Normals in camera axes that resolve the ambiguity, and where they come from."""

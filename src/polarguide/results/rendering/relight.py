@@ -99,12 +99,14 @@ def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -
         assert result.specular is not None
         assert result.reflection is not None
         assert result.normal is not None
-        seen = result.reflection
-        share = (result.specular.sum(-1) / seen.sum(-1).clamp(min=1e-6)).clamp(0, 1)[..., None].square()
+        light = result.reflection
+        share = (result.specular.sum(-1) / light.sum(-1).clamp(min=1e-6)).clamp(0, 1)[..., None].square()
         directions = mirrored(view.camera.world_rays(), unit(result.normal, 1e-3)).reshape(-1, 3)
         with torch.enable_grad():
             # The gradient of a look-up shares each pixel among the texels that it would read.
-            cubemap_lookup(sums, directions).backward(torch.cat([share * seen, share], dim=-1).reshape(-1, 4))
+            cubemap_lookup(sums, directions).backward(
+                torch.cat([share * light, share], dim=-1).reshape(-1, 4)
+            )
         advance(count)
     assert sums.grad is not None
     total, weight = sums.grad.split([3, 1], dim=-1)
@@ -196,8 +198,10 @@ def read_panorama(path: Path) -> Tensor:
     if missing or not bool((values > 0).any()):
         raise PolarguideError(
             path,
-            expected="radiance at every pixel, and light somewhere",
+            expected="a finite value at every pixel, and one above 0",
             found=f"NaN at {missing} of {values[..., 0].numel()} pixels" if missing else "no value above 0",
-            remedy="Export the panorama again, or paint the pixels.",
+            remedy="Export the panorama again."
+            if not missing
+            else "Export the panorama again, or fill these pixels.",
         )
     return values.clamp(0, 6e4)

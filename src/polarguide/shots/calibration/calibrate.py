@@ -79,7 +79,7 @@ def fit_pixels(
     Args:
         shots: linear intensities [H, W] of each shot, and whether they are saturated.
         light: Stokes vectors of the shots, [T, 3].
-        pattern: of the region.
+        pattern: pattern of the region.
     """
     moments: Any = None
     for (values, clipped), stokes in zip(shots, light, strict=True):
@@ -119,7 +119,7 @@ def plausible(vectors: Any, nominal: Any) -> NDArray[np.bool_]:
 
 
 def choose_block(
-    pixels: PixelFit, offset: tuple[int, int], pattern: Pattern, asked: int | None
+    pixels: PixelFit, offset: tuple[int, int], pattern: Pattern, specified: int | None
 ) -> BlockChoice:
     """Choose what shares a vector: single pixels where their noise is less than what their mean over a block hides."""
     around = _at_pixels(
@@ -139,8 +139,8 @@ def choose_block(
     spread = float((deviation[sound] ** 2).sum(axis=1).mean()) if sound.any() else 0.0
     scatter = max(0.0, spread - pixels.noise)
     block = BLOCK if scatter <= pixels.noise else pattern.period
-    if asked is not None:
-        block = pattern.period if asked == 1 else asked
+    if specified is not None:
+        block = pattern.period if specified == 1 else specified
     return BlockChoice(block, 2 * pixels.noise**0.5, 2 * scatter**0.5)
 
 
@@ -151,7 +151,7 @@ def shared(pixels: PixelFit, offset: tuple[int, int], block: int, pattern: Patte
 
     Args:
         pixels: the single vectors. offset: column and row of the sensor at which they start. block: side in pixels.
-        pattern: of the region.
+        pattern: pattern of the region.
 
     Returns:
         [rows, columns, P, P, 3] as in ``AnalyzerCalibration.vectors``.
@@ -181,9 +181,9 @@ def block_means(pixels: PixelFit, offset: tuple[int, int], block: int, pattern: 
         where = (y[:, None] * columns + x)[sound]
         count = np.bincount(where, minlength=rows * columns)
         sums = [np.bincount(where, part[..., k][sound], rows * columns) for k in range(3)]
-        found = np.stack(sums, axis=-1) / np.maximum(count, 1)[:, None]
-        found[count == 0] = part[sound].mean(axis=0, dtype=np.float64)
-        out[:, :, (row + offset[1]) % period, (column + offset[0]) % period] = found.reshape(rows, columns, 3)
+        means = np.stack(sums, axis=-1) / np.maximum(count, 1)[:, None]
+        means[count == 0] = part[sound].mean(axis=0, dtype=np.float64)
+        out[:, :, (row + offset[1]) % period, (column + offset[0]) % period] = means.reshape(rows, columns, 3)
     return out.astype(np.float32)
 
 
@@ -203,7 +203,7 @@ def _brightness(throughput: NDArray[np.float64], pattern: Pattern) -> NDArray[np
     It is smooth, and a plane over a cell, so that a light that is not quite uniform does not look like polarization.
 
     Args:
-        throughput: [H, W]. pattern: of the region.
+        throughput: [H, W]. pattern: pattern of the region.
     """
     left, top = pattern.cell_corner()
     height, width = ((length - cut) // 2 for length, cut in zip(throughput.shape, (top, left), strict=True))
@@ -320,19 +320,19 @@ def calibrate_sensor(
     choice = choose_block(pixels, settings.offset, files.pattern, settings.block)
     vectors = shared(pixels, settings.offset, choice.block, files.pattern)
     reference = settings.reference or ("mean" if known is None else "angles")
-    found = AnalyzerCalibration(
+    calibration = AnalyzerCalibration(
         settings.sensor, settings.lens, settings.offset, files.size, choice.block, vectors, reference,
         settings.polarizer_extinction,
     )  # fmt: skip
     make_folder(out.parent)
-    analyzers = positions(found)
-    found = replace(found, sha256=write_analyzers(out, found))
+    analyzers = positions(calibration)
+    calibration = replace(calibration, sha256=write_analyzers(out, calibration))
     picture = out.with_suffix(".png")
-    write_png(picture, calibration_picture(found, analyzers, fit, measured.means, files.pattern))
+    write_png(picture, calibration_picture(calibration, analyzers, fit, measured.means, files.pattern))
     _say_choice(choice, settings, files, defects, reporter)
-    for line in lines(found, analyzers):
+    for line in lines(calibration, analyzers):
         reporter.say(line)
-    return Calibrated(out, picture, found, analyzers, fit, choice, defects)
+    return Calibrated(out, picture, calibration, analyzers, fit, choice, defects)
 
 
 def _require_apart(out: Path, shots: Path, settings: CalibrateSettings) -> None:
@@ -354,7 +354,10 @@ def _require_apart(out: Path, shots: Path, settings: CalibrateSettings) -> None:
 def _require_new(out: Path) -> None:
     if out.suffix.lower() != SUFFIX:
         raise PolarguideError(
-            "--out", expected=f"a file name that ends in {SUFFIX}", found=out.name, remedy="Correct it."
+            "--out",
+            expected=f"a file name that ends in {SUFFIX}",
+            found=out.name,
+            remedy=f"End the name in {SUFFIX}.",
         )
     for path in (out, out.with_suffix(".png")):
         if path.exists() or path.is_symlink():
@@ -431,7 +434,8 @@ def _say_choice(
     )
     if own and choice.noise > choice.scatter:
         reporter.warn(
-            "Noise exceeds what single pixels really differ by: take more shots, or leave --block out."
+            "Pixels differ by less than their noise: a calibration of single pixels is less accurate than one of "
+            "blocks. Take more shots, or leave --block out."
         )
     if defects:
         reporter.say(

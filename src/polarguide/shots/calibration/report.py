@@ -45,7 +45,7 @@ def positions(calibration: AnalyzerCalibration) -> list[Position]:
     """The positions of a sensor, colors first, then by angle."""
     pattern = calibration.pattern
     colors = (None,) if pattern.colors is None else (0, 1, 2)
-    found = []
+    rows = []
     for color in colors:
         for angle in ANGLES:
             chosen = pattern.angles == angle
@@ -53,8 +53,8 @@ def positions(calibration: AnalyzerCalibration) -> list[Position]:
                 chosen &= pattern.colors == color
             vectors = calibration.vectors[:, :, chosen].astype(np.float64).mean(axis=2)
             name = f"{angle}" if color is None else f"{_COLORS[color]} {angle}"
-            found.append(Position(name, angle, color, *_measures(vectors, np.radians(angle))))
-    return found
+            rows.append(Position(name, angle, color, *_measures(vectors, np.radians(angle))))
+    return rows
 
 
 def _measures(vectors: Array, nominal: float) -> tuple[Array, Array, Array]:
@@ -142,7 +142,7 @@ def calibration_picture(
 
     Args:
         calibration: it. analyzers: its positions. fit: of the shots. means: of the shots by position, [T, K], and
-        pattern: of the region, to which they belong.
+        pattern: pattern of the region, to which they belong.
     """
     maps = _maps(analyzers)
     curves = _curves(calibration, analyzers, fit, means, pattern)
@@ -172,10 +172,10 @@ def _maps(analyzers: Sequence[Position]) -> Picture:
             labels.append(title if color is None else f"{'RGB'[color]}: {title}")
             footer.append(scale_bar(low, high, colormap))
             for index, angle in enumerate(ANGLES):
-                shown = next(
+                channel = next(
                     v for p, v in zip(analyzers, values, strict=True) if p.angle == angle and p.color == color
                 )
-                rows[index].append(scalar_to_rgb(torch.from_numpy(shown.copy()), low, high, colormap))
+                rows[index].append(scalar_to_rgb(torch.from_numpy(channel.copy()), low, high, colormap))
     most = 420 if len(colors) == 1 else 256
     return contact_sheet(
         rows,

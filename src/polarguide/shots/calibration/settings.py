@@ -65,14 +65,19 @@ class CalibrateSettings(MosaicOptions):
         check_options(self)
         if not self.lens.isprintable():
             found = repr(self.lens)
-            raise PolarguideError("--lens", expected="one line of text", found=found, remedy="Correct it.")
+            raise PolarguideError(
+                "--lens",
+                expected="one line of text",
+                found=found,
+                remedy="Leave control characters out.",
+            )
         period = sensor_pattern(self.sensor).period
         if self.block is not None and self.block != 1 and self.block % period:
             raise PolarguideError(
                 "--block",
-                expected=f"1, or a multiple of {period}, after which the pattern of {self.sensor} repeats",
+                expected=f"1, or a multiple of {period} pixels, the period of the pattern of {self.sensor}",
                 found=str(self.block),
-                remedy="Correct the number.",
+                remedy=f"Give for example --block {period}.",
             )
         if self.reference == "angles" and self.angles is None:
             raise PolarguideError(
@@ -92,7 +97,7 @@ class CalibrateSettings(MosaicOptions):
         """The angle of the polarizer in each file in radians, counter-clockwise as displayed; None if not given.
 
         Raises:
-            PolarguideError: they are no numbers, too few or too many, or a name ends in none.
+            PolarguideError: the angles are no numbers, too few or too many, or a name ends in none.
         """
         if self.angles is None:
             return None
@@ -112,13 +117,13 @@ class CalibrateSettings(MosaicOptions):
 
 
 def _angle_of(path: Path) -> float:
-    name, found = path.stem, _NUMBER.fullmatch(path.stem)
+    name, number = path.stem, _NUMBER.fullmatch(path.stem)
     why = ""
     if _SIGNED.fullmatch(name):
         why = ", a sign or a hyphen before the number"
-    elif found is not None and _IN_DEGREES.search(name[: found.start(1)]):
+    elif number is not None and _IN_DEGREES.search(name[: number.start(1)]):
         why = ", an angle in degrees before the last number"
-    if found is None or why:
+    if number is None or why:
         raise PolarguideError(
             path,
             expected="a name that ends in the angle of the polarizer from 0 on, after _ or a space, such as "
@@ -126,7 +131,7 @@ def _angle_of(path: Path) -> float:
             found=f"{name!r}{why}",
             remedy="Rename it (150 for -30), or list the angles: --angles 150,0,30,...",
         )
-    return float(found[1])
+    return float(number[1])
 
 
 def _numbers(text: str) -> list[float]:
@@ -136,6 +141,6 @@ def _numbers(text: str) -> list[float]:
             "--angles",
             expected="angles in degrees such as 0,15,30, or names",
             found=repr(text),
-            remedy="Correct the list.",
+            remedy="Give the angle of each file, or names if file names end in angles.",
         )
     return numbers

@@ -59,7 +59,7 @@ class Shots:
     """The files of a calibration.
 
     Attributes:
-        files: the shots of the polarizer, by name. pattern: of the region, from its top-left pixel.
+        files: the shots of the polarizer, by name. pattern: pattern of the region, from its top-left pixel.
     """
 
     def __init__(self, root: Path, settings: CalibrateSettings) -> None:
@@ -75,8 +75,8 @@ class Shots:
         self._flat = _files("--flat", settings.flat)
         self._dark = _files("--dark-frame", settings.dark_frame)
         others = {os.path.realpath(path) for path in (*self._flat, *self._dark)}
-        found = index_files(root, RAW_SUFFIXES)
-        self.files = [found[name] for name in sorted(found) if os.path.realpath(found[name]) not in others]
+        paths = index_files(root, RAW_SUFFIXES)
+        self.files = [paths[name] for name in sorted(paths) if os.path.realpath(paths[name]) not in others]
         if len(self.files) < FEWEST:
             raise PolarguideError(
                 root,
@@ -132,9 +132,9 @@ class Shots:
         if means[dim].mean() < TOO_DARK:
             raise PolarguideError(
                 files[dim],
-                expected=f"a mean of at least {TOO_DARK:.0%} of full scale",
+                expected=f"a mean intensity of at least {TOO_DARK:.0%} of full scale",
                 found=f"{means[dim].mean():.1%}",
-                remedy="Expose longer; half of full scale is a good mean.",
+                remedy="Expose longer: half of full scale is good.",
             )
         shots = len(self.files)
         return ShotMeans(levels, means[:shots], means[shots:].mean(axis=0) if self._flat else None)
@@ -142,7 +142,7 @@ class Shots:
     def linear(
         self, levels: Levels, reporter: Reporter
     ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
-        """Each shot once more: linear intensities [H, W], full scale 1, and whether a sample is saturated."""
+        """Read each shot once more: linear intensities [H, W], full scale 1, and a mask [H, W] of saturated samples."""
         with reporter.track("fitting pixels", len(self.files)) as advance:
             for number, path in enumerate(self.files, 1):
                 values = self._read(path)
@@ -180,11 +180,11 @@ class Shots:
         largest = max(int(values[-1]) for values in used)
         bits = int(np.bitwise_or.reduce(np.concatenate(used)))
         assert self._first is not None
-        asked, (path, _, kind) = self._settings, self._first
+        settings, (path, _, kind) = self._settings, self._first
         container = self._raw.container(path, np.dtype(kind))
-        black = 0.0 if self._dark else asked.black_level
+        black = 0.0 if self._dark else settings.black_level
         return estimate_levels(
-            largest, bits, container, bits=asked.bits, black=black, saturation=asked.saturation
+            largest, bits, container, bits=settings.bits, black=black, saturation=settings.saturation
         )
 
     def _too_dark(self, path: Path, values: NDArray[Any]) -> PolarguideError:
@@ -246,12 +246,12 @@ def _files(option: str, path: Path | None) -> list[Path]:
         return []
     if not path.is_dir():
         return [path]
-    found = list(index_files(path, RAW_SUFFIXES).values())
-    if not found:
+    paths = list(index_files(path, RAW_SUFFIXES).values())
+    if not paths:
         raise PolarguideError(
             f"{option} {path}",
             expected="a mosaic, or a folder of some",
             found=describe_contents(path),
             remedy="Leave it out, or give the files.",
         )
-    return found
+    return paths

@@ -49,7 +49,7 @@ class ShotFit:
     """The shots as they were.
 
     Attributes:
-        angles: of the polarizer, radians, [T]. levels: of the light behind it, [T], their mean is 1.
+        angles: angles of the polarizer, radians, [T]. levels: levels of the light behind it, [T], their mean is 1.
         vectors: analyzer vectors of the positions, [K, 3], in the unit of the means.
         misfit: root mean square deviation of the means from the fit, as a share of their mean.
         zero: mean deviation of the positions from their nominal angles before the reference was chosen, radians.
@@ -81,17 +81,17 @@ def solve_shots(
     """Estimate the shots.
 
     Args:
-        means: of each shot by position, [T, K]. nominal: angles of the positions by their names, radians, [K].
+        means: means of each shot by position, [T, K]. nominal: angles of the positions by their names, radians, [K].
         known: angles of the polarizer, radians, [T]; None to estimate them.
         flat: means of the flat field, [K], or None.
-        diattenuation: of the polarizer, (E - 1) / (E + 1) for the extinction ratio E.
+        diattenuation: diattenuation of the polarizer, (E - 1) / (E + 1) for the extinction ratio E.
         to_mean: whether the mean deviation of the positions from their nominal angles is the zero of all angles.
-        files: of the shots, for messages.
+        files: files of the shots, for messages.
 
     Raises:
         PolarguideError: the shots are not of a polarizer, not at different angles, contradict the angles given, ...
     """
-    start = _seen(means, nominal)
+    start = _pixel_stokes(means, nominal)
     folder = files[0].parent
     for path, stokes in zip(files, start, strict=True):
         dolp = float(np.hypot(stokes[1], stokes[2]) / stokes[0])
@@ -103,7 +103,7 @@ def solve_shots(
                 remedy="Take it through the polarizer, and the --flat without it. Check --sensor and offsets.",
             )
     if flat is not None:
-        s0, s1, s2 = _seen(flat[None], nominal)[0]
+        s0, s1, s2 = _pixel_stokes(flat[None], nominal)[0]
         if np.hypot(s1, s2) > FLAT_POLARIZED * s0:
             raise PolarguideError(
                 "--flat",
@@ -167,7 +167,7 @@ def _stokes(angles: Array, levels: Array, diattenuation: float) -> Array:
     return levels[:, None] * np.stack([one, *polarized], axis=1)
 
 
-def _seen(means: Array, nominal: Array) -> Array:
+def _pixel_stokes(means: Array, nominal: Array) -> Array:
     """Stokes vectors as a sensor with ideal analyzers would see them, [T, 3]; colors are brought to one level."""
     unit = np.eye(3)
     ideal = np.stack([malus(unit[:, k], nominal) for k in range(3)], axis=1)
@@ -220,8 +220,8 @@ def _refined(
     if free_levels:
         begin = np.append(begin, np.log(levels_at_first[1:] / levels_at_first[0]))
     if len(begin):
-        found: Any = least_squares(deviations, begin, xtol=1e-12, ftol=1e-14, gtol=1e-14, max_nfev=500)
-        begin = found.x
+        solution: Any = least_squares(deviations, begin, xtol=1e-12, ftol=1e-14, gtol=1e-14, max_nfev=500)
+        begin = solution.x
     angles, levels = unpacked(begin)
     return angles, levels[:count]
 
@@ -268,7 +268,7 @@ def _require_match(known: Array, apparent: Array, folder: Path, to_mean: bool) -
             "--angles",
             expected="angles from the image's horizontal, counter-clockwise as displayed",
             found=f"a zero that lies {-np.degrees(zero):+.1f} degrees off what the sensor in {folder} sees",
-            remedy="Correct them, or give --reference mean: the sensor's own mean is then the zero.",
+            remedy="Give angles from the horizontal, or --reference mean: the sensor's own mean is then the zero.",
         )
 
 

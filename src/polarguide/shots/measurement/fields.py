@@ -25,7 +25,7 @@ class Field:
 
     Attributes:
         key: its name.
-        unit: of its numbers; empty where it has none.
+        unit: unit of its numbers; empty where it has none.
         about: what it says.
         bounded: whether a limits file may bound it.
     """
@@ -139,20 +139,23 @@ def read_limits(path: Path, regions: Collection[str], *, reference: bool) -> Lim
         regions: names that may occur in it. reference: whether shots are compared with one.
 
     Raises:
-        PolarguideError: it cannot be read, names a field or a region that there is not, or bounds nothing.
+        PolarguideError: the file cannot be read, names an unknown field or region, or bounds nothing.
     """
-    found = read_record(path, Limits, remedy=_REMEDY)
-    if found.format != 1:
-        raise _wrong(path, "format", "1", str(found.format))
-    for region in found.regions:
+    limits = read_record(path, Limits, remedy=_REMEDY)
+    if limits.format != 1:
+        raise _wrong(path, "format", "1", str(limits.format))
+    for region in limits.regions:
         if region not in regions:
             raise _wrong(path, "regions", f"a region of --roi: {', '.join(regions)}", region)
-    for place, bounds in (("limits", found.limits), *((f"regions.{r}", b) for r, b in found.regions.items())):
+    for place, bounds in (
+        ("limits", limits.limits),
+        *((f"regions.{r}", b) for r, b in limits.regions.items()),
+    ):
         for field, bound in bounds.items():
             _check(path, f"{place}.{field}", field, bound, reference)
-    if not any((found.limits, *found.regions.values())):
+    if not any((limits.limits, *limits.regions.values())):
         raise _wrong(path, "limits", "a bound of at least one field", "none")
-    return found
+    return limits
 
 
 def _check(path: Path, place: str, field: str, bound: Bound, reference: bool) -> None:
@@ -162,9 +165,9 @@ def _check(path: Path, place: str, field: str, bound: Bound, reference: bool) ->
     if field in COMPARED and not reference:
         raise PolarguideError(
             f"{path} ({place})",
-            expected="a reference that shots are compared with",
+            expected="a golden part, because this field limits the difference from it",
             found="none",
-            remedy="Give --reference, or remove the field.",
+            remedy="Give the golden part with --reference, or remove the field.",
         )
     if bound.min is None and bound.max is None:
         raise _wrong(path, place, "min, max or both", "neither")

@@ -96,7 +96,7 @@ class Measurer:
         """The maps of a shot: of the whole picture if ``whole`` or with a reference, else at least of the regions.
 
         Raises:
-            PolarguideError, OSError, MemoryError: it cannot be read.
+            PolarguideError, OSError, MemoryError: the shot cannot be read.
         """
         return read_shot(shot, self._reading, part=None if whole else self._part)
 
@@ -104,17 +104,17 @@ class Measurer:
         """The figures of its maps.
 
         Raises:
-            PolarguideError: it does not fit the regions or the reference.
+            PolarguideError: the shot does not fit the regions or the reference.
         """
         regions = placed(self._regions, maps.whole or maps.size, shot.where)
         differences = None if self.reference is None else self.reference.differences(maps)
-        found = [self._region(maps, region, differences) for region in regions]
-        statuses = [str(figures["status"]) for _, figures, _ in found]
+        measured = [self._region(maps, region, differences) for region in regions]
+        statuses = [str(figures["status"]) for _, figures, _ in measured]
         status: Status = (
             "beyond" if "beyond" in statuses else "within" if "within" in statuses else "measured"
         )
-        beyond = [(region, which) for region, _, which in found] if status == "beyond" else []
-        return MeasuredShot(maps, differences, tuple(figures for _, figures, _ in found), status, beyond)
+        beyond = [(region, which) for region, _, which in measured] if status == "beyond" else []
+        return MeasuredShot(maps, differences, tuple(figures for _, figures, _ in measured), status, beyond)
 
     def entry(self, shot: ExposureSet) -> Entry:
         """The line of a shot, which says why where it cannot be measured."""
@@ -193,7 +193,7 @@ class Outcome:
     """The outcome of a command.
 
     Attributes:
-        folder: of the table; None where nothing was written.
+        folder: folder of the table; None where nothing was written.
         counts: shots by status. Of ``measure_shots`` these are all it was given, those included that were in the table
             before; of ``watch_folder`` those that came while it watched.
         earlier: how many were in the table before; 0 of ``watch_folder``.
@@ -254,7 +254,7 @@ class Line:
 
         Raises:
             ChangedWhileRead: they have become others meanwhile; nothing was written.
-            PolarguideError, OSError, MemoryError: it cannot be read, or does not fit the regions or the reference.
+            PolarguideError, OSError, MemoryError: the shot cannot be read, or does not fit regions or reference.
         """
         maps = self.measurer.read(shot)
         if stamps(shot.paths) != files:
@@ -396,8 +396,8 @@ def _shots_of(
         raise PolarguideError("paths", expected="files, or arrays", found="both, or neither", remedy=remedy)
     if out is not None:
         require_elsewhere(files, Path(out))
-    found = find_shots(files, reading)
-    return found, len(found)
+    shots = find_shots(files, reading)
+    return shots, len(shots)
 
 
 def _array_set(shot: Source, number: int, reading: ShotOptions, angles: Sequence[Angle]) -> ExposureSet:

@@ -21,18 +21,18 @@ _NOT_COMPARED = 110
 _BAR = 256
 
 
-def regions_picture(maps: ShotMaps, found: Sequence[tuple[Region, Sequence[str]]]) -> Picture:
+def regions_picture(maps: ShotMaps, regions: Sequence[tuple[Region, Sequence[str]]]) -> Picture:
     """The photograph of a shot with its regions, those beyond their limits in red, and below what is beyond.
 
     Args:
-        maps: the shot. found: its regions, and for each the limits that it is beyond, in words.
+        maps: the shot. regions: its regions, and for each the limits that it is beyond, in words.
 
     Returns:
         uint8 RGB, 640 to 1600 pixels wide where the shot does not force more.
     """
     photograph, scale = _photograph(maps)
     thick = max(1, round(photograph.shape[1] / 500))
-    for region, beyond in sorted(found, key=lambda pair: bool(pair[1])):
+    for region, beyond in sorted(regions, key=lambda pair: bool(pair[1])):
         color, width = _BEYOND if beyond else _WITHIN, 2 * thick if beyond else thick
         right, low = region.width, region.height
         corners = region.corners or ((0, 0), (right, 0), (right, low), (0, low))
@@ -45,7 +45,7 @@ def regions_picture(maps: ShotMaps, found: Sequence[tuple[Region, Sequence[str]]
         _name(photograph, region.name, left, top, color)
     lines = [
         (f"{maps.name}: photograph (S0 / 2), red: beyond a limit", INK),
-        *((f"{region.name}: {', '.join(beyond)}", (176, 0, 0)) for region, beyond in found if beyond),
+        *((f"{region.name}: {', '.join(beyond)}", (176, 0, 0)) for region, beyond in regions if beyond),
     ]
     wrapped = [(part, color) for line, color in lines for part in _wrapped(line, photograph.shape[1] - 16)]
     strip: Picture = np.full((LINE_HEIGHT * len(wrapped) + 8, photograph.shape[1], 3), 255, np.uint8)
@@ -112,8 +112,8 @@ def difference_picture(differences: Differences, shot: str, reference: str) -> P
     return sheet
 
 
-def _short(name: str, most: int = 24) -> str:
-    return name if len(name) <= most else f"{name[: most - 3]}..."
+def _short(name: str) -> str:
+    return name if len(name) <= 24 else f"{name[:21]}..."
 
 
 def diverging(values: Map, most: float) -> Picture:

@@ -40,8 +40,8 @@ class Region:
     """A rectangle of pixels, its top-left corner included, ``x + width`` and ``y + height`` not; or a polygon in it.
 
     Attributes:
-        name, x, y, width, height: of the rectangle.
-        corners: of the polygon, relative to the rectangle's top-left corner; none: the rectangle itself.
+        name, x, y, width, height: those of the rectangle.
+        corners: corners of the polygon, relative to the rectangle's top-left corner; none: the rectangle itself.
     """
 
     name: str
@@ -87,18 +87,18 @@ def parse_regions(texts: Sequence[str]) -> tuple[Region, ...]:
     Raises:
         PolarguideError: one has another form or no pixel, or two have one name.
     """
-    found: dict[str, Region] = {}
+    regions: dict[str, Region] = {}
     for number, text in enumerate(texts, 1):
         region = _parse(text, number)
-        if region.name in found:
+        if region.name in regions:
             raise PolarguideError(
                 "--roi",
                 expected="one region of each name",
                 found=f"{region.name} twice",
                 remedy="Rename one of them.",
             )
-        found[region.name] = region
-    return tuple(found.values())
+        regions[region.name] = region
+    return tuple(regions.values())
 
 
 def _parse(text: str, number: int) -> Region:
@@ -132,7 +132,7 @@ def _wrong(expected: str, found: str) -> PolarguideError:
         "--roi",
         expected=expected,
         found=found if len(found) <= 100 else f"{found[:100]}...",
-        remedy="Correct the region.",
+        remedy="Write a region as --roi NAME=X,Y,WIDTH,HEIGHT, in pixels.",
     )
 
 
@@ -149,7 +149,7 @@ def placed(regions: Sequence[Region], size: tuple[int, int], where: Path | str) 
                 where,
                 expected=f"the region {region.name} within {width}x{height} pixels",
                 found=f"{region.x},{region.y},{region.width},{region.height}",
-                remedy="Correct --roi; it counts pixels of the developed picture.",
+                remedy="Make the region smaller, or move it; --roi counts pixels of the developed picture.",
             )
     return tuple(regions) or (Region(WHOLE, 0, 0, width, height),)
 
@@ -218,15 +218,15 @@ def _error_of_mean(maps: ShotMaps, deviations: Floats) -> float | None:
     if not deviations.size:
         return None
     shared = 1.0 if maps.mean_variance is None else maps.mean_variance / maps.pixel_variance
-    found = math.sqrt(shared * float(np.square(deviations, dtype=np.float64).mean()) / deviations.size)
-    return found if math.isfinite(found) else None
+    error = math.sqrt(shared * float(np.square(deviations, dtype=np.float64).mean()) / deviations.size)
+    return error if math.isfinite(error) else None
 
 
 def _distribution(key: str, values: Floats, error: float | None) -> dict[str, Value]:
     names = (f"{key}_mean", f"{key}_error", f"{key}_deviation", *(f"{key}_p{p}" for p in PERCENTILES))
     if not values.size:
         return dict.fromkeys(names)
-    mean, deviation = (float(found[0, 0]) for found in cv2.meanStdDev(values))  # one pass, in float64
+    mean, deviation = (float(moment[0, 0]) for moment in cv2.meanStdDev(values))  # one pass, in float64
     return dict(
         zip(names, (mean, error, deviation, *map(float, np.percentile(values, PERCENTILES))), strict=True)
     )
@@ -289,7 +289,7 @@ class Reference:
             options: as for the shots that it is compared with.
 
         Raises:
-            PolarguideError: it is not one shot, or cannot be read.
+            PolarguideError: the path is not one shot, or cannot be read.
         """
         shot = _reference_shot(path, options)
         return cls(shot, read_shot(shot, options))

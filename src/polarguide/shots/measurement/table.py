@@ -162,7 +162,7 @@ class Table:
         """Write the lines of a shot; when this returns, they are on disk.
 
         Raises:
-            PolarguideError: they cannot be written, for example because the disk is full, or the table was removed.
+            PolarguideError: the lines cannot be written, as on a full disk, or the table was removed.
         """
         self.require_there()
         lines, rows = self._files

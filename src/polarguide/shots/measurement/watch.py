@@ -58,7 +58,7 @@ class _Folder:
     def shots(self) -> list[ExposureSet]:
         """The shots that are there, the oldest first; of those of several files, parts, too."""
         try:
-            found = (
+            shots = (
                 self._mosaics() if self.reading.sensor is not None else list_shots([self.root], self.reading)
             )
         except PolarguideError as error:  # perhaps only the first of four folders is there: this may pass
@@ -71,7 +71,7 @@ class _Folder:
             )
             return []
         self._trouble = ("", 0.0)
-        return [shot for shot in found if not any(os.path.realpath(p) in self.ignored for p in shot.paths)]
+        return [shot for shot in shots if not any(os.path.realpath(p) in self.ignored for p in shot.paths)]
 
     def _mosaics(self) -> list[ExposureSet]:
         with os.scandir(self.root) as entries:

@@ -41,8 +41,8 @@ class Judgment:
         view, number: the view, and the place of the picture among its exposures.
         specified: what the capture says. believed: what the training goes by.
         angle: the mean of the fits that tell one, or else of those that guess one, degrees.
-        gain, modulation, spread, doubt, misfit, misfit_across: of the last of these, see ``FittedAngle``.
-        scatter: of the angles about their mean, degrees; 90 where less than half of the fits have one.
+        gain, modulation, spread, doubt, misfit, misfit_across: those of the last of these, see ``FittedAngle``.
+        scatter: scatter of the angles about their mean, degrees; 90 where less than half of the fits have one.
         usual: median of what the telling pictures of the same fit are ``off``: how well the model predicts any.
         unexplained: misfit of the last of all fits over the median of all pictures, times that over the misfit across:
             large where the picture is explained worse than others are, and hardly better than by a turned polarizer.

@@ -61,7 +61,7 @@ class AngleTrainer:
         """Make the trainer of the search that is next, or of the training once all angles are found.
 
         Args:
-            state: that it goes on from; None: from the beginning. table: of all fits so far.
+            state: that it goes on from; None: from the beginning. table: table of all fits so far.
         """
         settings, search = self.settings, search_steps(self.recipe, self.settings)
         self.polarizers = Polarizers(self.scene, self.recipe, settings.steps, table, search)

@@ -190,7 +190,7 @@ def index_offsets(
     lists, or nothing, and of metals.
 
     Args:
-        indices: by the number in ``View.materials``. refractive_index: of the run.
+        indices: by the number in ``View.materials``. refractive_index: refractive index of the run.
     """
     means = gaussians["means"].detach()
     labels = {view.name: numbers_in(view) for view in views}

@@ -115,16 +115,16 @@ def bake(
                 total[part].index_add_(0, rows, weight[:, None] * sampled[0, :, 0].T)
                 weights[part].index_add_(0, rows, weight)
             progress(count)
-    seen = (weights > SEEN).numpy()
-    nearest = _nearest_seen(places, seen)
+    visible = (weights > SEEN).numpy()
+    nearest = _nearest_seen(places, visible)
     total /= weights.clamp(min=1e-6)[:, None]
     values = total.numpy()
-    values[~seen] = values[nearest]
+    values[~visible] = values[nearest]
     parts = np.split(values, np.cumsum([*CHANNELS.values()])[:-1], axis=1)
     named = {
         name: part if CHANNELS[name] == 3 else part[:, 0] for name, part in zip(CHANNELS, parts, strict=True)
     }
-    return Baked(**named, seen=seen, nearest=nearest)
+    return Baked(**named, seen=visible, nearest=nearest)
 
 
 def _layers(model: GaussianModel, result: RenderResult, view: View, color: ColorSource) -> dict[str, Tensor]:
@@ -191,14 +191,14 @@ def _visible(
     cosine = cosine[rows]
     # Half a pixel beside it, an inclined surface has another depth, too.
     tolerance = (NEAR * voxel + 0.5 * z / camera.fx) / cosine.clamp(min=0.3)
-    seen = (surface > 0) & ((surface - z).abs() < tolerance)
+    visible = (surface > 0) & ((surface - z).abs() < tolerance)
     places = torch.stack((2 * column / camera.width - 1, 2 * row / camera.height - 1), dim=-1)
-    return rows[seen], cosine[seen].square(), places[seen]
+    return rows[visible], cosine[visible].square(), places[visible]
 
 
-def _nearest_seen(places: NDArray[np.float32], seen: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _nearest_seen(places: NDArray[np.float32], visible: NDArray[np.bool_]) -> NDArray[np.int64]:
     """For each texel that no view shows the nearest that one does, about; itself where none is."""
-    known, unseen = seen.nonzero()[0], (~seen).nonzero()[0]
+    known, unseen = visible.nonzero()[0], (~visible).nonzero()[0]
     if not len(known) or not len(unseen):
         return unseen
     known = known[:: -(-len(known) // _FILLED_FROM)]

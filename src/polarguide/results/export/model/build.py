@@ -57,7 +57,7 @@ def require_room(texture: int) -> None:
     """Check that a texture of so many texels along its side fits into memory.
 
     Raises:
-        PolarguideError: it does not.
+        PolarguideError: the texture does not fit.
     """
     needed, free = BYTES_PER_TEXEL * texture**2, free_memory()
     if free is not None and needed > free:
@@ -75,7 +75,7 @@ class Charted:
 
     Attributes:
         mesh: with colors of the diffuse layer. inside: what belongs to it. voxel: side of those it was fused in.
-        unwrapped: the mesh, split along the borders of charts. texels: of the texture.
+        unwrapped: the mesh, split along the borders of charts. texels: places of the texture's texels.
     """
 
     mesh: ColoredMesh
@@ -98,7 +98,7 @@ def charted_subject(
 
     Args:
         run: of Gaussians; its scene is read. surface_view: renders a view of what lies in the crop box.
-        presentation: how it is presented. options: of the model. resolution: voxels along its longest side.
+        presentation: how it is presented. options: options of the model. resolution: voxels along its longest side.
         folder: for temporary files. reporter: receives progress, counts and warnings.
 
     Raises:
@@ -130,7 +130,7 @@ def textured_model(
 
     Args:
         run: of Gaussians; its scene is read. subject: its surface. presentation, placement: how it is presented.
-        options: of the model. reporter: receives progress and counts.
+        options: options of the model. reporter: receives progress and counts.
     """
     mesh, unwrapped, texels = subject.mesh, subject.unwrapped, subject.texels
     kind = options.resolved_base_color
@@ -167,11 +167,11 @@ def _presented(
     reflectance of metals in it. Radiance and irradiance get the color of the presentation before they are divided.
     """
     metal = colored_reflectance(torch.from_numpy(baked.reflectance), color).numpy()
-    shown = colored(torch.from_numpy(baked.color), color).numpy()
+    colors = colored(torch.from_numpy(baked.color), color).numpy()
     if light is not None:
-        shown = delit(shown, colored(torch.from_numpy(light), color).numpy(), index)
-        shown = _within_white(baked.filled(shown), baked, reporter)
-    return shown, replace(baked, reflectance=metal)
+        colors = delit(colors, colored(torch.from_numpy(light), color).numpy(), index)
+        colors = _within_white(baked.filled(colors), baked, reporter)
+    return colors, replace(baked, reflectance=metal)
 
 
 def _within_white(color: NDArray[np.float32], baked: Baked, reporter: Reporter) -> NDArray[np.float32]:
@@ -238,8 +238,8 @@ def _arriving(
         texels = mirrored_light(run, cubemap, progress)
 
     def radiance(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        found = cubemap.radiance(cubemap_lookup(texels, torch.from_numpy(directions).float()))
-        return np.asarray(found.double().numpy())
+        light = cubemap.radiance(cubemap_lookup(texels, torch.from_numpy(directions).float()))
+        return np.asarray(light.double().numpy())
 
     around = Surroundings(radiance, mesh if inside is None else _joined(mesh, _outside(run, inside)))
     surface = mesh.surface
@@ -252,8 +252,8 @@ def _outside(run: OpenedRun, inside: Inside) -> ColoredMesh:
     surface, views, box = fused_surface(run.cameras, run.result, resolution=SURROUNDINGS_RESOLUTION)
     mesh = painted(surface, views, box)
     faces = surface.faces[~inside(surface.vertices)[surface.faces].any(axis=1)]
-    kept, used = mesh.surface.with_faces(faces)
-    return ColoredMesh(kept, mesh.colors[used])
+    outside, used = mesh.surface.with_faces(faces)
+    return ColoredMesh(outside, mesh.colors[used])
 
 
 def _joined(first: ColoredMesh, second: ColoredMesh) -> ColoredMesh:

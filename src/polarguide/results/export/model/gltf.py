@@ -67,7 +67,7 @@ def write_glb(path: Path, model: Textured, asset: dict[str, Any], *, jpeg: bool)
         jpeg: whether base color, roughness and metalness are JPEG; else PNG.
 
     Raises:
-        PolarguideError: it cannot be written.
+        PolarguideError: the file cannot be written.
     """
     images, material, extensions = _material(model, jpeg=jpeg)
     binary = Binary()

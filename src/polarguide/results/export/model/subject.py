@@ -52,10 +52,10 @@ def subject_of(run: OpenedRun, crop: Crop | None, *, masked: bool) -> Inside | N
             assert view.mask is not None
             pixel, _, in_picture = seen_at(points - view.camera.center, view.camera)
             votes += in_picture * torch.where(view.mask.cpu()[pixel], 1.0, -1.0)
-        kept = votes > 0 if views else torch.ones(len(points), dtype=torch.bool)
+        mask = votes > 0 if views else torch.ones(len(points), dtype=torch.bool)
         if crop is not None:
-            kept &= crop.inside(points, run.camera_frame)
-        return np.asarray(kept.numpy())
+            mask &= crop.inside(points, run.camera_frame)
+        return np.asarray(mask.numpy())
 
     return inside
 
@@ -91,7 +91,7 @@ def write_stl(path: Path, vertices: Places, faces: NDArray[np.int64], words: str
         path: the file. vertices: [V, 3] as the file has them. faces: [F, 3]. words: for its head, of which 80 are kept.
 
     Raises:
-        PolarguideError: it cannot be written.
+        PolarguideError: the file cannot be written.
     """
     table = np.zeros(len(faces), _TRIANGLE)
     table["corners"] = vertices[faces]

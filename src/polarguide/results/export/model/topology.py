@@ -123,13 +123,13 @@ def consistent(vertices: Places, faces: Faces) -> Faces:
     # An edge fits where it has one face on each side.
     misfits = ((count[edge] != 1) | (both[either] != 2)).reshape(-1, 3).sum(axis=1)
     rival = (count[edge] > 1).reshape(-1, 3).any(axis=1)
-    kept, taken = [faces[~rival]], set(_keys(_directed(faces[~rival])).tolist())
+    oriented, taken = [faces[~rival]], set(_keys(_directed(faces[~rival])).tolist())
     contested = faces[rival][np.lexsort((-area[rival], misfits[rival]))]
     for face, keys in zip(contested, _keys(_directed(contested)).reshape(-1, 3).tolist(), strict=True):
         if taken.isdisjoint(keys):
             taken.update(keys)
-            kept.append(face[None])
-    return np.concatenate(kept)
+            oriented.append(face[None])
+    return np.concatenate(oriented)
 
 
 def _closed(vertices: Places, faces: Faces, largest: float) -> tuple[Places, Faces]:
