@@ -193,7 +193,7 @@ def draw_constants(scenes: Mapping[str, Mapping[str, Mapping[str, float]]]) -> N
             share
             for scene, at in scenes.items()
             for name, share in at[setting].items()
-            if name not in METALS[scene]
+            if name not in METALS.get(scene, ())
         )
         for setting in settings
     ]
