@@ -151,6 +151,22 @@ def test_the_point_cloud_says_what_metals_are(tmp_path: Path) -> None:
     assert not torch.equal(after[~metal], shown[~metal])
 
 
+def test_a_soft_metal_is_shown_as_a_mixture_of_both() -> None:
+    """Before the last look: its color between those of a dielectric and of a metal, and its diffuse layer."""
+    values, rays = gaussians(metals=COUNT), torch.nn.functional.normalize(torch.randn(COUNT, 3), dim=1)
+    values = {name: value.float() for name, value in values.items()}
+    normals = -rays
+    colors, diffuse = [], []
+    for metalness in (0.0, 0.25, 1.0):
+        values["metalness"] = torch.full((COUNT,), metalness)
+        values["metalness"][0] = 1.0  # one is a metal in all three
+        colors.append(SHADING.colors(values, light(), rays, normals))
+        diffuse.append(rendered(SHADING, values).diffuse)
+    torch.testing.assert_close(colors[1], 0.75 * colors[0] + 0.25 * colors[2])
+    torch.testing.assert_close(diffuse[1], 0.75 * diffuse[0] + 0.25 * diffuse[2], rtol=1e-3, atol=1e-5)
+    assert not torch.allclose(colors[0][1:], colors[2][1:])
+
+
 def test_polarization_of_a_metal_is_that_of_a_conductor() -> None:
     result = rendered(SHADING, gaussians(metals=COUNT))
     stokes = SHADING.predicted_stokes(result, camera()).flatten(1, 2)[:, result.metal.pixels]

@@ -136,10 +136,10 @@ def report_metals(out: Path, trainer: AngleTrainer, model: GaussianModel, report
     ]
     labels = ["photograph", "metal", "undecided"]
     write_png(out / METALS_PICTURE, contact_sheet(rows, [view.name for view in views], labels))
-    advice = "click on what is metal in the viewer (Materials) and resume" if open_ else ""
+    advice = ". Click on what is metal in the viewer (Materials), and resume" if open_ else ""
     reporter.say(
-        f"metals: {metal:.1f} % of the pixels; undecided, as polarization cannot tell: {open_:.1f} %"
-        f"{advice and f'; {advice}'}: {out / METALS_PICTURE}"
+        f"metals: {metal:.1f} % of the pixels; undecided, as polarization cannot tell: {open_:.1f} %, see "
+        f"{out / METALS_PICTURE}{advice}"
     )
 
 
