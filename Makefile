@@ -3,6 +3,7 @@
 #                 check the files of those that are finished, and print a SHA-256 of each
 # make test    linter, formatter, spelling, types and tests, on the package as it is installed;
 #                 its last lines say what was skipped, and how to change that
+# make test-kernels    the tests once with each variant of the kernels that this processor can run; three times as long
 # make fuzz N=20    all tables of tests/robustness, random cases with N seeds; prints what failed, and how to repeat it
 # make soak N=300    kill commands N times at random moments, go on, and compare the files
 # make sanitize    the kernels' tests with AddressSanitizer and UndefinedBehaviorSanitizer, the thread pool with ThreadSanitizer
@@ -30,7 +31,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 SOURCES := pyproject.toml constraints-cpu.txt CMakeLists.txt README.md LICENSE \
 	$(shell find native src -name __pycache__ -prune -o -name '*.so' -o -print)
 
-.PHONY: demo dataset test fuzz soak sanitize speed wheel docs cross-check gpu-check gpu-pack clean
+.PHONY: demo dataset test test-kernels fuzz soak sanitize speed wheel docs cross-check gpu-check gpu-pack clean
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
 
@@ -48,6 +49,12 @@ test: $(VENV)/.installed-test $(READERS)
 	$(BIN)/codespell
 	$(BIN)/mypy
 	$(BIN)/python -m pytest $(PYTEST)
+
+# Rounding differs between the variants, and a test must not depend on the processor of a machine.
+test-kernels: $(VENV)/.installed-test $(READERS)
+	set -e; for variant in $$(PYTHONPATH=tests/helpers $(BIN)/python -c \
+		'from instruction_sets import instruction_sets; print(*instruction_sets())'); do \
+		echo "Kernels: $$variant"; POLARGUIDE_SIMD=$$variant $(BIN)/python -m pytest $(PYTEST); done
 
 N ?= 20
 

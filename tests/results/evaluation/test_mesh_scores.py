@@ -115,7 +115,7 @@ def test_distances_agree_with_another_package() -> None:
     points = np.concatenate([measured.true_points(view)[0] for view in known])[::37]
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     _, distance, _ = trimesh.proximity.closest_point_naive(mesh, points[:200])
-    samples = measured._sampled(surface, np.ones(len(surface.vertices), bool), 0.002 * diagonal())
+    samples, _ = measured._sampled(surface, np.ones(len(surface.vertices), bool), 0.002 * diagonal())
     got = measured._distances(points[:200], samples, 1.0)
     np.testing.assert_allclose(got, distance, atol=0.003 * diagonal())
     assert np.abs(got - distance).mean() < 0.001 * diagonal()

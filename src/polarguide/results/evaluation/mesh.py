@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from polarguide.capture import View
-from polarguide.core.errors import PolarguideError, optional_import, require_package
+from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.options import EXPORT_PACKAGES
 from polarguide.geometry.camera import seen_at
 from polarguide.results.evaluation.table import MESH_LABEL
@@ -25,8 +24,9 @@ THRESHOLDS = {"05": 0.005, "1": 0.01}
 BEHIND = 0.02
 """A point this share of the diagonal behind the true surface is hidden by it."""
 SPACING = 0.002
-"""Of the points that stand for the mesh, as a share of the diagonal."""
+"""Distance of the points that stand for the mesh, as a share of the diagonal."""
 MOST_POINTS = 1_000_000
+"""Faces are not divided further when this many points stand for the mesh."""
 TRUE_SPACING = 0.0025
 """Largest distance of neighboring true points on surfaces that face the camera, as a share of the diagonal."""
 FINEST = 6
@@ -82,14 +82,16 @@ def surface_scores(surface: Surface, views: Sequence[View]) -> dict[str, float]:
     front, whole = (np.concatenate(parts) for parts in zip(*points, strict=True))
     inside = ((surface.vertices > low - reach) & (surface.vertices < high + reach)).all(axis=1)
     used = inside | judged(surface.vertices, views, reach)
-    samples = _sampled(surface, used, SPACING * diagonal)
-    counted = samples[judged(samples, views, reach)]
+    samples, areas = _sampled(surface, used, SPACING * diagonal)
+    counted = judged(samples, views, reach)
+    judged_area = float(areas[counted].sum())
     scores: dict[str, float] = {}
     farthest = 1.01 * max(THRESHOLDS.values()) * diagonal
-    to_true = _distances(counted, whole, farthest)
+    to_true = _distances(samples[counted], whole, farthest)
     to_mesh = _distances(front, samples, farthest)
     for end, share in THRESHOLDS.items():
-        accuracy = float((to_true <= share * diagonal).mean()) if len(to_true) else 0.0
+        right = to_true <= share * diagonal
+        accuracy = float(areas[counted][right].sum()) / judged_area if judged_area else 0.0
         completeness = float((to_mesh <= share * diagonal).mean())
         both = accuracy + completeness
         scores[f"mesh_accuracy_{end}"] = accuracy
@@ -158,16 +160,35 @@ def _known(view: View) -> tuple[Tensor, Tensor, Tensor]:
     return truth.depth.double(), whole if truth.mask is None else whole & truth.mask, whole
 
 
-def _sampled(surface: Surface, used: NDArray[np.bool_], spacing: float) -> Points:
-    """Points [N, 3], spread evenly, on the faces of which some vertex is used."""
-    trimesh: Any = optional_import("trimesh", "a mesh")
-    faces = surface.faces[used[surface.faces].any(axis=1)]
-    if not len(faces):
-        return np.zeros((0, 3))
-    mesh = trimesh.Trimesh(surface.vertices, faces, process=False, validate=False)
-    count = int(np.clip(mesh.area / spacing**2, 1, MOST_POINTS))
-    points, _ = trimesh.sample.sample_surface(mesh, count, seed=0)
-    return np.asarray(points, np.float64)
+def _sampled(surface: Surface, used: NDArray[np.bool_], spacing: float) -> tuple[Points, NDArray[np.float64]]:
+    """Points [N, 3] on the faces of which some vertex is used, and the area [N] that each point stands for.
+
+    Every face is divided on its own into equal triangles with sides of about ``spacing``, and the points are their
+    centers. A rounding error of one vertex therefore moves the points of its own faces only.
+    """
+    corners = surface.vertices[surface.faces[used[surface.faces].any(axis=1)]]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(across, axis=1) / 2
+    spacing = max(spacing, float(np.sqrt(area.sum() / MOST_POINTS)))
+    divisions = np.maximum(np.rint(np.sqrt(area) / spacing), 1).astype(int)
+    points = [np.zeros((0, 3))]
+    areas = [np.zeros(0)]
+    for n in np.unique(divisions):
+        chosen = divisions == n
+        centers = _centers(int(n))
+        points.append((centers @ corners[chosen]).reshape(-1, 3))
+        areas.append(np.repeat(area[chosen] / len(centers), len(centers)))
+    return np.concatenate(points), np.concatenate(areas)
+
+
+def _centers(n: int) -> Points:
+    """Barycentric coordinates [n * n, 3] of the centers of the triangles that divide a side into ``n`` parts."""
+    first, second = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    upright = first + second < n
+    turned = first + second < n - 1
+    u = np.concatenate((first[upright] + 1 / 3, first[turned] + 2 / 3)) / n
+    v = np.concatenate((second[upright] + 1 / 3, second[turned] + 2 / 3)) / n
+    return np.stack((1 - u - v, u, v), axis=1)
 
 
 def _distances(points: Points, others: Points, farthest: float) -> Points:
