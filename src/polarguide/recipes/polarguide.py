@@ -115,28 +115,30 @@ RECIPE_POLARGUIDE_STOKES: Recipe = replace(
     shading=SHADING_STOKES,
 )
 
-RECIPE_POLARGUIDE_PAPER: Recipe = replace(
-    RECIPE_POLARGUIDE,
-    name="polarguide-paper",
-    about="PolarGuide-GSDR to the letter: its four candidates and its separation cue; its kind reading is :kind.",
-    stages=_stages(
-        Weights(specular=0.5, diffuse=0.2, normal=0.2),
-        Weights(normal=0.2),
-        hold_normals=False,
-        behind=None,
-    ),
-    densification=RECIPE_3DGS_DR.densification,
-    priors=Priors(candidates="paper", separation="paper", azimuth_weight=0.0),
+_PAPER = Priors(
+    candidates="paper",
+    live=True,
+    separation="paper",
+    threshold=0.1,
+    full_dolp=1e-6,  # a pixel counts fully or not at all
+    azimuth_weight=0.0,
 )
+_PAPER_NORMAL = 0.02
+_PAPER_SPECULAR = 0.1
+_PAPER_DIFFUSE = 0.05
 
 
-def _kind_stages() -> tuple[Stage, ...]:
-    """3DGS-DR's stages, deferred from the first step on, with the terms where PolarGuide-GSDR has them."""
+def _paper_stages(guided: Weights, final: float, *, deferred_first: bool) -> tuple[Stage, ...]:
+    """3DGS-DR's stages with the terms of PolarGuide-GSDR in its second and third stage.
+
+    Args:
+        guided: weights between the first stage and the final one.
+        final: share of the steps that the final stage takes.
+        deferred_first: whether the first stage is shaded with deferred reflection, too.
+    """
     plain, propagate, densify, refine = RECIPE_3DGS_DR.stages
-    guided = Weights(specular=0.1, diffuse=0.05, normal=0.02)
-    final = 0.15
     return (
-        replace(plain, reflection=True),
+        replace(plain, reflection=deferred_first),
         replace(propagate, weights=guided, on_enter=("refresh_priors",)),
         replace(densify, weights=guided),
         replace(refine, name="guided", fraction=refine.fraction - final, weights=guided),
@@ -144,17 +146,26 @@ def _kind_stages() -> tuple[Stage, ...]:
     )
 
 
+RECIPE_POLARGUIDE_PAPER: Recipe = replace(
+    RECIPE_3DGS_DR,
+    name="polarguide-paper",
+    about="PolarGuide-GSDR to the letter, on 3DGS-DR: its candidates, its loss over all pixels, layers before the blend.",
+    stages=_paper_stages(
+        Weights(reflection=_PAPER_SPECULAR, base=_PAPER_DIFFUSE, normal=_PAPER_NORMAL),
+        final=10 / 97,  # 10,000 of 97,000 steps
+        deferred_first=False,
+    ),
+    priors=replace(_PAPER, azimuth_share=1.0),
+)
+
 RECIPE_POLARGUIDE_PAPER_KIND: Recipe = replace(
     RECIPE_3DGS_DR,
     name="polarguide-paper:kind",
-    about="PolarGuide-GSDR as read most kindly: azimuths in place of -n, chosen in every step, on 3DGS-DR whole.",
-    stages=_kind_stages(),
-    priors=Priors(
-        candidates="azimuths",
-        live=True,
-        separation="paper",
-        threshold=0.1,
-        full_dolp=1e-6,
-        azimuth_weight=0.0,
+    about="PolarGuide-GSDR as read most favorably: azimuths in place of -n, on 3DGS-DR, deferred from the first step.",
+    stages=_paper_stages(
+        Weights(specular=_PAPER_SPECULAR, diffuse=_PAPER_DIFFUSE, normal=_PAPER_NORMAL),
+        final=0.15,
+        deferred_first=True,
     ),
+    priors=replace(_PAPER, candidates="azimuths"),
 )

@@ -104,7 +104,8 @@ def release_rates(**others: float) -> Change:
 
 
 _NORMAL_TERMS_OFF = off("normal", "azimuth", "chromatic", "consistency")
-_POLARIZED_TERMS = ("normal", "azimuth", "chromatic", "stokes", "specular", "diffuse")
+_LAYER_TERMS = ("specular", "diffuse", "reflection", "base")
+_POLARIZED_TERMS = ("normal", "azimuth", "chromatic", "stokes", *_LAYER_TERMS)
 _UNPOLARIZED = (
     "unpolarized",
     "The same without any polarization: normals agree with the depth everywhere, where the recipe has them agree.",
@@ -198,9 +199,54 @@ ABLATIONS_3DGS_DR = varied(
     ),
 )
 
+
+def layers_before_the_blend(weights: Weights) -> Weights:
+    """The terms on the layers compare mirrored light and base color, before the blend with the reflection strength."""
+    return replace(weights, specular=0.0, diffuse=0.0, reflection=weights.specular, base=weights.diffuse)
+
+
+def layers_after_the_blend(weights: Weights) -> Weights:
+    """The terms on the layers compare what each adds to the picture."""
+    return replace(weights, specular=weights.reflection, diffuse=weights.base, reflection=0.0, base=0.0)
+
+
+_TABLE_2 = (
+    ("only-normals", "Polarization normals alone: no term on the layers.", off(*_LAYER_TERMS)),
+    ("without-normals", "Separated layers alone: no term on the normals.", off("normal")),
+    _UNPOLARIZED,
+)
+"""The ablations that the publication has."""
+
 ABLATIONS_PAPER = (
     RECIPE_POLARGUIDE_PAPER_KIND,
-    *varied(RECIPE_POLARGUIDE_PAPER, _UNPOLARIZED),
+    *varied(
+        RECIPE_POLARGUIDE_PAPER,
+        *_TABLE_2,
+        (
+            "counted-pixels",
+            "The term on the normals is divided by the pixels that count, not by all.",
+            priors(azimuth_share=0.0),
+        ),
+        (
+            "after-the-blend",
+            "The layers are compared after the blend with the reflection strength.",
+            weighing(layers_after_the_blend),
+        ),
+    ),
+)
+ABLATIONS_KIND = varied(
+    RECIPE_POLARGUIDE_PAPER_KIND,
+    *_TABLE_2,
+    (
+        "all-pixels",
+        "The term on the normals is divided by all pixels, as printed.",
+        priors(azimuth_share=1.0),
+    ),
+    (
+        "before-the-blend",
+        "The layers are compared before the blend with the reflection strength.",
+        weighing(layers_before_the_blend),
+    ),
 )
 
 ABLATIONS_POLARGUIDE = varied(
@@ -211,6 +257,11 @@ ABLATIONS_POLARGUIDE = varied(
         off("specular", "diffuse"),
     ),
     ("without-normals", "Separated layers alone: no term on the normals.", _NORMAL_TERMS_OFF),
+    (
+        "without-polar-normals",
+        "No polarization normals, but normals still agree with the depth.",
+        off("normal", "azimuth", "chromatic"),
+    ),
     (
         "paper-candidates",
         "PolarGuide-GSDR's four candidates in place of the six that physics allows.",
@@ -285,6 +336,7 @@ ABLATIONS: dict[str, tuple[Method, ...]] = {
     "3dgs": ABLATIONS_3DGS,
     "3dgs-dr": ABLATIONS_3DGS_DR,
     "polarguide-paper": ABLATIONS_PAPER,
+    "polarguide-paper:kind": ABLATIONS_KIND,
     "polarguide": ABLATIONS_POLARGUIDE,
     "polarguide-stokes": ABLATIONS_STOKES,
     "gnerp": ABLATIONS_GNERP,

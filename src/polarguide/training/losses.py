@@ -54,7 +54,9 @@ class Weights:
 
     Attributes:
         photometric: final picture against S0/2.
-        specular, diffuse: the two contributions against the separated pictures.
+        specular, diffuse: the two contributions, after the blend with the reflection strength, against the separated
+            pictures.
+        reflection, base: the mirrored light and the base color, before that blend, against the same pictures.
         normal: 1 - cosine with the disambiguated polarization normal (azimuth and zenith).
         azimuth: distance of the normal from the plane of incidence that the AoLP gives (azimuth alone).
         chromatic: 1 - cosine with the normal from color differences, where these decide one.
@@ -67,6 +69,8 @@ class Weights:
     photometric: float = term(default=1.0)
     specular: float = term("specular", "separated", rendered=("layers",))
     diffuse: float = term("diffuse", "separated", rendered=("layers",))
+    reflection: float = term("specular", "separated", rendered=("layers",))
+    base: float = term("diffuse", "separated", rendered=("layers",))
     normal: float = term("normal", "candidates", "weight", rendered=("normal",))
     azimuth: float = term("plane", "weight", rendered=("normal",))
     chromatic: float = term("chromatic", "chromatic_weight", rendered=("normal",))
@@ -292,12 +296,14 @@ def refuse_diverged(total: Tensor) -> None:
 def layer_terms(step: Step, weights: Weights) -> Tensor | None:
     """The weighted sum of the terms that compare layers with the separated pictures."""
     result, priors = step.result, step.targets.priors
-    if priors is None or not (weights.specular or weights.diffuse):
+    if priors is None or not (weights.specular or weights.diffuse or weights.reflection or weights.base):
         return None
     total, separated_share = result.final.new_zeros(()), priors.separated.mean()
     for weight, layer, target in (
         (weights.specular, result.specular, priors.specular),
         (weights.diffuse, result.diffuse, priors.diffuse),
+        (weights.reflection, result.reflection, priors.specular),
+        (weights.base, result.base, priors.diffuse),
     ):
         if weight and layer is not None:
             # Over all pixels like the picture's own term, so that before nothing it does not outweigh it.
