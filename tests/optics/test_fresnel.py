@@ -248,6 +248,65 @@ def test_the_line_of_indices_keeps_to_metals(metal: str) -> None:
         assert abs(float(found) - (s - p) / (s + p)) < tolerance
 
 
+@given(i=st.floats(0, 1.5707), n=st.floats(0.05, 4), k=st.floats(0.05, 9))
+def test_the_oblique_share_follows_complex_amplitudes(i: float, n: float, k: float) -> None:
+    """U of light with U alone before and after, ``2 Re(-rs rp*) / (|rs|^2 + |rp|^2)``."""
+    c, index = math.cos(i), complex(n, k)
+    t = cmath.sqrt(index * index - math.sin(i) ** 2)
+    s, p = (c - t) / (c + t), (index**2 * c - t) / (index**2 * c + t)
+    expected = -2 * (s * p.conjugate()).real / (abs(s) ** 2 + abs(p) ** 2)
+    found = optics.conductor_oblique_share(scalar(c), scalar(n), scalar(k))
+    assert float(found) == pytest.approx(expected, abs=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("index", "shares"),
+    [
+        ((0.96, 6.69), (0.98, 0.91, 0.75)),
+        ((0.95, 2.58), (0.88, 0.57, 0.11)),
+        ((0.36, 2.69), (0.88, 0.57, 0.10)),
+    ],
+    ids=["aluminum", "copper", "gold"],
+)
+def test_metals_lose_oblique_polarization_at_large_angles(
+    index: tuple[float, float], shares: tuple[float, ...]
+) -> None:
+    cosine = torch.cos(torch.deg2rad(torch.tensor([45.0, 60.0, 70.0], dtype=torch.float64)))
+    found = optics.conductor_oblique_share(cosine, *(scalar(part) for part in index))
+    assert found.tolist() == pytest.approx(shares, abs=0.006)
+
+
+def printed_zenith(d: torch.Tensor, k: float, *, corrected: bool) -> torch.Tensor:
+    """The closed form of PolarGuide-GSDR (Shan et al. 2026) for the diffuse zenith, with or without its misprints."""
+    a = 2 * (1 - d) - (1 + d) * (k**2 + 1 / k**2)
+    b = 4 * d
+    c = 1 + k**2
+    e = 1 - k**2
+    if corrected:
+        root = b * torch.sqrt(c**2 * (a + b) ** 2 - e**2 * (a**2 - b**2))
+    else:
+        root = -torch.sqrt(c**2 * (a + b) ** 2 - e**2 * (a - b) ** 2)
+    return torch.asin(torch.sqrt((-b * c * (a + b) + root) / (2 * (a**2 - b**2))))
+
+
+@pytest.mark.parametrize("n", [1.33, 1.5, 1.8])
+def test_the_printed_zenith_is_the_inverse_but_for_three_misprints(n: float) -> None:
+    limit = (n**2 - 1) / (n**2 + 1)
+    d = torch.linspace(1e-3, 0.999 * limit, 50_000, dtype=torch.float64)
+    exact = optics.diffuse_zenith(d, n)
+    corrected = printed_zenith(d, n, corrected=True)
+    assert float(torch.rad2deg(corrected - exact).abs().max()) < 1e-10
+
+
+def test_the_zenith_as_printed_is_real_for_few_degrees_of_polarization_and_wrong() -> None:
+    d = torch.linspace(1e-4, 0.3845, 100_000, dtype=torch.float64)
+    printed = printed_zenith(d, 1.5, corrected=False)
+    real = torch.isfinite(printed)
+    assert (float(d[real].min()), float(d[real].max())) == pytest.approx((0.1231, 0.1613), abs=1e-4)
+    wrong = torch.rad2deg(printed - optics.diffuse_zenith(d, 1.5))[real].abs()
+    assert (float(wrong.min()), float(wrong.max())) == pytest.approx((26.0, 64.5), abs=0.5)
+
+
 def test_gradients_follow_finite_differences() -> None:
     cosine = torch.linspace(0.02, 0.98, 7, dtype=torch.float64)[:, None].requires_grad_()
     n = torch.tensor([0.15, 0.97, 2.9], dtype=torch.float64, requires_grad=True)

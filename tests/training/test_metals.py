@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from metal_balls import BODIES, METALS, gaussians_of_the_ball, measured, views_o
 from torch import Tensor
 from trainings import CPU, different, run
 
+from polarguide import optics
 from polarguide.capture import Scene, View
 from polarguide.optics.fresnel import reflectances_from_cosine
 from polarguide.raster.cpu import rasterize_cpu
@@ -23,7 +25,7 @@ from polarguide.runs.model import GaussianModel
 from polarguide.shading.metal import any_nonzero
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.metals.cut import INFINITE, Graph, decide, minimum_cut, surfaces, unary
-from polarguide.training.metals.evidence import GOLD, Evidence, _tint_cost, errors, evidence
+from polarguide.training.metals.evidence import GOLD, LEVELS, Evidence, _tint_cost, errors, evidence
 from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights, shares
 from polarguide.training.metals.search import SOFT_PRIORS, looks
 from polarguide.training.rules import MetalRules, MetalViews
@@ -60,7 +62,7 @@ def test_errors_are_those_of_fresnels_equations(material: str) -> None:
 
 @pytest.mark.parametrize(("light", "metal_alone"), [(0.1, True), (50.0, False)])
 def test_oblique_polarization_excuses_whom_it_can_come_from(light: float, metal_alone: bool) -> None:
-    """A metal may mirror any of it, a dielectric a small share of the scene's light."""
+    """A metal keeps a large share of what it mirrors, a dielectric makes a small share of the scene's light."""
     cosine = torch.full((6, 1), 0.7).double()
     s0 = torch.full((6, 1, 3), 0.5).double()
     oblique = 0.1 * s0
@@ -70,6 +72,18 @@ def test_oblique_polarization_excuses_whom_it_can_come_from(light: float, metal_
     most = float((s * p).sqrt()) * light
     assert float(result.dielectric) >= 0.99 * max(0.0, 0.05 - most) ** 2 / 0.25
     assert (float(result.dielectric) > 0) == metal_alone
+
+
+def test_more_oblique_polarization_than_a_metal_keeps_is_an_error() -> None:
+    """At 70 degrees no reflectance that is tried keeps 95 % of it."""
+    cosine = torch.full((6, 1), math.cos(math.radians(70))).double()
+    s0 = torch.full((6, 1, 3), 0.5).double()
+    oblique = 0.95 * s0
+    result = errors(ViewSamples(torch.ones(6, 1).double(), s0, 0.1 * s0, oblique, cosine), 1.5, 0.1, 0.0)
+    index = optics.conductor_index(torch.tensor(LEVELS).double())
+    largest = float(optics.conductor_oblique_share(cosine[0], *index).abs().max())
+    assert largest < 0.9
+    assert float(result.metal) >= 0.99 * (0.95 - largest) ** 2
 
 
 @pytest.mark.parametrize("degree", [0.0, 0.2, 0.4, 0.6])

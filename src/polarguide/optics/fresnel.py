@@ -306,6 +306,25 @@ def conductor_dolp_slope(cosine: Tensor, n: Tensor, k: Tensor) -> Tensor:
 
 
 @for_arrays
+def conductor_oblique_share(cosine: Tensor, n: Tensor, k: Tensor) -> Tensor:
+    """Share of the polarization at 45 degrees to the plane of incidence that reflection at a conductor keeps.
+
+    It is the ratio of U / S0 after and before the reflection of light with U alone: ``2 Re(-rs rp*) / (|rs|^2 + |rp|^2)
+    = 1 - 2 sin^4(i) / x`` with x of the module's text. The rest becomes circular polarization.
+
+    Args:
+        cosine: [...] cos(zenith); values outside [0, 1] are clamped.
+        n, k: [...] of the index, n > 0, k >= 0.
+
+    Returns:
+        [...] in [-1, 1]: 1 at normal incidence, negative beyond the principal angle of incidence.
+    """
+    c, sine2, _, squared = _terms(cosine, n, k)
+    sine4 = sine2 * sine2
+    return 1 - 2 * sine4 / (c * c * squared + sine4)
+
+
+@for_arrays
 def conductor_index(reflectance: Tensor) -> tuple[Tensor, Tensor]:
     """An index (n, k) of a metal with this reflectance at normal incidence.
 

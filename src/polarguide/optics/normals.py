@@ -87,9 +87,9 @@ class Disambiguated(NamedTuple):
 def paper_candidates(stokes: Tensor, rays: Tensor, refractive_index: float | Tensor = 1.5) -> Candidates:
     """Four candidate normals as in PolarGuide-GSDR: n, -n, R n, -R n.
 
-    n has the angle of polarization as azimuth and the diffuse zenith of the degree of polarization. (The
-    closed form of PolarGuide-GSDR for the zenith inverts no Fresnel curve; this is the exact inverse.) Two
-    of the four face away from the camera.
+    n has the angle of polarization as azimuth and the diffuse zenith of the degree of polarization. The closed form
+    that PolarGuide-GSDR prints for this zenith has three misprints; corrected, it equals ``diffuse_zenith``. Two of the
+    four candidates face away from the camera.
 
     Args:
         stokes: [3, ...] of the luminance.

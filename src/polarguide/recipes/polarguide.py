@@ -149,7 +149,7 @@ def _paper_stages(guided: Weights, final: float, *, deferred_first: bool) -> tup
 RECIPE_POLARGUIDE_PAPER: Recipe = replace(
     RECIPE_3DGS_DR,
     name="polarguide-paper",
-    about="PolarGuide-GSDR to the letter, on 3DGS-DR: its candidates, its loss over all pixels, layers before the blend.",
+    about="PolarGuide-GSDR to the letter, on 3DGS-DR: its candidates, loss over all pixels, layers before the blend.",
     stages=_paper_stages(
         Weights(reflection=_PAPER_SPECULAR, base=_PAPER_DIFFUSE, normal=_PAPER_NORMAL),
         final=10 / 97,  # 10,000 of 97,000 steps
