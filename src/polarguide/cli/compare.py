@@ -12,7 +12,7 @@ import tyro
 import polarguide
 from polarguide.cli.console import JobReporter, say, use_threads
 from polarguide.core.errors import PolarguideError
-from polarguide.experiments.options import BenchOptions, CompareOptions
+from polarguide.experiments.options import BenchOptions, CompareOptions, LayoutName
 from polarguide.training.settings import Background, Materials, TrainSettings
 
 if TYPE_CHECKING:
@@ -176,7 +176,9 @@ def bench(
 Records = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RESULTS ...")]
 
 
-def tables(records: Records, /, *, out: Path, against: str | None = None) -> None:
+def tables(
+    records: Records, /, *, out: Path, against: str | None = None, layout: LayoutName | None = None
+) -> None:
     """Join the records of comparisons that were run apart, and set their tables anew.
 
     For comparisons and benches that are spread over machines or days: scenes, seeds and recipes may be shared out in
@@ -186,6 +188,11 @@ def tables(records: Records, /, *, out: Path, against: str | None = None) -> Non
         records: Records of compare, ablate or bench (results.json), or folders with one.
         out: Folder to write.
         against: One of the recipes: tables have the difference of every other one to it.
+        layout: Also write a table of PolarGuide-GSDR in its own layout, with the published values below:
+            publication-1 compares methods, publication-2 has its ablations.
     """
     join_tables = importlib.import_module("polarguide.experiments.join").join_tables
-    print_results(join_tables(records, out, against=against), out)
+    results = join_tables(records, out, against=against, layout=layout)
+    if layout is not None:
+        say(f"layout: {out}/{layout}.md, .tex")
+    print_results(results, out)

@@ -13,6 +13,8 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, write_text
 from polarguide.core.options import PathLike, check_choice
 from polarguide.core.records import shortened
+from polarguide.experiments.options import LayoutName
+from polarguide.experiments.publication import LAYOUTS, write_publication_tables
 from polarguide.experiments.record import (
     FORMAT,
     Provenance,
@@ -32,7 +34,13 @@ _FREE = ("jobs", "seeds", "against")
 """Settings in which parts of one comparison may differ: the largest counts, and what is asked for now."""
 
 
-def join_tables(parts: Sequence[PathLike], out: PathLike, *, against: str | None = None) -> Results:
+def join_tables(
+    parts: Sequence[PathLike],
+    out: PathLike,
+    *,
+    against: str | None = None,
+    layout: LayoutName | None = None,
+) -> Results:
     """Join the records of comparisons that were run apart, and set their tables anew.
 
     Scenes, seeds and recipes may be spread over machines in any way, as long as no run is there twice. Writes
@@ -43,10 +51,12 @@ def join_tables(parts: Sequence[PathLike], out: PathLike, *, against: str | None
         parts: records, or folders with a ``results.json``; scenes and recipes keep the order in which they come.
         out: folder to write.
         against: a recipe; tables have the difference of every other one to it.
+        layout: also write a table in the layout of a publication, as ``LAYOUT.md`` and ``LAYOUT.tex``.
 
     Raises:
         PolarguideError: a file that is not a record, or would be written over; records of other code, settings, scenes
-            or recipes than the first; a run that two of them have; an unknown ``against``.
+            or recipes than the first; a run that two of them have; an unknown ``against``; a layout whose recipes the
+            records do not have.
     """
     paths = [Path(part) / RECORD if Path(part).is_dir() else Path(part) for part in parts]
     if not paths:
@@ -64,6 +74,9 @@ def join_tables(parts: Sequence[PathLike], out: PathLike, *, against: str | None
     refuse_scene(Path(out))
     make_folder(Path(out))
     write_tables(Path(out), joined)
+    if layout is not None:
+        check_choice("layout", layout, list(LAYOUTS))
+        write_publication_tables(Path(out), joined, LAYOUTS[layout])
     remark = "Pictures are in the reports of the parts."
     write_text(Path(out) / REPORT, report_html(joined, [], {}, [remark]))
     return joined

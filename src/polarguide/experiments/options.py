@@ -23,6 +23,8 @@ from polarguide.training.settings import TrainSettings
 MOST_SEEDS = 1000
 """Each is a run of its own for every recipe and scene."""
 Manager = Literal["slurm", "pbs"]
+LayoutName = Literal["publication-1", "publication-2"]
+"""Tables of PolarGuide-GSDR: its comparison of methods, and its ablations."""
 
 
 @dataclass(frozen=True)

@@ -121,7 +121,7 @@ def scores_section(results: Results) -> Section:
         parts = [
             (
                 [(row.recipe, True, _remark(row, results))],
-                [_score(row, column, index in bold[column.key], results) for column in columns],
+                [score_cell(row, column, index in bold[column.key], results) for column in columns],
             )
             for index, row in enumerate(rows)
         ]
@@ -154,7 +154,8 @@ def leaders(
     }
 
 
-def _score(row: Row, column: Metric, bold: bool, results: Results) -> TableCell:
+def score_cell(row: Row, column: Metric, bold: bool, results: Results) -> TableCell:
+    """The cell of a recipe's score on a scene."""
     cell: Cell = row.cells[column.key]
     if cell.mean is None:
         # A speed that was not measured alone, or a run that has not finished, is not "not applicable".

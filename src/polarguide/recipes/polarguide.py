@@ -122,6 +122,7 @@ _PAPER = Priors(
     threshold=0.1,
     full_dolp=1e-6,  # a pixel counts fully or not at all
     azimuth_weight=0.0,
+    azimuth_share=1.0,  # the sum over the pixels that count is divided by all pixels
 )
 _PAPER_NORMAL = 0.02
 _PAPER_SPECULAR = 0.1
@@ -155,7 +156,7 @@ RECIPE_POLARGUIDE_PAPER: Recipe = replace(
         final=10 / 97,  # 10,000 of 97,000 steps
         deferred_first=False,
     ),
-    priors=replace(_PAPER, azimuth_share=1.0),
+    priors=_PAPER,
 )
 
 RECIPE_POLARGUIDE_PAPER_KIND: Recipe = replace(

@@ -210,23 +210,23 @@ def layers_after_the_blend(weights: Weights) -> Weights:
     return replace(weights, specular=weights.reflection, diffuse=weights.base, reflection=0.0, base=0.0)
 
 
-_TABLE_2 = (
+_PUBLISHED = (
     ("only-normals", "Polarization normals alone: no term on the layers.", off(*_LAYER_TERMS)),
     ("without-normals", "Separated layers alone: no term on the normals.", off("normal")),
+    (
+        "counted-pixels",
+        "The term on the normals is divided by the pixels that count, not by all.",
+        priors(azimuth_share=0.0),
+    ),
     _UNPOLARIZED,
 )
-"""The ablations that the publication has."""
+"""The two ablations of the publication, another reading of its normal term, and the control."""
 
 ABLATIONS_PAPER = (
     RECIPE_POLARGUIDE_PAPER_KIND,
     *varied(
         RECIPE_POLARGUIDE_PAPER,
-        *_TABLE_2,
-        (
-            "counted-pixels",
-            "The term on the normals is divided by the pixels that count, not by all.",
-            priors(azimuth_share=0.0),
-        ),
+        *_PUBLISHED,
         (
             "after-the-blend",
             "The layers are compared after the blend with the reflection strength.",
@@ -236,12 +236,7 @@ ABLATIONS_PAPER = (
 )
 ABLATIONS_KIND = varied(
     RECIPE_POLARGUIDE_PAPER_KIND,
-    *_TABLE_2,
-    (
-        "all-pixels",
-        "The term on the normals is divided by all pixels, as printed.",
-        priors(azimuth_share=1.0),
-    ),
+    *_PUBLISHED,
     (
         "before-the-blend",
         "The layers are compared before the blend with the reflection strength.",

@@ -196,8 +196,11 @@ class Method(ABC):
         return self
 
     def differs(self, data: Mapping[str, Any]) -> bool:
-        """Whether a value is another than in what a run's folder has of the recipe, as far as that goes."""
-        return _differs(self.data(), data)
+        """Whether a value is another than in what a run's folder has of the recipe, as far as that goes.
+
+        Its description is no value.
+        """
+        return _differs(self.data(), {key: value for key, value in data.items() if key != "about"})
 
 
 @dataclass(frozen=True)
