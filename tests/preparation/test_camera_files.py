@@ -2,6 +2,7 @@
 
 import io
 import struct
+import zlib
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from faults import Fault
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
+from polarguide.capture.calibration import Calibration
 from polarguide.capture.checks import measured_gains, pair_moments
 from polarguide.capture.filter.camera_files import stated_exponent
 from polarguide.capture.filter.develop import (
@@ -26,9 +28,11 @@ from polarguide.capture.sensor.demosaic import defects
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
 from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
 from polarguide.optics.color import srgb_encode_array as srgb_encode
-from polarguide.preparation.mosaic_source import MosaicFiles
+from polarguide.preparation.mosaic_source import MosaicFiles, MosaicSource
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.shot_exposures import exposures_of_view, stated_exposures
+from polarguide.shots.options import ShotOptions
+from polarguide.shots.read import read_shot
 
 
 def four(height=96, width=128):
@@ -287,3 +291,65 @@ def test_a_tone_curve_that_is_neither_is_doubted(encode, transfer, doubtful):
     pictures, none = np.repeat(codes[..., None], 3, axis=3), np.zeros(codes.shape, bool)
     found = decide_transfer([Shots(pictures, 1, none, none[0])], lossy=True)
     assert (found.transfer, bool(found.doubt)) == (transfer, doubtful)
+
+
+def _stating(folder, kind, values, full):
+    """A file that states the full scale of gray ``values``, in one of four ways."""
+    path = folder / f"v.{kind}"
+    if kind == "pgm":
+        head = b"P5\n%d %d\n%d\n" % (values.shape[1], values.shape[0], full)
+        path.write_bytes(head + values.astype(">u2" if full > 255 else "u1").tobytes())
+    elif kind == "tif":
+        tifffile.imwrite(path, values, extratags=[(281, "H", 1, full, True)], metadata=None)
+    else:
+        chunk = b"sBIT" + bytes([full.bit_length()])
+        data = cv2.imencode(".png", values)[1].tobytes()
+        body = struct.pack(">I", 1) + chunk + struct.pack(">I", zlib.crc32(chunk))
+        path.write_bytes(data[:33] + body + data[33:])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "full"),
+    [("pgm", 127), ("pgm", 1023), ("pgm", 16383), ("tif", 1023), ("tif", 127), ("png", 1023), ("png", 63)],
+)
+def test_the_full_scale_that_a_file_states_is_used(tmp_path, kind, full):
+    """Of mosaics and photographs: what is at it is saturated, and half of it is half of the light."""
+    values = (
+        np.linspace(1, full, 64 * 64).reshape(64, 64).round().astype(np.uint8 if full < 256 else np.uint16)
+    )
+    path = _stating(tmp_path, kind, values, full)
+    picture = decode_picture(path, path.read_bytes())
+    assert picture[..., 0] / np.iinfo(picture.dtype).max == pytest.approx(values / full, abs=2e-3)
+    settings = PrepareSettings(sensor="IMX250MZR", poses="none", gains="none", calibration=Calibration())
+    source = MosaicSource(tmp_path, settings)
+    measured = source.measure(lambda done: None)
+    assert (measured["levels"]["white"], measured["levels"]["saturation"]) == (full, full)
+    assert f"{full} is full scale, as the files state" in measured["notes"][-1]
+    shot = read_shot(path, ShotOptions(sensor="IMX250MZR"))
+    assert any("as the file states" in note for note in shot.notes)
+
+
+def test_significant_bits_of_png_may_be_at_the_top(tmp_path):
+    """As the standard has them: ten of sixteen bits, the lowest six empty or copies of the highest."""
+    values = np.linspace(1, 1023, 64 * 64).reshape(64, 64).round().astype(np.uint16)
+    for name, stored in (("empty", values << 6), ("copies", values << 6 | values >> 4)):
+        folder = tmp_path / name
+        folder.mkdir()
+        path = _stating(folder, "png", stored, 1023)
+        assert decode_picture(path, path.read_bytes())[..., 0] / 65535 == pytest.approx(
+            values / 1023, abs=2e-3
+        )
+        settings = PrepareSettings(sensor="IMX250MZR")
+        levels = MosaicSource(folder, settings).measure(lambda done: None)["levels"]
+        assert levels["saturation"] == 65472
+
+
+def test_full_scales_that_contradict_one_another_or_the_values_are_refused(tmp_path):
+    values = np.full((64, 64), 1000, np.uint16)
+    path = _stating(tmp_path, "pgm", values, 511)
+    Fault(path, found="1000", expected="511").raised_by(decode_picture, path, path.read_bytes())
+    _stating(tmp_path, "pgm", values, 1023)
+    (tmp_path / "w.png").write_bytes(cv2.imencode(".png", values)[1].tobytes())
+    source = MosaicSource(tmp_path, PrepareSettings(sensor="IMX250MZR"))
+    Fault(tmp_path / "w.png", found="no full scale").raised_by(source.measure, lambda done: None)

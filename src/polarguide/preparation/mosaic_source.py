@@ -26,6 +26,7 @@ from polarguide.capture.sensor.pattern import (
     SIDE,
     Levels,
     Pattern,
+    agreed_full_scale,
     estimate_levels,
     level_notes,
     require_kind,
@@ -107,6 +108,10 @@ class MosaicFiles:
     def container(self, path: Path, values: NDArray[Any]) -> int:
         """Bits that a pixel takes in the file."""
         return self._raw.container(path, values.dtype)
+
+    def full_scale(self, path: Path, values: NDArray[Any]) -> int | None:
+        """The full scale that a file states for its values; None where it does not, or where ``bits`` says it."""
+        return self._raw.full_scale(path, values) if self._settings.bits is None else None
 
     def require_kind(self, blocks: NDArray[Any], levels: Levels) -> None:
         """Refuse mosaics of the other kind of sensor: nothing later would tell."""
@@ -258,6 +263,7 @@ class MosaicSource(Source):
         """Levels, gains of the angles and white balance of the capture; every file is read once."""
         counts = np.zeros(FULL_16 + 1, np.int64)
         container, shape = 0, None
+        stated: dict[Path, int | None] = {}
         samples: list[NDArray[Any]] = []
         blocks: list[NDArray[Any]] = []
         for count, path in enumerate(self._files.values(), 1):
@@ -268,16 +274,17 @@ class MosaicSource(Source):
                 offset = (self._settings.offset_x, self._settings.offset_y)
                 self._analyzers.require_region(offset, values.shape[::-1], self._settings.analyzers)
             container = self._mosaics.container(path, values)
+            stated[path] = self._mosaics.full_scale(path, values)
             counts += np.bincount(values.ravel(), minlength=len(counts))
             samples.append(sample_blocks(self._mosaics.cut(values), 2 * self._pattern.period))
             blocks.append(sample_blocks(self._mosaics.cut(values), SIDE))
             advance(count)
         assert shape is not None
         settings = self._settings
-        occurring = np.flatnonzero(counts)
+        occurring, full = np.flatnonzero(counts), agreed_full_scale(stated)
         levels = estimate_levels(
             int(occurring[-1]), int(np.bitwise_or.reduce(occurring)), container,
-            bits=settings.bits, black=settings.black_level, saturation=settings.saturation, counts=counts,
+            bits=settings.bits, black=settings.black_level, saturation=settings.saturation, counts=counts, stated=full,
         )  # fmt: skip
         levels = replace(levels, gamma=settings.gamma if self._dataset is None else self._dataset.gamma)
         if self._dataset is None:
@@ -296,7 +303,7 @@ class MosaicSource(Source):
         ratio = pair_ratio(angles, usable)
         gains, notes = self._gains(ratio)
         notes += [] if self._dataset is None else self._dataset.notes
-        notes += level_notes(levels, counts, container, settings.bits)
+        notes += level_notes(levels, counts, container, settings.bits, full)
         standing_out = int(self._defects(levels).sum())
         if standing_out:
             notes.append(defects_note(standing_out, shape[0][0] * shape[0][1]))

@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, Sense, checked, read_calibration
 from polarguide.capture.sensor.analyzer_file import is_analyzer_file
-from polarguide.capture.sensor.pattern import MosaicOptions, Positive
+from polarguide.capture.sensor.pattern import MosaicOptions, Positive, require_sensor
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options, option_name
 from polarguide.core.text import decimals
@@ -110,6 +110,7 @@ class PrepareSettings(MosaicOptions):
         Raises:
             PolarguideError: a value is out of range.
         """
+        require_sensor(self.sensor)
         check_options(self)
         checked(self.calibration, "calibration")
         white_gains(self.white_balance)

@@ -18,7 +18,8 @@ from polarguide.capture.exposures import Angle, Exposure, analyzers, nominal, tu
 from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
 from polarguide.capture.filter.develop import kind_of_file, require_known_encoding, transfer_of_kind
 from polarguide.capture.filter.shots import Shots, read_stack, stacked
-from polarguide.capture.formats.pictures import linear_codes, rescaled
+from polarguide.capture.formats.decoders import rescaled
+from polarguide.capture.formats.pictures import linear_codes
 from polarguide.capture.layout import require_memory
 from polarguide.capture.sensor.pattern import FULL_16, Levels, clipping_bits, estimate_levels
 from polarguide.capture.view import FULL_CODE, View

@@ -255,7 +255,7 @@ def heif_tags(data: bytes) -> bytes:
         return b""
 
 
-def heif_pixels(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
+def heif_pixels(path: Path, data: bytes) -> NDArray[Any]:
     """The picture of a HEIC file as the camera stored it, before it is turned for display.
 
     Args:
@@ -263,7 +263,7 @@ def heif_pixels(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
         data: the whole file, without damage that its structure tells.
 
     Returns:
-        [H, W, C] uint8, or uint16 of more than 8 bits, in OpenCV's order of channels; and the value of full scale.
+        [H, W, C] uint8, or uint16 of more than 8 bits brought to full scale, in OpenCV's order of channels.
 
     Raises:
         PolarguideError: pillow-heif is not installed.
@@ -283,9 +283,16 @@ def heif_pixels(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
     if pixels.shape[1::-1] != head.size:
         raise ValueError("a HEIC file whose picture has another size than its header states")
     if pixels.dtype == np.uint8:
-        return np.ascontiguousarray(pixels), 255
+        return np.ascontiguousarray(pixels)
     # The decoder puts the bits at the top of 16.
-    return np.ascontiguousarray(pixels >> (16 - bits)), (1 << bits) - 1
+    return rescaled(np.ascontiguousarray(pixels >> (16 - bits)), (1 << bits) - 1)
+
+
+def rescaled(pixels: NDArray[Any], full: int) -> NDArray[Any]:
+    """Whole numbers of which ``full`` is full scale, as such of the whole range of their type."""
+    whole = np.iinfo(pixels.dtype).max
+    table = np.rint(np.minimum(np.arange(whole + 1) * (whole / full), whole)).astype(pixels.dtype)
+    return np.asarray(table[pixels])
 
 
 # It logs what it finds odd in a file; what matters of it is an error here.
@@ -305,7 +312,7 @@ class UnreadableTiffError(ValueError):
     """A TIFF file that is no ordinary picture; the text is a noun phrase that says why."""
 
 
-def decode_tiff(data: bytes) -> tuple[NDArray[Any], int]:
+def decode_tiff(data: bytes) -> NDArray[Any]:
     """The picture of a TIFF or BigTIFF file, neither turned nor scaled.
 
     Args:
@@ -313,7 +320,7 @@ def decode_tiff(data: bytes) -> tuple[NDArray[Any], int]:
 
     Returns:
         [H, W] or [H, W, C] in OpenCV's order of channels (blue, green, red, alpha), of 8- or 16-bit whole numbers or
-        floating-point numbers; and the bits of a sample, which may be fewer than those of the array.
+        floating-point numbers.
 
     Raises:
         UnreadableTiffError: the file has several pictures, or samples that mean something else.
@@ -331,15 +338,36 @@ def decode_tiff(data: bytes) -> tuple[NDArray[Any], int]:
         raise UnreadableTiffError("a TIFF file of several layers")
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     if bits == 1 and pixels.dtype.kind in "bu":
-        pixels, bits = pixels.astype(np.uint8) * np.uint8(255), 8
+        pixels = pixels.astype(np.uint8) * np.uint8(255)
     if colors is not None:
         # Palettes have 16 bits; those of 8-bit colors are multiples of 257.
-        pixels, bits = np.rint(np.asarray(colors).T[pixels] / 257).astype(np.uint8), 8
+        pixels = np.rint(np.asarray(colors).T[pixels] / 257).astype(np.uint8)
     if transparent and samples == 2:
-        return pixels[..., [0, 0, 0, 1]], bits
+        return pixels[..., [0, 0, 0, 1]]
     if pixels.ndim == 3:
         pixels = pixels[..., [2, 1, 0, 3]] if transparent else pixels[..., ::-1]
-    return pixels, bits
+    return pixels
+
+
+_LARGEST = 281
+
+
+def tiff_full_scale(file: tifffile.TiffFile) -> int | None:
+    """The full scale that a TIFF file states below that of its type; None where it does not.
+
+    By the bits of a sample, or by MaxSampleValue where that is all ones in binary: the tag may also hold the largest
+    value that occurs.
+    """
+    page = file.pages.first
+    kind, bits = page.dtype, int(page.bitspersample)
+    if kind is None or kind.kind != "u" or bits == 1 or page.photometric == _PALETTE:
+        return None
+    stated = page.tags.valueof(_LARGEST, 0)
+    largest = max(stated) if isinstance(stated, tuple) else int(stated)
+    full = (1 << bits) - 1
+    if 0 < largest < full and largest & (largest + 1) == 0:
+        full = largest
+    return full if full < np.iinfo(kind).max else None
 
 
 def _only_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
