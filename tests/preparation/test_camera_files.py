@@ -15,13 +15,9 @@ from PIL.TiffImagePlugin import IFDRational
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.checks import measured_gains, pair_moments
-from polarguide.capture.filter.camera_files import stated_exponent
-from polarguide.capture.filter.develop import (
-    align_shots,
-    decide_transfer,
-    estimate_shifts,
-    require_known_encoding,
-)
+from polarguide.capture.filter.camera_files import stated_encoding
+from polarguide.capture.filter.develop import align_shots, estimate_shifts
+from polarguide.capture.filter.encoding import LOSSY, decide_transfer, slope_of_shots, stated_transfer
 from polarguide.capture.filter.shots import Shots
 from polarguide.capture.formats.pictures import decode_mask, decode_picture
 from polarguide.capture.sensor.demosaic import defects
@@ -260,11 +256,13 @@ SRGB = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
 def test_profiles_state_how_a_picture_is_encoded(tmp_path, suffix, curve, exponent):
     path = tmp_path / f"v{suffix}"
     Image.new("RGB", (16, 16), (90, 120, 60)).save(path, **({} if curve is None else {"icc_profile": curve}))
-    found = stated_exponent(path.read_bytes())
-    assert found == (None if exponent is None else pytest.approx(exponent, abs=0.01))
-    if exponent != 1.8:
-        return require_known_encoding(path)
-    Fault(found="1.80").raised_by(require_known_encoding, path)
+    found = stated_encoding(path.read_bytes())
+    assert (found and found.exponent) == (None if exponent is None else pytest.approx(exponent, abs=0.01))
+    if exponent == 1.8:
+        Fault(str(path), found="1.80").raised_by(stated_transfer, [path])
+    else:
+        known = None if exponent is None else "linear" if exponent == 1 else "srgb"
+        assert (stated_transfer([path]) or (None,))[0] == known
 
 
 def test_damaged_profiles_state_nothing():
@@ -273,8 +271,8 @@ def test_damaged_profiles_state_nothing():
     Image.new("RGB", (16, 16)).save(image, "JPEG", icc_profile=whole)
     data, at = image.getvalue(), image.getvalue().index(whole)
     for place in range(at + 128, at + len(whole)):
-        found = stated_exponent(data[:place] + b"\xff" + data[place + 1 :])
-        assert found is None or found > 0
+        found = stated_encoding(data[:place] + b"\xff" + data[place + 1 :])
+        assert found is None or found.exponent > 0
 
 
 @pytest.mark.parametrize(
@@ -289,7 +287,8 @@ def test_damaged_profiles_state_nothing():
 def test_a_tone_curve_that_is_neither_is_doubted(encode, transfer, doubtful):
     codes = np.rint(np.clip(encode(four()), 0, 1) * 65535).astype(np.uint16)
     pictures, none = np.repeat(codes[..., None], 3, axis=3), np.zeros(codes.shape, bool)
-    found = decide_transfer([Shots(pictures, 1, none, none[0])], lossy=True)
+    slope = slope_of_shots([Shots(pictures, 1, none, none[0])], [(0, 45, 90, 135)])
+    found = decide_transfer(LOSSY, None, eight=False, slope=slope)
     assert (found.transfer, bool(found.doubt)) == (transfer, doubtful)
 
 
@@ -315,9 +314,8 @@ def _stating(folder, kind, values, full):
 )
 def test_the_full_scale_that_a_file_states_is_used(tmp_path, kind, full):
     """Of mosaics and photographs: what is at it is saturated, and the rest is a share of it."""
-    values = (
-        np.linspace(1, full, 64 * 64).reshape(64, 64).round().astype(np.uint8 if full < 256 else np.uint16)
-    )
+    ramp = np.random.default_rng(3).permutation(np.linspace(1, full, 64 * 64)).reshape(64, 64)
+    values = ramp.round().astype(np.uint8 if full < 256 else np.uint16)
     path = _stating(tmp_path, kind, values, full)
     picture = decode_picture(path, path.read_bytes())
     assert picture[..., 0] / np.iinfo(picture.dtype).max == pytest.approx(values / full, abs=2e-3)

@@ -14,15 +14,9 @@ from polarguide.capture import checks
 from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented, pair_ratio
 from polarguide.capture.exposures import FOUR
 from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
-from polarguide.capture.filter.develop import (
-    align_shots,
-    decide_transfer,
-    estimate_shifts,
-    linear_intensities,
-    require_known_encoding,
-)
+from polarguide.capture.filter.develop import align_shots, estimate_shifts, linear_intensities, moved_shots
+from polarguide.capture.filter.encoding import transfer_of_set
 from polarguide.capture.filter.shots import Shots, read_shots, require_four_shots, stacked
-from polarguide.capture.formats.pictures import is_lossy
 from polarguide.capture.layout import (
     KEPT,
     READ,
@@ -323,24 +317,16 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
     levels, notes = levels_of_shot(shots.pictures, 8 * shots.pictures.dtype.itemsize, options)
     if levels is not None:
         shots = _four(shot, levels)
-    transfer: str = options.transfer
-    if transfer == "auto":
-        if paths:
-            require_known_encoding(paths[0])
-        decision = decide_transfer([shots], lossy=bool(paths) and is_lossy(paths[0]))
-        transfer = decision.transfer
-        notes += [f"Transfer {decision.reason}.", *filter(None, [decision.doubt])]
+    decision = transfer_of_set(paths, options.transfer, shots, ANGLES)
+    transfer = decision.transfer
+    notes += [decision.note, *filter(None, [decision.doubt])]
     linear = linear_intensities(shots.pictures, transfer)
     lsb = 1 / float(np.iinfo(shots.pictures.dtype).max if levels is None else levels.white)
     clipped, dark = shots.clipped, shots.dark
     if options.align:
         shifts = estimate_shifts(linear)
         linear, clipped = align_shots(linear, clipped, shifts)
-        moved = [
-            f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f})"
-            for angle, shift in zip(ANGLES, shifts, strict=True)
-            if shift.corrected
-        ]
+        moved = moved_shots(shifts)
         notes += [f"Shots moved, in pixels: {', '.join(moved)}."] if moved else []
     saturated = np.asarray(clipped.any(axis=0))
     stated = stated_exposures({shot.name: paths}).get(shot.name) if paths else None

@@ -13,27 +13,35 @@ import io
 import math
 import struct
 import warnings
-import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.formats.arrays import array_kind
-from polarguide.capture.formats.decoders import heif_head, heif_tags, is_heif, is_webp, webp_chunks
+from polarguide.capture.formats.decoders import (
+    HIGH_RANGE,
+    heif_colors,
+    heif_head,
+    heif_tags,
+    is_heif,
+    is_webp,
+    webp_chunks,
+)
 from polarguide.capture.formats.integrity import (
+    BIG_TIFF,
     LARGEST_PIXELS,
     ORIENTATION,
+    PNG,
     TIFF,
     jpeg_segments,
-    png_chunks,
-    tiff_entries,
-    tiff_order,
+    png_chunk,
 )
 from polarguide.capture.formats.pictures import read_picture
 from polarguide.core.errors import PolarguideError, optional_import
@@ -222,7 +230,7 @@ def tags_of(data: bytes) -> dict[int, Any]:
         contents = (content for kind, content in jpeg_segments(data) if kind == 0xE1)
         tiff = next((content[6:] for content in contents if content.startswith(b"Exif\0\0")), b"")
     elif data.startswith(b"\x89PNG"):
-        tiff = next((data[at + 8 : end - 4] for kind, at, end in png_chunks(data) if kind == b"eXIf"), b"")
+        tiff = png_chunk(data, b"eXIf") or b""
     elif is_webp(data):
         tiff = next((data[at:end] for kind, at, end in webp_chunks(data) if kind == b"EXIF"), b"")
         tiff = tiff.removeprefix(b"Exif\0\0")
@@ -303,45 +311,103 @@ def _number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-_TIFF_PROFILE = 34675
-_JPEG_PROFILE = b"ICC_PROFILE\0"
+SRGB_EXPONENT = 2.22
+"""Of sRGB at half scale."""
+_CHARACTERISTICS = {
+    **dict.fromkeys((1, 6, 7, 13, 14, 15), SRGB_EXPONENT),
+    4: 2.2,
+    5: 2.8,
+    8: 1.0,
+}
+"""Exponents of transfer characteristics (ITU-T H.273). Those of television are shown as sRGB is."""
+_UNSPECIFIED = 2
+_TIFF_PROFILE, _TRANSFER_FUNCTION = 34675, 301
+_COLOR_SPACE, _GAMMA = 40961, 42240
 _CURVES = (b"rTRC", b"kTRC")
 _PARAMETERS = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}
 _MIDDLE = 0.5
 
 
-def stated_exponent(data: bytes) -> float | None:
-    """The exponent e that the ICC profile of a PNG, JPEG, WebP or TIFF file states: light = value ^ e at half scale.
+@dataclass(frozen=True)
+class Encoding:
+    """How a picture file says that it is encoded.
 
-    1 is linear, 2.2 sRGB and Adobe RGB, 1.8 ProPhoto RGB. None where there is no profile, or none of this kind.
+    Attributes:
+        exponent: light = value ^ exponent at half scale: 1 is linear, 2.2 sRGB and Adobe RGB, 1.8 ProPhoto RGB; None
+            where it is no such curve.
+        words: what says so.
     """
+
+    exponent: float | None
+    words: str
+
+
+def stated_encoding(data: bytes) -> Encoding | None:
+    """The encoding that a picture file states; None where it states none that can be read.
+
+    By transfer characteristics (cICP of PNG, nclx of HEIC), else an ICC profile, else sRGB and gAMA of PNG or
+    TransferFunction of TIFF, else gamma and color space of EXIF: a more specific statement goes first, as in the
+    standard of PNG.
+    """
+    characteristics, profile, rest = None, None, None
+    # A statement that cannot be read states nothing: Pillow, tifffile and pillow-heif raise what they please.
+    with contextlib.suppress(Exception), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if data[:4] in (*TIFF, *BIG_TIFF):
+            profile, rest = _of_tiff(data)
+        elif is_heif(data):
+            characteristics, profile = heif_colors(data)
+        else:
+            with Image.open(io.BytesIO(data)) as image:
+                profile = image.info.get("icc_profile")
+                rest = _of_png(image.info)
+            stated = png_chunk(data, b"cICP") if data.startswith(PNG) else None
+            characteristics = stated[1] if stated else None
+    if characteristics is not None and characteristics != _UNSPECIFIED:
+        name = HIGH_RANGE.get(characteristics, f"number {characteristics} of H.273")
+        return Encoding(_CHARACTERISTICS.get(characteristics), f"its transfer characteristics ({name})")
+    exponent = None if profile is None else profile_exponent(profile)
+    if exponent is not None:
+        return Encoding(exponent, "a color profile (ICC)")
+    return rest or _of_exif(tags_of(data))
+
+
+def _of_png(info: Mapping[str | tuple[int, int], Any]) -> Encoding | None:
+    """What the chunks sRGB and gAMA say, as Pillow reads them."""
+    if "srgb" in info:
+        return Encoding(SRGB_EXPONENT, "an sRGB chunk")
+    gamma = info.get("gamma")
+    return Encoding(1 / gamma, f"a gAMA chunk of {gamma:.5g}") if gamma else None
+
+
+def _of_tiff(data: bytes) -> tuple[bytes | None, Encoding | None]:
+    """The ICC profile of a TIFF file, and what its transfer function says."""
+    with tifffile.TiffFile(io.BytesIO(data)) as file:
+        tags = file.pages.first.tags
+        profile, function = tags.valueof(_TIFF_PROFILE), tags.valueof(_TRANSFER_FUNCTION)
+        count = 1 << int(file.pages.first.bitspersample)
+    middle = function[round(_MIDDLE * (count - 1))] / 65535 if function and len(function) >= count else 0.0
+    exponent = math.log(middle) / math.log(_MIDDLE) if 0 < middle < 1 else None
+    return profile, None if exponent is None else Encoding(exponent, "a TransferFunction")
+
+
+def _of_exif(tags: Mapping[int, Any]) -> Encoding | None:
+    """What EXIF says: the tag Gamma, or sRGB as the color space."""
+    gamma = _number(tags.get(_GAMMA))
+    if gamma is not None and gamma > 0:
+        return Encoding(gamma, f"EXIF gamma {gamma:.3g}")
+    return Encoding(SRGB_EXPONENT, "EXIF color space sRGB") if tags.get(_COLOR_SPACE) == 1 else None
+
+
+def profile_exponent(profile: bytes) -> float | None:
+    """The exponent of an ICC profile as in ``Encoding``; None where it has no such curve, or is damaged."""
     try:
-        profile = _profile(data)
-        decoded = None if profile is None else _decoded_middle(profile)
-    except (struct.error, zlib.error, OverflowError, ValueError, IndexError):
-        return None  # a damaged profile states nothing
+        decoded = _decoded_middle(profile)
+    except (struct.error, OverflowError, ValueError, IndexError):
+        return None
     if decoded is None or not 0 < decoded < 1:
         return None
     return math.log(decoded) / math.log(_MIDDLE)
-
-
-def _profile(data: bytes) -> bytes | None:
-    """The ICC profile in a picture file."""
-    if data.startswith(b"\xff\xd8"):
-        parts = [content for kind, content in jpeg_segments(data) if kind == 0xE2]
-        parts = [part[len(_JPEG_PROFILE) + 2 :] for part in parts if part.startswith(_JPEG_PROFILE)]
-        return b"".join(parts) or None
-    if data.startswith(b"\x89PNG"):
-        chunk = next((data[at + 8 : end - 4] for kind, at, end in png_chunks(data) if kind == b"iCCP"), None)
-        return None if chunk is None else zlib.decompress(chunk[chunk.index(b"\0") + 2 :])
-    if is_webp(data):
-        return next((data[at:end] for kind, at, end in webp_chunks(data) if kind == b"ICCP"), None)
-    if data[:4] in TIFF:
-        for tag, _, count, place in tiff_entries(data):
-            if tag == _TIFF_PROFILE:
-                (at,) = struct.unpack_from(tiff_order(data) + "I", data, place)
-                return data[at : at + count]
-    return None
 
 
 def _decoded_middle(profile: bytes) -> float | None:

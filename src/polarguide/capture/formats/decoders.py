@@ -153,7 +153,7 @@ _BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif
 _AVIF = (b"avif", b"avis")
 _ORIENTATION_OF_TURNS = (1, 8, 3, 6)
 """EXIF's number for quarter turns counter-clockwise."""
-_HIGH_RANGE = {16: "PQ", 18: "HLG"}
+HIGH_RANGE = {16: "PQ", 18: "HLG"}
 """Transfer characteristics (ITU-T H.273) of displays, which depend on more than the light at a pixel."""
 
 
@@ -255,6 +255,16 @@ def heif_tags(data: bytes) -> bytes:
         return b""
 
 
+def heif_colors(data: bytes) -> tuple[int | None, bytes | None]:
+    """Transfer characteristics and ICC profile that a HEIC file states.
+
+    Raises:
+        Exception: of several kinds, where the file is damaged or pillow-heif is not installed.
+    """
+    info = optional_import("pillow_heif", "color").open_heif(io.BytesIO(data)).info
+    return (info.get("nclx_profile") or {}).get("transfer_characteristics"), info.get("icc_profile")
+
+
 def heif_pixels(path: Path, data: bytes) -> NDArray[Any]:
     """The picture of a HEIC file as the camera stored it, before it is turned for display.
 
@@ -276,8 +286,8 @@ def heif_pixels(path: Path, data: bytes) -> NDArray[Any]:
     if len(opened) > 1:
         raise ValueError(f"a HEIC file of {len(opened)} pictures")
     transfer = (opened.info.get("nclx_profile") or {}).get("transfer_characteristics")
-    if transfer in _HIGH_RANGE:
-        raise ValueError(f"a HEIC file of high dynamic range ({_HIGH_RANGE[transfer]})")
+    if transfer in HIGH_RANGE:
+        raise ValueError(f"a HEIC file of high dynamic range ({HIGH_RANGE[transfer]})")
     bits, pixels = int(opened.info["bit_depth"]), np.asarray(opened)
     pixels = np.rot90(pixels, -head.turns)
     if pixels.shape[1::-1] != head.size:
