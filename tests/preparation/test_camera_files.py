@@ -15,15 +15,21 @@ from PIL.TiffImagePlugin import IFDRational
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.checks import measured_gains, pair_moments
-from polarguide.capture.filter.camera_files import stated_encoding
 from polarguide.capture.filter.develop import align_shots, estimate_shifts
-from polarguide.capture.filter.encoding import LOSSY, decide_transfer, slope_of_shots, stated_transfer
+from polarguide.capture.filter.encoding import (
+    LOSSY,
+    decide_transfer,
+    slope_of_shots,
+    stated_encoding,
+    stated_transfer,
+)
 from polarguide.capture.filter.shots import Shots
 from polarguide.capture.formats.pictures import decode_mask, decode_picture
 from polarguide.capture.sensor.demosaic import defects
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
 from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
 from polarguide.optics.color import srgb_encode_array as srgb_encode
+from polarguide.preparation.filter_source import SinglesSource
 from polarguide.preparation.mosaic_source import MosaicFiles, MosaicSource
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.shot_exposures import exposures_of_view, stated_exposures
@@ -62,7 +68,7 @@ def test_exposures_that_files_state_are_taken_back(tmp_path, stated):
         exif.get_ifd(0x8769)[0x829A] = IFDRational(1, time)
         paths.append(tmp_path / f"v_{angle}.jpg")
         image.save(paths[-1], exif=exif)
-    light = stated_exposures({"v": paths}, lambda done: None).get("v", [1.0] * 4)
+    light = stated_exposures({"v": paths}, lambda done: None)[0].get("v", [1.0] * 4)
     true = 1 / np.array(stated if light != [1.0] * 4 else (100, 100, 140, 100))
     found = exposures_of_view(
         [path.name for path in paths], four() * true[:, None, None] * 50, np.ones((96, 128), bool), light
@@ -352,3 +358,40 @@ def test_full_scales_that_contradict_one_another_or_the_values_are_refused(tmp_p
     (tmp_path / "w.png").write_bytes(cv2.imencode(".png", values)[1].tobytes())
     source = MosaicSource(tmp_path, PrepareSettings(sensor="IMX250MZR"))
     Fault(str(tmp_path / "w.png"), found="no full scale").raised_by(source.measure, lambda done: None)
+
+
+TIME, F_NUMBER, ISO = 0x829A, 0x829D, 0x8827
+EXPOSED = {TIME: IFDRational(1, 100), F_NUMBER: IFDRational(8, 1), ISO: 400}
+
+
+def exposed(path, **changes):
+    """A picture that states its exposure, with some tags changed, or left out where None."""
+    image = Image.new("RGB", (16, 16), (90, 90, 90))
+    exif = image.getexif()
+    tags = {**EXPOSED, **{globals()[name]: value for name, value in changes.items()}}
+    exif.get_ifd(0x8769).update({tag: value for tag, value in tags.items() if value is not None})
+    image.save(path, exif=exif)
+    return path
+
+
+@pytest.mark.parametrize("name", ["TIME", "F_NUMBER", "ISO"])
+@pytest.mark.parametrize("value", [None, 0])
+def test_a_tag_that_one_file_of_several_lacks_corrects_nothing(tmp_path, name, value):
+    """It does not count as f/1, ISO 100, or as no exposure of this file alone; of all files alike, it is equal."""
+    files = [exposed(tmp_path / f"cup_a{angle}.jpg") for angle in (0, 60, 120)]
+    value = IFDRational(0, 1) if value == 0 and name != "ISO" else value
+    exposed(files[1], **{name: value})
+    gains, missing = stated_exposures({"cup": files[:1], "other": files[1:]})
+    assert not gains
+    assert "1 of 3 files have no" in missing
+    assert "EXIF corrects no exposure" in missing
+    assert missing in read_shot(tmp_path, ShotOptions()).notes
+    measured = SinglesSource(tmp_path, PrepareSettings(poses="none")).measure(lambda done: None)
+    assert (measured["light"], measured["notes"][-1]) == ({}, missing)
+    for path, time in zip(files, (100, 100, 50), strict=True):
+        exposed(path, **{"TIME": IFDRational(1, time), name: value})
+    gains, missing = stated_exposures({"cup": files})
+    assert missing == ""
+    assert gains == (
+        {} if name == "TIME" else {"cup": pytest.approx([2 ** (-1 / 3), 2 ** (-1 / 3), 2 ** (2 / 3)])}
+    )

@@ -12,8 +12,7 @@ import pytest
 from faults import Fault
 from PIL import Image, ImageCms
 
-from polarguide.capture.filter.camera_files import stated_encoding
-from polarguide.capture.filter.encoding import stated_transfer, stated_video_transfer
+from polarguide.capture.filter.encoding import stated_encoding, stated_transfer, stated_video_transfer
 from polarguide.core.errors import PolarguideWarning
 from polarguide.optics.color import srgb_encode_array as srgb_encode
 from polarguide.preparation.filter_source import SinglesSource

@@ -26,8 +26,10 @@ from polarguide.capture.calibration import (
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.exposures import Angle, angle_text, turned
 from polarguide.capture.filter.camera_files import (
+    ExposureData,
     apply_orientation,
     is_camera_raw,
+    missing_tags,
     orientation,
     orientation_calibration,
     read_exposure_data,
@@ -233,8 +235,8 @@ class FilterSource(ShotsSource):
         levels, counted = levels_of_shots(self._shots, self._white, self._settings)
         decision = self._decided(levels)
         notes += [*counted, decision.note]
-        stated = stated_exposures(self._of_view, advance) if settings.gains == "auto" else {}
-        notes += exposure_notes(stated, len(self.views))
+        stated, missing = stated_exposures(self._of_view, advance) if settings.gains == "auto" else ({}, "")
+        notes += [missing] if missing else exposure_notes(stated)
         # One scale for all shots, with room for the largest gain that is corrected.
         room = math.sqrt(1.0 - LARGEST_IMBALANCE)
         if gains is None and settings.gains == "auto":
@@ -365,32 +367,31 @@ class SinglesSource(ShotsSource):
         self._require_one(kinds, "kind of file", "Keep one kind: their brightness cannot be compared.")
         levels, counted = levels_of_shots(self._shots, self._white, self._settings)
         decision = self._decided(levels)
-        light: dict[str, float] = {}
+        every: dict[Path, ExposureData] = {}
         cameras: dict[str, Path] = {}
         for number, view in enumerate(self.views, 1):
             for path in self._of_view[view]:
-                taken = read_exposure_data(path)
+                every[path] = taken = read_exposure_data(path)
                 if taken.camera:
                     cameras.setdefault(taken.camera, path)
-                if taken.light is not None:
-                    light[self._name(path)] = taken.light
             advance(number)
         remedy = "Prepare those of one camera; only one set of intrinsics is estimated."
         self._require_one(cameras, "camera", remedy)
-        whole = len(self._shots)
-        stating = "All" if len(light) == whole else f"{len(light) or 'None'} of {whole}"
+        missing, light = missing_tags(every), {}
+        if not missing:
+            light = {
+                self._name(path): value
+                for path, taken in every.items()
+                if (value := taken.light) is not None
+            }
+        stating = f"{'All' if light else 'None'} of {len(every)} files state their exposure (EXIF)."
         return {
             "transfer": decision.transfer,
             "scale": 1.0,
             "rounding": self._rounding(decision.transfer, 1.0),
             "levels": None if levels is None else asdict(levels),
             "light": light,
-            "notes": [
-                self._summary(),
-                decision.note,
-                *counted,
-                f"{stating} files state their exposure (EXIF).",
-            ],
+            "notes": [self._summary(), decision.note, *counted, missing or stating],
         }
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:

@@ -329,9 +329,9 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
         moved = moved_shots(shifts)
         notes += [f"Shots moved, in pixels: {', '.join(moved)}."] if moved else []
     saturated = np.asarray(clipped.any(axis=0))
-    stated = stated_exposures({shot.name: paths}).get(shot.name) if paths else None
-    exposed = np.asarray(stated or UNIT_GAINS)
-    notes += [corrected_note(stated)] if stated else []
+    stated, missing = stated_exposures({shot.name: paths})
+    exposed = np.asarray(stated.get(shot.name, UNIT_GAINS))
+    notes += [corrected_note(stated[shot.name])] if stated else [missing] if missing else []
     if options.gains == "auto" and options.calibration.gains is None:
         labels = [path.name for path in paths] or [f"picture {number}" for number in (1, 2, 3, 4)]
         measured = exposures_of_view(labels, linear.mean(axis=3), ~(saturated | dark), exposed.tolist())

@@ -315,9 +315,11 @@ def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:
     """The gain of each picture: as the table states, else as the files state their exposure; and notes."""
     gains = [picture.gain for picture in pictures]
     if all(gain is None and picture.frame is None for gain, picture in zip(gains, pictures, strict=True)):
-        stated = stated_exposures({"": [picture.path for picture in pictures]}).get("")
-        if stated is not None:
-            return stated, [corrected_note(stated)]
+        stated, missing = stated_exposures({"": [picture.path for picture in pictures]})
+        if stated:
+            return stated[""], [corrected_note(stated[""])]
+        if missing:
+            return [1.0] * len(pictures), [missing]
     return [1.0 if gain is None else gain for gain in gains], []
 
 

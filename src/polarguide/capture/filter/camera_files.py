@@ -11,7 +11,6 @@ import contextlib
 import importlib
 import io
 import math
-import struct
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -19,15 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.formats.arrays import array_kind
 from polarguide.capture.formats.decoders import (
-    HIGH_RANGE,
-    heif_colors,
     heif_head,
     heif_tags,
     is_heif,
@@ -35,15 +31,14 @@ from polarguide.capture.formats.decoders import (
     webp_chunks,
 )
 from polarguide.capture.formats.integrity import (
-    BIG_TIFF,
     LARGEST_PIXELS,
     ORIENTATION,
-    PNG,
     TIFF,
     jpeg_segments,
     png_chunk,
 )
 from polarguide.capture.formats.pictures import read_picture
+from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import read_file
 
@@ -254,16 +249,42 @@ _TIME, _F_NUMBER, _ISO = 33434, 33437, 34855
 
 @dataclass(frozen=True)
 class ExposureData:
-    """How a photograph was taken, as its file says.
+    """How a photograph was taken, as its file says; None for what it does not say, or not plausibly.
 
     Attributes:
         camera: maker and model; empty where it does not say.
-        light: how much light was let in and how it was amplified: seconds * ISO / f-number^2; None where it does not
-            say the time. ISO and f-number count as 100 and 1 where they are not said.
+        seconds, iso, f_number: of the exposure.
     """
 
-    camera: str
-    light: float | None
+    camera: str = ""
+    seconds: float | None = None
+    iso: float | None = None
+    f_number: float | None = None
+
+    @property
+    def light(self) -> float | None:
+        """How much light was let in and how it was amplified: seconds * ISO / f-number^2; None without a time.
+
+        Comparable among files that say the same of the three; ISO and f-number count as 1 where no file says them.
+        """
+        return (
+            None if self.seconds is None else self.seconds * (self.iso or 1.0) / (self.f_number or 1.0) ** 2
+        )
+
+
+_NAMES = {"seconds": "ExposureTime", "iso": "ISO", "f_number": "FNumber"}
+
+
+def missing_tags(taken: Mapping[Path, ExposureData]) -> str:
+    """A sentence where some files do not say what others say of their exposure; "" where they are comparable."""
+    for field, name in _NAMES.items():
+        without = [path.name for path, data in taken.items() if getattr(data, field) is None]
+        if 0 < len(without) < len(taken):
+            return (
+                f"{len(without)} of {len(taken)} files have no {name} in their EXIF tags ({listed(without)}), and the "
+                "others have: EXIF corrects no exposure."
+            )
+    return ""
 
 
 def read_exposure_data(path: Path) -> ExposureData:
@@ -275,13 +296,13 @@ def read_exposure_data(path: Path) -> ExposureData:
     raw = is_camera_raw(path)
     data = read_file(path) if raw else read_picture(path)
     exposure = exif_data(data)
-    if not raw or exposure.light is not None or data[:4] in TIFF:
+    if not raw or exposure.seconds is not None or data[:4] in TIFF:
         return exposure
     libraw = optional_import("rawpy", str(path))
     # LibRaw's errors: whoever develops the file says what is wrong with it.
     with contextlib.suppress(Exception), libraw.imread(io.BytesIO(data)) as opened:
         other = opened.other  # which some versions of rawpy do not have
-        return ExposureData("", _light(other.shutter, other.iso_speed, other.aperture))
+        return _plausible("", other.shutter, other.iso_speed, other.aperture)
     return exposure
 
 
@@ -289,149 +310,25 @@ def exif_data(data: bytes) -> ExposureData:
     """Exposure data in the EXIF tags of a picture file; damaged tags count as missing."""
     tags = tags_of(data)
     names = (str(tags.get(tag, "")).partition("\0")[0].strip() for tag in (_MAKER, _MODEL))
-    light = _light(*(_number(tags.get(tag)) for tag in (_TIME, _ISO, _F_NUMBER)))
-    return ExposureData(" ".join(filter(None, names)), light)
+    return _plausible(
+        " ".join(filter(None, names)), *(number_of(tags.get(tag)) for tag in (_TIME, _ISO, _F_NUMBER))
+    )
 
 
-def _light(seconds: float | None, iso: float | None, f_number: float | None) -> float | None:
-    """Relative exposure of plausible numbers; None without a time."""
-    if seconds is None or not 0 < seconds < 1e5:
-        return None
-    iso = iso if iso is not None and 0 < iso < 1e8 else 100.0
-    f_number = f_number if f_number is not None and 0.1 < f_number < 1000 else 1.0
-    return seconds * iso / f_number**2
+def _plausible(camera: str, seconds: float | None, iso: float | None, f_number: float | None) -> ExposureData:
+    """Exposure data without numbers that no camera has, such as the 0 of a lens that states no aperture."""
+    return ExposureData(
+        camera,
+        seconds if seconds is not None and 0 < seconds < 1e5 else None,
+        iso if iso is not None and 0 < iso < 1e8 else None,
+        f_number if f_number is not None and 0.1 < f_number < 1000 else None,
+    )
 
 
-def _number(value: Any) -> float | None:
+def number_of(value: Any) -> float | None:
     """A tag as a number, the first of several; None where it is missing or not finite."""
     try:
         number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, IndexError, ZeroDivisionError):
         return None
     return number if math.isfinite(number) else None
-
-
-SRGB_EXPONENT = 2.22
-"""Of sRGB at half scale."""
-_CHARACTERISTICS = {
-    **dict.fromkeys((1, 6, 7, 13, 14, 15), SRGB_EXPONENT),
-    4: 2.2,
-    5: 2.8,
-    8: 1.0,
-}
-"""Exponents of transfer characteristics (ITU-T H.273). Those of television are shown as sRGB is."""
-_UNSPECIFIED = 2
-_TIFF_PROFILE, _TRANSFER_FUNCTION = 34675, 301
-_COLOR_SPACE, _GAMMA = 40961, 42240
-_CURVES = (b"rTRC", b"kTRC")
-_PARAMETERS = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}
-_MIDDLE = 0.5
-
-
-@dataclass(frozen=True)
-class Encoding:
-    """How a picture file says that it is encoded.
-
-    Attributes:
-        exponent: light = value ^ exponent at half scale: 1 is linear, 2.2 sRGB and Adobe RGB, 1.8 ProPhoto RGB; None
-            where it is no such curve.
-        words: what says so.
-    """
-
-    exponent: float | None
-    words: str
-
-
-def stated_encoding(data: bytes) -> Encoding | None:
-    """The encoding that a picture file states; None where it states none that can be read.
-
-    By transfer characteristics (cICP of PNG, nclx of HEIC), else an ICC profile, else sRGB and gAMA of PNG or
-    TransferFunction of TIFF, else gamma and color space of EXIF: a more specific statement goes first, as in the
-    standard of PNG.
-    """
-    characteristics, profile, rest = None, None, None
-    # A statement that cannot be read states nothing: Pillow, tifffile and pillow-heif raise what they please.
-    with contextlib.suppress(Exception), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        if data[:4] in (*TIFF, *BIG_TIFF):
-            profile, rest = _of_tiff(data)
-        elif is_heif(data):
-            characteristics, profile = heif_colors(data)
-        else:
-            with Image.open(io.BytesIO(data)) as image:
-                profile = image.info.get("icc_profile")
-                rest = _of_png(image.info)
-            stated = png_chunk(data, b"cICP") if data.startswith(PNG) else None
-            characteristics = stated[1] if stated else None
-    if characteristics is not None and characteristics != _UNSPECIFIED:
-        name = HIGH_RANGE.get(characteristics, f"number {characteristics} of H.273")
-        return Encoding(_CHARACTERISTICS.get(characteristics), f"its transfer characteristics ({name})")
-    exponent = None if profile is None else profile_exponent(profile)
-    if exponent is not None:
-        return Encoding(exponent, "a color profile (ICC)")
-    return rest or _of_exif(tags_of(data))
-
-
-def _of_png(info: Mapping[str | tuple[int, int], Any]) -> Encoding | None:
-    """What the chunks sRGB and gAMA say, as Pillow reads them."""
-    if "srgb" in info:
-        return Encoding(SRGB_EXPONENT, "an sRGB chunk")
-    gamma = info.get("gamma")
-    return Encoding(1 / gamma, f"a gAMA chunk of {gamma:.5g}") if gamma else None
-
-
-def _of_tiff(data: bytes) -> tuple[bytes | None, Encoding | None]:
-    """The ICC profile of a TIFF file, and what its transfer function says."""
-    with tifffile.TiffFile(io.BytesIO(data)) as file:
-        tags = file.pages.first.tags
-        profile, function = tags.valueof(_TIFF_PROFILE), tags.valueof(_TRANSFER_FUNCTION)
-        count = 1 << int(file.pages.first.bitspersample)
-    middle = function[round(_MIDDLE * (count - 1))] / 65535 if function and len(function) >= count else 0.0
-    exponent = math.log(middle) / math.log(_MIDDLE) if 0 < middle < 1 else None
-    return profile, None if exponent is None else Encoding(exponent, "a TransferFunction")
-
-
-def _of_exif(tags: Mapping[int, Any]) -> Encoding | None:
-    """What EXIF says: the tag Gamma, or sRGB as the color space."""
-    gamma = _number(tags.get(_GAMMA))
-    if gamma is not None and gamma > 0:
-        return Encoding(gamma, f"EXIF gamma {gamma:.3g}")
-    return Encoding(SRGB_EXPONENT, "EXIF color space sRGB") if tags.get(_COLOR_SPACE) == 1 else None
-
-
-def profile_exponent(profile: bytes) -> float | None:
-    """The exponent of an ICC profile as in ``Encoding``; None where it has no such curve, or is damaged."""
-    try:
-        decoded = _decoded_middle(profile)
-    except (struct.error, OverflowError, ValueError, IndexError):
-        return None
-    if decoded is None or not 0 < decoded < 1:
-        return None
-    return math.log(decoded) / math.log(_MIDDLE)
-
-
-def _decoded_middle(profile: bytes) -> float | None:
-    """Value of a profile's red or gray curve at half scale (ICC.1, curveType and parametricCurveType)."""
-    (count,) = struct.unpack_from(">I", profile, 128)
-    entries = [struct.unpack_from(">4sII", profile, 132 + 12 * number) for number in range(min(count, 100))]
-    at = next((at for name, at, _ in entries if name in _CURVES), None)
-    if at is None:
-        return None
-    kind = profile[at : at + 4]
-    if kind == b"curv":
-        (count,) = struct.unpack_from(">I", profile, at + 8)
-        if count == 0:
-            return _MIDDLE
-        if count == 1:
-            return float(_MIDDLE ** (struct.unpack_from(">H", profile, at + 12)[0] / 256))
-        return float(struct.unpack_from(">H", profile, at + 12 + 2 * round(_MIDDLE * (count - 1)))[0]) / 65535
-    if kind != b"para":
-        return None
-    (form,) = struct.unpack_from(">H", profile, at + 8)
-    if form not in _PARAMETERS:
-        return None
-    numbers = [n / 65536 for n in struct.unpack_from(f">{_PARAMETERS[form]}i", profile, at + 12)]
-    factor, shift = numbers[1:3] if form else (1.0, 0.0)
-    # Half scale lies above the linear part of every curve in use.
-    raised = numbers[{2: 3, 4: 5}[form]] if form in (2, 4) else 0.0
-    return float(max(0.0, factor * _MIDDLE + shift) ** max(numbers[0], 0.1) + raised)

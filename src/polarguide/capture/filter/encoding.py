@@ -2,19 +2,155 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import itertools
-from collections.abc import Callable, Sequence
+import math
+import struct
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import tifffile
+from PIL import Image
 
 from polarguide.capture import checks
 from polarguide.capture.exposures import Angle
-from polarguide.capture.filter.camera_files import SRGB_EXPONENT, is_camera_raw, stated_encoding
+from polarguide.capture.filter.camera_files import is_camera_raw, number_of, tags_of
 from polarguide.capture.filter.shots import Shots
+from polarguide.capture.formats.decoders import HIGH_RANGE, heif_colors, is_heif
+from polarguide.capture.formats.integrity import BIG_TIFF, PNG, TIFF, png_chunk
 from polarguide.capture.formats.pictures import is_lossy, linear_codes, read_picture
 from polarguide.core.errors import PolarguideError, optional_import
+
+SRGB_EXPONENT = 2.22
+"""Of sRGB at half scale."""
+_CHARACTERISTICS = {
+    **dict.fromkeys((1, 6, 7, 13, 14, 15), SRGB_EXPONENT),
+    4: 2.2,
+    5: 2.8,
+    8: 1.0,
+}
+"""Exponents of transfer characteristics (ITU-T H.273). Those of television are shown as sRGB is."""
+_UNSPECIFIED = 2
+_TIFF_PROFILE, _TRANSFER_FUNCTION = 34675, 301
+_COLOR_SPACE, _GAMMA = 40961, 42240
+_CURVES = (b"rTRC", b"kTRC")
+_PARAMETERS = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}
+_MIDDLE = 0.5
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How a picture file says that it is encoded.
+
+    Attributes:
+        exponent: light = value ^ exponent at half scale: 1 is linear, 2.2 sRGB and Adobe RGB, 1.8 ProPhoto RGB; None
+            where it is no such curve.
+        words: what says so.
+    """
+
+    exponent: float | None
+    words: str
+
+
+def stated_encoding(data: bytes) -> Encoding | None:
+    """The encoding that a picture file states; None where it states none that can be read.
+
+    By transfer characteristics (cICP of PNG, nclx of HEIC), else an ICC profile, else sRGB and gAMA of PNG or
+    TransferFunction of TIFF, else gamma and color space of EXIF: a more specific statement goes first, as in the
+    standard of PNG.
+    """
+    characteristics, profile, rest = None, None, None
+    # A statement that cannot be read states nothing: Pillow, tifffile and pillow-heif raise what they please.
+    with contextlib.suppress(Exception), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if data[:4] in (*TIFF, *BIG_TIFF):
+            profile, rest = _of_tiff(data)
+        elif is_heif(data):
+            characteristics, profile = heif_colors(data)
+        else:
+            with Image.open(io.BytesIO(data)) as image:
+                profile = image.info.get("icc_profile")
+                rest = _of_png(image.info)
+            stated = png_chunk(data, b"cICP") if data.startswith(PNG) else None
+            characteristics = stated[1] if stated else None
+    if characteristics is not None and characteristics != _UNSPECIFIED:
+        name = HIGH_RANGE.get(characteristics, f"number {characteristics} of H.273")
+        return Encoding(_CHARACTERISTICS.get(characteristics), f"its transfer characteristics ({name})")
+    exponent = None if profile is None else profile_exponent(profile)
+    if exponent is not None:
+        return Encoding(exponent, "a color profile (ICC)")
+    return rest or _of_exif(tags_of(data))
+
+
+def _of_png(info: Mapping[str | tuple[int, int], Any]) -> Encoding | None:
+    """What the chunks sRGB and gAMA say, as Pillow reads them."""
+    if "srgb" in info:
+        return Encoding(SRGB_EXPONENT, "an sRGB chunk")
+    gamma = info.get("gamma")
+    return Encoding(1 / gamma, f"a gAMA chunk of {gamma:.5g}") if gamma else None
+
+
+def _of_tiff(data: bytes) -> tuple[bytes | None, Encoding | None]:
+    """The ICC profile of a TIFF file, and what its transfer function says."""
+    with tifffile.TiffFile(io.BytesIO(data)) as file:
+        tags = file.pages.first.tags
+        profile, function = tags.valueof(_TIFF_PROFILE), tags.valueof(_TRANSFER_FUNCTION)
+        count = 1 << int(file.pages.first.bitspersample)
+    middle = function[round(_MIDDLE * (count - 1))] / 65535 if function and len(function) >= count else 0.0
+    exponent = math.log(middle) / math.log(_MIDDLE) if 0 < middle < 1 else None
+    return profile, None if exponent is None else Encoding(exponent, "a TransferFunction")
+
+
+def _of_exif(tags: Mapping[int, Any]) -> Encoding | None:
+    """What EXIF says: the tag Gamma, or sRGB as the color space."""
+    gamma = number_of(tags.get(_GAMMA))
+    if gamma is not None and gamma > 0:
+        return Encoding(gamma, f"EXIF gamma {gamma:.3g}")
+    return Encoding(SRGB_EXPONENT, "EXIF color space sRGB") if tags.get(_COLOR_SPACE) == 1 else None
+
+
+def profile_exponent(profile: bytes) -> float | None:
+    """The exponent of an ICC profile as in ``Encoding``; None where it has no such curve, or is damaged."""
+    try:
+        decoded = _decoded_middle(profile)
+    except (struct.error, OverflowError, ValueError, IndexError):
+        return None
+    if decoded is None or not 0 < decoded < 1:
+        return None
+    return math.log(decoded) / math.log(_MIDDLE)
+
+
+def _decoded_middle(profile: bytes) -> float | None:
+    """Value of a profile's red or gray curve at half scale (ICC.1, curveType and parametricCurveType)."""
+    (count,) = struct.unpack_from(">I", profile, 128)
+    entries = [struct.unpack_from(">4sII", profile, 132 + 12 * number) for number in range(min(count, 100))]
+    at = next((at for name, at, _ in entries if name in _CURVES), None)
+    if at is None:
+        return None
+    kind = profile[at : at + 4]
+    if kind == b"curv":
+        (count,) = struct.unpack_from(">I", profile, at + 8)
+        if count == 0:
+            return _MIDDLE
+        if count == 1:
+            return float(_MIDDLE ** (struct.unpack_from(">H", profile, at + 12)[0] / 256))
+        return float(struct.unpack_from(">H", profile, at + 12 + 2 * round(_MIDDLE * (count - 1)))[0]) / 65535
+    if kind != b"para":
+        return None
+    (form,) = struct.unpack_from(">H", profile, at + 8)
+    if form not in _PARAMETERS:
+        return None
+    numbers = [n / 65536 for n in struct.unpack_from(f">{_PARAMETERS[form]}i", profile, at + 12)]
+    factor, shift = numbers[1:3] if form else (1.0, 0.0)
+    # Half scale lies above the linear part of every curve in use.
+    raised = numbers[{2: 3, 4: 5}[form]] if form in (2, 4) else 0.0
+    return float(max(0.0, factor * _MIDDLE + shift) ** max(numbers[0], 0.1) + raised)
+
 
 LOSSY, PLAIN, CAMERA_RAW = "JPEG, WebP or HEIC", "PNG, TIFF or BMP", "camera raw"
 VIDEO, ARRAY = "video", "array"
