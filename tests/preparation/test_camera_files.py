@@ -173,6 +173,26 @@ def test_mirrored_mosaics_are_turned_back(tmp_path, flip):
     assert (files.read(tmp_path / "v.npy") == values).all()
 
 
+@pytest.mark.parametrize(("flip", "turns"), [("90", 1), ("270", 3)])
+@pytest.mark.parametrize("sensor", ["IMX250MZR", "IMX250MYR"])
+def test_mosaics_turned_by_a_quarter_are_turned_back(tmp_path, flip, turns, sensor):
+    """They are developed as the sensor saw them; their size in headers is exchanged, too."""
+    values = np.rint(mosaic(four(), sensor) * 4095).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "v.png"), np.ascontiguousarray(np.rot90(values, turns)))
+    settings = PrepareSettings(sensor=sensor, flip=flip)
+    assert (MosaicFiles(settings).read(tmp_path / "v.png") == values).all()
+    stored = MosaicSource(tmp_path, settings).stored("v")
+    assert (stored.size, stored.developed) == ((128, 96), (64, 48))
+
+
+def test_a_whole_sensor_that_stands_upright_is_refused(tmp_path):
+    np.save(tmp_path / "v.npy", np.random.default_rng(0).integers(0, 4096, (2448, 2048), np.uint16))
+    fault = Fault(found="2048x2448", remedy="--flip 90")
+    fault.raised_by(MosaicFiles(PrepareSettings(sensor="IMX250MZR")).read, tmp_path / "v.npy")
+    fault.raised_by(read_shot, tmp_path / "v.npy", ShotOptions(sensor="IMX250MZR"))
+    assert MosaicFiles(PrepareSettings(sensor="IMX253MZR")).read(tmp_path / "v.npy").shape == (2448, 2048)
+
+
 @pytest.mark.parametrize(
     ("stored", "asked"),
     [("12p", "12packed"), ("12packed", "12p"), ("12mipi", "12packed"), ("10mipi", "10p"), ("16be", "16")],

@@ -380,9 +380,7 @@ class SinglesSource(ShotsSource):
         missing, light = missing_tags(every), {}
         if not missing:
             light = {
-                self._name(path): value
-                for path, taken in every.items()
-                if (value := taken.light) is not None
+                self._name(path): value for path, taken in every.items() if (value := taken.light) is not None
             }
         stating = f"{'All' if light else 'None'} of {len(every)} files state their exposure (EXIF)."
         return {

@@ -61,7 +61,8 @@ class ShotOptions(MosaicOptions):
         saturation: Stored value from which the sensor saturates; without it that at which samples pile up, or full
             scale.
         gamma: Gamma that the camera applied to mosaics: stored = light ^ gamma.
-        flip: Which way the camera mirrored the mosaics (Reverse X, Reverse Y): undone before anything else.
+        flip: Which way the mosaics were mirrored (Reverse X, Reverse Y), or the degrees by which they were turned
+            counter-clockwise: undone before anything else.
         demosaic: full, half or quarter resolution of the sensor.
         interpolation: How half and full fill in colors and angles.
         transfer: Encoding of filter shots; auto by the curvature of the response.
@@ -80,7 +81,7 @@ class ShotOptions(MosaicOptions):
     dark_frame: Path | None = None
     saturation: Positive | None = None
     gamma: Annotated[float, Meta(ge=0.1, le=4.0)] = 1.0
-    flip: Literal["none", "x", "y", "xy"] = "none"
+    flip: Literal["none", "x", "y", "xy", "90", "270"] = "none"
     demosaic: Literal["half", "quarter", "full"] = "full"
     interpolation: Literal["bilinear", "guided"] = "bilinear"
     transfer: Literal["auto", "linear", "srgb"] = "auto"

@@ -265,10 +265,10 @@ class ExposureData:
     def light(self) -> float | None:
         """How much light was let in and how it was amplified: seconds * ISO / f-number^2; None without a time.
 
-        Comparable among files that say the same of the three; ISO and f-number count as 1 where no file says them.
+        Comparable among files that say the same of the three: ISO and f-number count as 100 and 1 where none does.
         """
         return (
-            None if self.seconds is None else self.seconds * (self.iso or 1.0) / (self.f_number or 1.0) ** 2
+            None if self.seconds is None else self.seconds * (self.iso or 100.0) / (self.f_number or 1.0) ** 2
         )
 
 

@@ -311,7 +311,7 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())
 _GRAY, _RGB, _PALETTE, _YCBCR = 1, 2, 3, 6
 _WHITE_IS_ZERO = 0
 _SAMPLES = {_GRAY: 1, _RGB: 3, _PALETTE: 1, _YCBCR: 3}
-_JPEG = (6, 7)
+JPEG_IN_TIFF = (6, 7)
 """Compressions that decode to RGB what is stored as luminance and color differences."""
 _NO_PICTURE, _OLD_REDUCED = 1 | 4, 2
 """Of NewSubfileType: a smaller copy, or a mask of transparency; of the older tag: a smaller copy."""
@@ -411,7 +411,7 @@ def _judged(page: tifffile.TiffPage) -> tuple[int, bool]:
     meaning, samples = int(page.photometric), int(page.samplesperpixel)
     if meaning == _WHITE_IS_ZERO:
         raise UnreadableTiffError("a TIFF file whose white is 0")
-    if meaning not in _SAMPLES or (meaning == _YCBCR and int(page.compression) not in _JPEG):
+    if meaning not in _SAMPLES or (meaning == _YCBCR and int(page.compression) not in JPEG_IN_TIFF):
         name = getattr(page.photometric, "name", str(meaning)).lower()
         raise UnreadableTiffError(f"a TIFF file of the color model {name}")
     more = samples - _SAMPLES[meaning]

@@ -16,14 +16,17 @@ from numpy.typing import NDArray
 
 from polarguide.capture.formats.arrays import BROKEN, array_header, exr_size, hdr_size
 from polarguide.capture.formats.decoders import (
+    JPEG_IN_TIFF,
     UnreadableTiffError,
     decode_tiff,
     heif_pixels,
     is_heif,
+    is_webp,
     plain_head,
     plain_pixels,
     rescaled,
     tiff_full_scale,
+    webp_chunks,
 )
 from polarguide.capture.formats.integrity import (
     BIG_TIFF,
@@ -194,9 +197,16 @@ def decode_materials(path: Path, data: bytes) -> NDArray[np.uint8]:
     """Decode a picture of materials into [H, W]: 0 unknown, 1 dielectric, 2 metal, from 3 on what ``scene.json`` says.
 
     Raises:
-        PolarguideError: the file is damaged, cut short, of another kind, or has a larger value than a byte holds.
+        PolarguideError: the file is damaged, cut short, of another kind, lossy, or has a value beyond 255.
     """
     pixels = decode_stored(path, data)
+    if _loses_detail(data):
+        raise PolarguideError(
+            path,
+            expected="a lossless picture, such as PNG, which keeps the numbers of materials",
+            found="a compression that changes them (JPEG, HEIC, WebP)",
+            remedy=f"Save it as PNG. {MATERIAL_REMEDY}",
+        )
     gray = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)
     if int(gray.max(initial=0)) > MOST_MATERIAL:
         raise PolarguideError(
@@ -288,6 +298,16 @@ def _unreadable(path: Path, found: str) -> PolarguideError:
 def is_lossy(path: Path) -> bool:
     """Whether a file is of a kind that loses detail, and that is sRGB by custom: JPEG, WebP or HEIC, by its suffix."""
     return path.suffix.lower() in _LOSSY
+
+
+def _loses_detail(data: bytes) -> bool:
+    """Whether the compression of a picture changes its values; by its content, whatever its suffix."""
+    if is_webp(data):
+        return any(kind == b"VP8 " for kind, _, _ in webp_chunks(data))
+    if data[:4] in (*TIFF, *BIG_TIFF):
+        with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+            return int(tiff.pages.first.compression) in JPEG_IN_TIFF
+    return data.startswith(b"\xff\xd8") or is_heif(data)
 
 
 def stated_full_scale(path: Path, file: BinaryIO, samples: NDArray[Any]) -> int | None:
