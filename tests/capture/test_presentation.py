@@ -61,8 +61,8 @@ def test_what_is_written_is_read_and_what_is_missing_is_left_out(tmp_path: Path)
         ('{"title": "' + 1001 * "x" + '"}', Fault("(title)")),
         ("[]", Fault(expected="JSON object")),
         (
-            '{"chart": {"matrix": [[1, 0, 0], [0, -1, 0.5], [0, 0, 1]], "delta_e": 1, "delta_e_worst": 1, "patches": 9, '
-            '"view": "v"}}',
+            '{"chart": {"matrix": [[1, 0, 0], [0, -1, 0.5], [0, 0, 1]], "delta_e": 1, "delta_e_worst": 1, '
+            '"patches": 9, "view": "v"}}',
             Fault("matrix", expected="positive sums", found="-0.5"),
         ),
     ],
