@@ -310,7 +310,7 @@ def decide_transfer(
         return TransferDecision(stated[0], note, _doubt(slope, stated[0]))
     untold = ""
     if slope is not None:
-        untold = ": too few pixels are polarized for pair sums to tell"
+        untold = ": no two pairs at right angles, or too few pixels are polarized for their sums to tell"
     if measured is not None:
         untold = f": the curvature of the response is {measured:+.2f}, between those of linear files and sRGB"
     if kind == PLAIN and eight and slope is not None:
