@@ -6,6 +6,7 @@ import math
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 import torch
 from faults import Fault
 from heard import Heard
+from PIL import Image
 from tiny_capture import NAMES, TinyCapture
 
 from polarguide.capture import load_scene
@@ -147,6 +149,35 @@ def test_masks_of_any_convention(capture: TinyCapture) -> None:
     assert not scene.view("v005").mask.any()
     assert scene.view("v006").mask is None
     assert scene.warnings == ("masks/ has no file for 3 of 9 views (v006, v007, v008).",)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "options", "lossless"),
+    [
+        (".png", {}, True),
+        (".webp", {"lossless": True}, True),
+        (".tif", {"compression": "tiff_lzw"}, True),
+        (".jpg", {"quality": 100}, False),
+        (".webp", {"quality": 90}, False),
+        (".tif", {"compression": "jpeg"}, False),
+    ],
+)
+def test_materials_of_lossy_files_are_refused(
+    capture: TinyCapture, suffix: str, options: dict[str, Any], lossless: bool
+) -> None:
+    """Compression makes other numbers of the numbers of materials."""
+    height, width = 10, 12
+    path = capture.root / "materials" / f"v003{suffix}"
+    path.parent.mkdir()
+    numbers = np.zeros((height, width, 3) if suffix == ".webp" else (height, width), np.uint8)
+    numbers[:, width // 2 :] = 2
+    Image.fromarray(numbers).save(path, **options)
+    if lossless:
+        found = load_scene(capture.root).view("v003").materials
+        assert found is not None
+        assert (found.numpy() == (numbers if numbers.ndim == 2 else numbers[..., 0])).all()
+    else:
+        Fault(str(path), expected="lossless", remedy="PNG").raised_by(load_scene, capture.root)
 
 
 def test_materials_of_any_number_of_views(capture: TinyCapture) -> None:

@@ -60,6 +60,11 @@ def test_what_is_written_is_read_and_what_is_missing_is_left_out(tmp_path: Path)
         ('{"licence": "CC0"}', Fault(expected="only white_balance, chart", found="licence")),
         ('{"title": "' + 1001 * "x" + '"}', Fault("(title)")),
         ("[]", Fault(expected="JSON object")),
+        (
+            '{"chart": {"matrix": [[1, 0, 0], [0, -1, 0.5], [0, 0, 1]], "delta_e": 1, "delta_e_worst": 1, '
+            '"patches": 9, "view": "v"}}',
+            Fault("matrix", expected="positive sums", found="-0.5"),
+        ),
     ],
 )
 def test_what_is_wrong_is_refused_by_name(text: str, fault: Fault, tmp_path: Path) -> None:

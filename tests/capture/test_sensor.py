@@ -81,7 +81,27 @@ def test_patterns_and_their_offsets(sensor: str, rows: tuple[str, ...]) -> None:
 def test_a_sensor_is_named_in_any_case(settings: type[MosaicOptions]) -> None:
     for name in SENSORS:
         assert settings(sensor=name.lower()).checked().sensor == name  # type: ignore[arg-type, attr-defined]
-    Fault("--sensor", found='"imx"').raised_by(settings(sensor="imx").checked)  # type: ignore[arg-type, attr-defined]
+    unknown = Fault("--sensor", found="'imx'", expected="TRI050S-P", remedy="IMX250MZR has the same pattern")
+    unknown.raised_by(settings(sensor="imx").checked)  # type: ignore[arg-type, attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("model", "sensor"),
+    [
+        ("imx253mzr", "IMX253MZR"),
+        ("BFS-U3-51S5P-C", "IMX250MZR"),
+        ("BFS-U3-51S5P-BD2", "IMX250MZR"),
+        ("BFS-U3-51S5PC-C", "IMX250MYR"),
+        ("BFS-PGE-123S6P-C", "IMX253MZR"),
+        ("PHX050S1-PC", "IMX264MZR"),
+        ("tri050s-qc", "IMX250MYR"),
+        ("DZK 33UX250", "IMX250MZR"),
+        ("dyk_33ux250", "IMX250MYR"),
+        ("GO-5100MP-USB", "IMX250MZR"),
+    ],
+)
+def test_a_camera_is_read_as_its_sensor(model: str, sensor: str) -> None:
+    assert PrepareSettings(sensor=model).checked().sensor == sensor  # type: ignore[arg-type]
 
 
 def test_simulated_sensors_are_named_and_recorded_alike() -> None:

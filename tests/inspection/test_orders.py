@@ -51,13 +51,18 @@ def test_an_order_turns_the_aolp_as_its_sense_and_zero_say(order) -> None:
     torch.testing.assert_close(torch.sin(2 * after), torch.sin(2 * expected), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("key", MOSAICS)
-def test_mirrored_and_shifted_mosaics_are_named_by_the_options_that_read_them(key) -> None:
-    """By the angles of a sensor whose mosaic is mirrored or begins elsewhere, in the frame of that picture."""
+CAUSES = [(key, place) for key, causes in MOSAICS.items() for place in range(causes.count("--flip") or 1)]
+
+
+@pytest.mark.parametrize(("key", "place"), CAUSES)
+def test_mirrored_turned_and_shifted_mosaics_are_named_by_the_options_that_read_them(key, place) -> None:
+    """By the angles of a sensor whose mosaic is mirrored, turned or begins elsewhere, in the frame of that picture."""
     pattern = sensor_pattern("IMX250MZR").angles
     stored = np.tile(pattern, (2, 2))
-    option, value = MOSAICS[key].split(",")[0].split()[:2]
-    if option == "--flip":
+    option, value = MOSAICS[key].replace(",", "").split(" or ")[place].split()[:2]
+    if value in ("90", "270"):
+        stored = (np.rot90(stored, int(value) // 90) + int(value)) % 180
+    elif option == "--flip":
         stored = stored[:, ::-1] if "x" in value else stored
         stored = stored[::-1] if "y" in value else stored
         stored = -stored % 180 if len(value) == 1 else stored  # a mirror turns angles round

@@ -107,15 +107,33 @@ def test_arrays_in_arrays_out(name: str) -> None:
 @pytest.mark.parametrize(
     ("kind", "result"),
     [
-        (np.uint8, np.float32), (np.uint16, np.float32), (np.int32, np.float64), (np.float16, np.float32),
-        (np.float32, np.float32), (np.float64, np.float64), (">f4", np.float32),
+        (np.int32, np.float64), (np.float16, np.float32), (np.float32, np.float32), (np.float64, np.float64),
+        (">f4", np.float32),
     ],
 )  # fmt: skip
 def test_numbers_of_every_kind(kind: Any, result: Any) -> None:
-    """Differences of unsigned numbers would wrap around."""
-    found = optics.stokes(np.array([[10], [20], [30], [5]]).astype(kind))
-    assert found.dtype == result
-    assert found[:, 0].tolist() == [32.5, -20.0, 15.0]
+    values = np.array([[10], [20], [30]]).astype(kind)
+    assert optics.dolp(values).dtype == result
+    if np.dtype(kind).kind == "f":
+        four = np.array([[10], [20], [30], [5]]).astype(kind)
+        assert optics.stokes(four)[:, 0].tolist() == [32.5, -20.0, 15.0]
+
+
+@pytest.mark.parametrize(("kind", "full"), [("u1", 255), ("<u2", 65535), (">u2", 65535)])
+def test_codes_are_shares_of_full_scale(kind: str, full: int) -> None:
+    """As ``read_shot`` takes them. Differences of unsigned numbers would wrap around."""
+    codes = np.array([[10], [20], [30], [5]]).astype(kind)
+    expected = np.array([32.5, -20.0, 15.0]) / full
+    assert optics.stokes(codes)[:, 0] == pytest.approx(expected, rel=1e-6)
+    found = optics.stokes(torch.from_numpy(codes.astype(codes.dtype.newbyteorder("="))))
+    assert found[:, 0].tolist() == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", [np.int32, np.uint32, np.int8, bool])
+def test_other_whole_numbers_tell_no_full_scale(kind: Any) -> None:
+    for four in (np.ones((4, 2), kind), torch.from_numpy(np.ones((4, 2), kind))):
+        with pytest.raises(ValueError, match="divide them by full scale"):
+            optics.stokes(four)
 
 
 def test_views_and_read_only_arrays() -> None:

@@ -293,3 +293,14 @@ def test_no_noise_leaves_the_degree() -> None:
 def test_wrong_shapes() -> None:
     with pytest.raises(ValueError, match="variances: "):
         optics.polarization_uncertainty(torch.zeros(3, 2), torch.zeros(3, 2))
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+def test_aolp_is_below_pi_in_every_precision(kind):
+    """A tiny negative angle is the angle 0, which rounding must not show as pi beside it."""
+    tiny = -(10.0 ** torch.arange(-20, -1, dtype=torch.float64))
+    stokes = torch.stack((torch.ones_like(tiny), torch.ones_like(tiny), tiny)).to(kind)
+    angles = optics.aolp(stokes)
+    assert (angles >= 0).all()
+    assert (angles < torch.tensor(math.pi, dtype=kind)).all()
+    assert (angles.double() < math.pi).all()

@@ -2,6 +2,7 @@
 
 import io
 import struct
+import zlib
 
 import cv2
 import numpy as np
@@ -12,13 +13,15 @@ from faults import Fault
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
+from polarguide.capture.calibration import Calibration
 from polarguide.capture.checks import measured_gains, pair_moments
-from polarguide.capture.filter.camera_files import stated_exponent
-from polarguide.capture.filter.develop import (
-    align_shots,
+from polarguide.capture.filter.develop import align_shots, estimate_shifts
+from polarguide.capture.filter.encoding import (
+    LOSSY,
     decide_transfer,
-    estimate_shifts,
-    require_known_encoding,
+    slope_of_shots,
+    stated_encoding,
+    stated_transfer,
 )
 from polarguide.capture.filter.shots import Shots
 from polarguide.capture.formats.pictures import decode_mask, decode_picture
@@ -26,9 +29,12 @@ from polarguide.capture.sensor.demosaic import defects
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
 from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
 from polarguide.optics.color import srgb_encode_array as srgb_encode
-from polarguide.preparation.mosaic_source import MosaicFiles
+from polarguide.preparation.filter_source import SinglesSource
+from polarguide.preparation.mosaic_source import MosaicFiles, MosaicSource
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.shot_exposures import exposures_of_view, stated_exposures
+from polarguide.shots.options import ShotOptions
+from polarguide.shots.read import read_shot
 
 
 def four(height=96, width=128):
@@ -62,7 +68,7 @@ def test_exposures_that_files_state_are_taken_back(tmp_path, stated):
         exif.get_ifd(0x8769)[0x829A] = IFDRational(1, time)
         paths.append(tmp_path / f"v_{angle}.jpg")
         image.save(paths[-1], exif=exif)
-    light = stated_exposures({"v": paths}, lambda done: None).get("v", [1.0] * 4)
+    light = stated_exposures({"v": paths}, lambda done: None)[0].get("v", [1.0] * 4)
     true = 1 / np.array(stated if light != [1.0] * 4 else (100, 100, 140, 100))
     found = exposures_of_view(
         [path.name for path in paths], four() * true[:, None, None] * 50, np.ones((96, 128), bool), light
@@ -167,6 +173,26 @@ def test_mirrored_mosaics_are_turned_back(tmp_path, flip):
     assert (files.read(tmp_path / "v.npy") == values).all()
 
 
+@pytest.mark.parametrize(("flip", "turns"), [("90", 1), ("270", 3)])
+@pytest.mark.parametrize("sensor", ["IMX250MZR", "IMX250MYR"])
+def test_mosaics_turned_by_a_quarter_are_turned_back(tmp_path, flip, turns, sensor):
+    """They are developed as the sensor saw them; their size in headers is exchanged, too."""
+    values = np.rint(mosaic(four(), sensor) * 4095).astype(np.uint16)
+    cv2.imwrite(str(tmp_path / "v.png"), np.ascontiguousarray(np.rot90(values, turns)))
+    settings = PrepareSettings(sensor=sensor, flip=flip)
+    assert (MosaicFiles(settings).read(tmp_path / "v.png") == values).all()
+    stored = MosaicSource(tmp_path, settings).stored("v")
+    assert (stored.size, stored.developed) == ((128, 96), (64, 48))
+
+
+def test_a_whole_sensor_that_stands_upright_is_refused(tmp_path):
+    np.save(tmp_path / "v.npy", np.random.default_rng(0).integers(0, 4096, (2448, 2048), np.uint16))
+    fault = Fault(found="2048x2448", remedy="--flip 90")
+    fault.raised_by(MosaicFiles(PrepareSettings(sensor="IMX250MZR")).read, tmp_path / "v.npy")
+    fault.raised_by(read_shot, tmp_path / "v.npy", ShotOptions(sensor="IMX250MZR"))
+    assert MosaicFiles(PrepareSettings(sensor="IMX253MZR")).read(tmp_path / "v.npy").shape == (2448, 2048)
+
+
 @pytest.mark.parametrize(
     ("stored", "asked"),
     [("12p", "12packed"), ("12packed", "12p"), ("12mipi", "12packed"), ("10mipi", "10p"), ("16be", "16")],
@@ -256,11 +282,13 @@ SRGB = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
 def test_profiles_state_how_a_picture_is_encoded(tmp_path, suffix, curve, exponent):
     path = tmp_path / f"v{suffix}"
     Image.new("RGB", (16, 16), (90, 120, 60)).save(path, **({} if curve is None else {"icc_profile": curve}))
-    found = stated_exponent(path.read_bytes())
-    assert found == (None if exponent is None else pytest.approx(exponent, abs=0.01))
-    if exponent != 1.8:
-        return require_known_encoding(path)
-    Fault(found="1.80").raised_by(require_known_encoding, path)
+    found = stated_encoding(path.read_bytes())
+    assert (found and found.exponent) == (None if exponent is None else pytest.approx(exponent, abs=0.01))
+    if exponent == 1.8:
+        Fault(str(path), found="1.80").raised_by(stated_transfer, [path])
+    else:
+        known = None if exponent is None else "linear" if exponent == 1 else "srgb"
+        assert (stated_transfer([path]) or (None,))[0] == known
 
 
 def test_damaged_profiles_state_nothing():
@@ -269,8 +297,8 @@ def test_damaged_profiles_state_nothing():
     Image.new("RGB", (16, 16)).save(image, "JPEG", icc_profile=whole)
     data, at = image.getvalue(), image.getvalue().index(whole)
     for place in range(at + 128, at + len(whole)):
-        found = stated_exponent(data[:place] + b"\xff" + data[place + 1 :])
-        assert found is None or found > 0
+        found = stated_encoding(data[:place] + b"\xff" + data[place + 1 :])
+        assert found is None or found.exponent > 0
 
 
 @pytest.mark.parametrize(
@@ -285,5 +313,105 @@ def test_damaged_profiles_state_nothing():
 def test_a_tone_curve_that_is_neither_is_doubted(encode, transfer, doubtful):
     codes = np.rint(np.clip(encode(four()), 0, 1) * 65535).astype(np.uint16)
     pictures, none = np.repeat(codes[..., None], 3, axis=3), np.zeros(codes.shape, bool)
-    found = decide_transfer([Shots(pictures, 1, none, none[0])], lossy=True)
+    slope = slope_of_shots([Shots(pictures, 1, none, none[0])], [(0, 45, 90, 135)])
+    found = decide_transfer(LOSSY, None, eight=False, slope=slope)
     assert (found.transfer, bool(found.doubt)) == (transfer, doubtful)
+
+
+def _stating(folder, kind, values, full):
+    """A file that states the full scale of gray ``values``, in one of four ways."""
+    path = folder / f"v.{kind}"
+    if kind == "pgm":
+        head = b"P5\n%d %d\n%d\n" % (values.shape[1], values.shape[0], full)
+        path.write_bytes(head + values.astype(">u2" if full > 255 else "u1").tobytes())
+    elif kind == "tif":
+        tifffile.imwrite(path, values, extratags=[(281, "H", 1, full, True)], metadata=None)
+    else:
+        chunk = b"sBIT" + bytes([full.bit_length()])
+        data = cv2.imencode(".png", values)[1].tobytes()
+        body = struct.pack(">I", 1) + chunk + struct.pack(">I", zlib.crc32(chunk))
+        path.write_bytes(data[:33] + body + data[33:])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "full"),
+    [("pgm", 127), ("pgm", 1023), ("pgm", 16383), ("tif", 1023), ("tif", 127), ("png", 1023), ("png", 63)],
+)
+def test_the_full_scale_that_a_file_states_is_used(tmp_path, kind, full):
+    """Of mosaics and photographs: what is at it is saturated, and the rest is a share of it."""
+    ramp = np.random.default_rng(3).permutation(np.linspace(1, full, 64 * 64)).reshape(64, 64)
+    values = ramp.round().astype(np.uint8 if full < 256 else np.uint16)
+    path = _stating(tmp_path, kind, values, full)
+    picture = decode_picture(path, path.read_bytes())
+    assert picture[..., 0] / np.iinfo(picture.dtype).max == pytest.approx(values / full, abs=2e-3)
+    settings = PrepareSettings(sensor="IMX250MZR", poses="none", gains="none", calibration=Calibration())
+    source = MosaicSource(tmp_path, settings)
+    measured = source.measure(lambda done: None)
+    assert (measured["levels"]["white"], measured["levels"]["saturation"]) == (full, full)
+    assert f"{full} is full scale, as the files state" in measured["notes"][-1]
+    shot = read_shot(path, ShotOptions(sensor="IMX250MZR"))
+    assert any("as the file states" in note for note in shot.notes)
+
+
+def test_significant_bits_of_png_may_be_at_the_top(tmp_path):
+    """As the standard has them: ten of sixteen bits, the lowest six empty or copies of the highest."""
+    ramp = np.random.default_rng(3).permutation(np.linspace(1, 1023, 64 * 64)).reshape(64, 64)
+    values = ramp.round().astype(np.uint16)
+    for name, stored in (("empty", values << 6), ("copies", values << 6 | values >> 4)):
+        folder = tmp_path / name
+        folder.mkdir()
+        path = _stating(folder, "png", stored, 1023)
+        assert decode_picture(path, path.read_bytes())[..., 0] / 65535 == pytest.approx(
+            values / 1023, abs=2e-3
+        )
+        settings = PrepareSettings(sensor="IMX250MZR")
+        levels = MosaicSource(folder, settings).measure(lambda done: None)["levels"]
+        assert levels["saturation"] == 65472
+
+
+def test_full_scales_that_contradict_one_another_or_the_values_are_refused(tmp_path):
+    values = np.full((64, 64), 1000, np.uint16)
+    path = _stating(tmp_path, "pgm", values, 511)
+    Fault(str(path), found="1000", expected="511").raised_by(decode_picture, path, path.read_bytes())
+    _stating(tmp_path, "pgm", values, 1023)
+    (tmp_path / "w.png").write_bytes(cv2.imencode(".png", values)[1].tobytes())
+    source = MosaicSource(tmp_path, PrepareSettings(sensor="IMX250MZR"))
+    Fault(str(tmp_path / "w.png"), found="no full scale").raised_by(source.measure, lambda done: None)
+
+
+TIME, F_NUMBER, ISO = 0x829A, 0x829D, 0x8827
+EXPOSED = {TIME: IFDRational(1, 100), F_NUMBER: IFDRational(8, 1), ISO: 400}
+
+
+def exposed(path, **changes):
+    """A picture that states its exposure, with some tags changed, or left out where None."""
+    image = Image.new("RGB", (16, 16), (90, 90, 90))
+    exif = image.getexif()
+    tags = {**EXPOSED, **{globals()[name]: value for name, value in changes.items()}}
+    exif.get_ifd(0x8769).update({tag: value for tag, value in tags.items() if value is not None})
+    image.save(path, exif=exif)
+    return path
+
+
+@pytest.mark.parametrize("name", ["TIME", "F_NUMBER", "ISO"])
+@pytest.mark.parametrize("value", [None, 0])
+def test_a_tag_that_one_file_of_several_lacks_corrects_nothing(tmp_path, name, value):
+    """It does not count as f/1, ISO 100, or as no exposure of this file alone; of all files alike, it is equal."""
+    files = [exposed(tmp_path / f"cup_a{angle}.jpg") for angle in (0, 60, 120)]
+    value = IFDRational(0, 1) if value == 0 and name != "ISO" else value
+    exposed(files[1], **{name: value})
+    gains, missing = stated_exposures({"cup": files[:1], "other": files[1:]})
+    assert not gains
+    assert "1 of 3 files have no" in missing
+    assert "EXIF corrects no exposure" in missing
+    assert missing in read_shot(tmp_path, ShotOptions()).notes
+    measured = SinglesSource(tmp_path, PrepareSettings(poses="none")).measure(lambda done: None)
+    assert (measured["light"], measured["notes"][-1]) == ({}, missing)
+    for path, time in zip(files, (100, 100, 50), strict=True):
+        exposed(path, **{"TIME": IFDRational(1, time), name: value})
+    gains, missing = stated_exposures({"cup": files})
+    assert missing == ""
+    assert gains == (
+        {} if name == "TIME" else {"cup": pytest.approx([2 ** (-1 / 3), 2 ** (-1 / 3), 2 ** (2 / 3)])}
+    )

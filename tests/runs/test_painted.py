@@ -144,3 +144,8 @@ def test_what_no_step_would_read_is_refused(
     Fault(FOLDER, "what is metal", recipe).raised_by(
         polarguide.train, demo_scene, out, recipe=recipe, settings=settings, reading=READING, resume=True
     )
+
+
+def test_materials_that_are_a_link_to_nowhere_are_refused(scene: polarguide.Scene, tmp_path: Path) -> None:
+    (tmp_path / FOLDER).symlink_to("nowhere")
+    Fault(str(tmp_path / FOLDER), found="nothing").raised_by(read_painted, tmp_path, scene)

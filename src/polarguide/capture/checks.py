@@ -13,6 +13,7 @@ of a stop.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -56,8 +57,8 @@ class Measures:
     sums: NDArray[np.float64]
 
 
-def sampled(codes: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """The sample of a view's codes [K, H, W, 3] that ``measure`` takes, for a caller that does not keep the codes."""
+def sampled(codes: NDArray[Any]) -> NDArray[Any]:
+    """The sample of a view's codes [K, H, W, ...] that ``measure`` takes, for a caller that does not keep the codes."""
     step = _step(codes.shape[1] * codes.shape[2])
     return codes[:, ::step, ::step].copy()
 
@@ -191,13 +192,62 @@ def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], tr
 
 def curvature(measures: Sequence[Measures]) -> float | None:
     """Slope of the regression described in ``Measures``, over all views; None if too few pixels are polarized."""
-    count, q, r, qq, qr = np.sum([measure.sums for measure in measures], axis=0)
+    return slope([measure.sums for measure in measures])
+
+
+def slope(sums: Sequence[NDArray[np.float64]]) -> float | None:
+    """The slope of several such regressions together; None if too few pixels are polarized."""
+    if not sums:
+        return None
+    count, q, r, qq, qr = np.sum(sums, axis=0)
     if count < 1000:
         return None
     spread = qq / count - (q / count) ** 2
     if spread < 0.005**2:
         return None
     return float((qr / count - q / count * r / count) / spread)
+
+
+_RIGHT = 1.0
+"""Degrees by which two angles may differ from right ones: a pair sum is off by two percent of the polarized light."""
+
+
+def right_pairs(angles: Sequence[object]) -> list[tuple[int, int]]:
+    """Places of pictures that lie at right angles to one another, each in one pair; words are no angles."""
+    free = {place: angle for place, angle in enumerate(angles) if isinstance(angle, int | float)}
+    pairs = []
+    while free:
+        place, angle = next(iter(free.items()))
+        del free[place]
+        other = next((k for k, at in free.items() if abs((at - angle) % 180 - 90) <= _RIGHT), None)
+        if other is not None:
+            del free[other]
+            pairs.append((place, other))
+    return pairs
+
+
+def pair_slopes(
+    codes: NDArray[np.uint16], usable: NDArray[np.bool_], pairs: Sequence[tuple[int, int]]
+) -> list[NDArray[np.float64]]:
+    """Sums of the regression described in ``Measures`` for every two of a view's pairs, about their own means.
+
+    Args:
+        codes: linear codes [K, H, W, C] of a sample of the view. usable: [H, W]. pairs: of ``right_pairs``.
+    """
+    if len(pairs) < 2:
+        return []
+    gray = codes.mean(axis=3, dtype=np.float64)
+    gray = gray[:, usable & (gray.min(axis=0) > _LOW_CODE)]
+    first, second = (gray[[pair[side] for pair in pairs]] for side in (0, 1))
+    s0 = (first + second).mean(axis=0)
+    sums, squares = (first + second) / s0, ((first - second) / s0) ** 2
+    found = []
+    for one, other in itertools.combinations(range(len(pairs)), 2):
+        q, r = squares[one] - squares[other], sums[one] - sums[other]
+        if len(q):
+            q, r = q - q.mean(), r - r.mean()
+        found.append(np.array([len(q), 0.0, 0.0, q @ q, q @ r]))
+    return found
 
 
 def encoding(slope: float | None) -> Literal["linear", "srgb"] | None:

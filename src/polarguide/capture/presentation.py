@@ -108,6 +108,14 @@ class Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise PolarguideError(
                 "matrix", expected="a matrix with an inverse", found=str(self.matrix), remedy=REMEDY
             )
+        darkest = min(sum(row) for row in self.matrix)
+        if not darkest > 0:
+            raise PolarguideError(
+                "matrix",
+                expected="rows with positive sums: what is gray to the camera has light in every channel",
+                found=f"a sum of {darkest:g}, which makes it black",
+                remedy=REMEDY,
+            )
 
 
 class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

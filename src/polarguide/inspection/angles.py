@@ -244,8 +244,8 @@ class Hypothesis:
 
 
 MOSAICS = {
-    (1, 45): "--flip x (Reverse X)",
-    (1, 135): "--flip y (Reverse Y)",
+    (1, 45): "--flip x (Reverse X), or --flip 90 (turned counter-clockwise)",
+    (1, 135): "--flip y (Reverse Y), or --flip 270 (turned clockwise)",
     (1, 90): "--flip xy (Reverse X and Y), or --offset-x 1 --offset-y 1",
     (-1, 135): "--offset-x 1",
     (-1, 45): "--offset-y 1",
@@ -288,7 +288,7 @@ class AngleFindings:
         )
 
     def _mirrored(self, offset: float) -> str:
-        """Advice where the order is that of a sensor's mosaic that was mirrored, or cropped at odd pixels."""
+        """Advice where the order is that of a sensor's mosaic that was mirrored, turned, or cropped at odd pixels."""
         straight = self.applied is not None and self.applied.true_angles() == (ANGLES, 0.0)
         if not self.mosaic or not straight or self.order is None or abs(offset) > ZERO_OFF:
             return ""
@@ -296,8 +296,8 @@ class AngleFindings:
         if options is None:
             return ""
         return (
-            f"A sensor's angles are fixed: the camera mirrored the mosaics, or their region begins elsewhere. Repeat "
-            f"prepare with {options} and a new --out."
+            "A sensor's angles are fixed: the mosaics were mirrored or turned, or their region begins elsewhere. "
+            f"Repeat prepare with {options} and a new --out."
         )
 
     @property

@@ -11,8 +11,9 @@ its intensity is ``(S0 + S1 cos 2t + S2 sin 2t) / 2`` (Malus's law).
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,7 +23,6 @@ from polarguide.optics._numerics import check_leading, for_arrays, safe_atan2, s
 from polarguide.optics.frames import lens_frame
 
 
-@for_arrays
 def stokes(intensities: Tensor) -> Tensor:
     """Stokes vector of four images taken behind a polarizer at 0, 45, 90 and 135 degrees.
 
@@ -30,14 +30,37 @@ def stokes(intensities: Tensor) -> Tensor:
     of Malus's law).
 
     Args:
-        intensities: [4, ...] linear intensities in the order of ``ANGLES``.
+        intensities: [4, ...] linear intensities in the order of ``ANGLES``; whole numbers of 8 or 16 bits are codes of
+            which the largest of their type is 1, as ``read_shot`` takes them.
 
     Returns:
         [3, ...] Stokes vector, in the units of the intensities.
 
     Raises:
-        ValueError: the first axis does not have four entries.
+        ValueError: the first axis does not have four entries, or the type of whole numbers tells no full scale.
     """
+    return _stokes(_of_full_scale(intensities))
+
+
+def _of_full_scale(intensities: Any) -> Any:
+    """Floats as they are; codes of 8 or 16 bits, NumPy's or torch's, as shares of full scale in single precision.
+
+    Raises:
+        ValueError: the values are other whole numbers.
+    """
+    values = intensities.numpy() if intensities.dtype in (torch.uint8, torch.uint16) else intensities
+    if isinstance(values, np.ndarray) and values.dtype.kind == "u" and values.dtype.itemsize <= 2:
+        shares = values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max)
+        return torch.from_numpy(shares) if isinstance(intensities, Tensor) else shares
+    kind = values.dtype.kind if isinstance(values, np.ndarray) else "f" if values.is_floating_point() else "i"
+    if kind in "iub":
+        found = f"found {values.dtype}; divide them by full scale"
+        raise ValueError(f"intensities: expected floats, or codes of type uint8 or uint16, {found}")
+    return values
+
+
+@for_arrays
+def _stokes(intensities: Tensor) -> Tensor:
     check_leading(intensities, 4, "intensities")
     return torch.stack(stokes_of_four(intensities.unbind(0)))
 
@@ -94,8 +117,9 @@ def aolp(stokes: Tensor) -> Tensor:
     check_leading(stokes, 3, "stokes")
     angle = safe_atan2(stokes[2], stokes[1]) / 2
     angle = torch.where(angle < 0, angle + math.pi, angle)
-    # A tiny negative angle plus pi rounds to pi, which is the angle 0.
-    return torch.where(angle >= math.pi, angle - math.pi, angle)
+    # A tiny negative angle plus pi rounds to pi (in single precision, to a number above it), which is the angle 0.
+    largest = torch.tensor(math.pi, dtype=angle.dtype, device=angle.device)
+    return torch.where(angle >= largest, angle - largest, angle)
 
 
 @for_arrays

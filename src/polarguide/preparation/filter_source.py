@@ -26,24 +26,31 @@ from polarguide.capture.calibration import (
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.exposures import Angle, angle_text, turned
 from polarguide.capture.filter.camera_files import (
+    ExposureData,
     apply_orientation,
     is_camera_raw,
+    missing_tags,
     orientation,
     orientation_calibration,
     read_exposure_data,
     stored_frame,
 )
 from polarguide.capture.filter.develop import (
-    CAMERA_RAW,
     Shift,
     align_shots,
-    decide_transfer,
     estimate_shifts,
-    kind_of_file,
     linear_intensities,
-    require_known_encoding,
     rounding_of_bytes,
-    transfer_of_kind,
+    shift_notes,
+)
+from polarguide.capture.filter.encoding import (
+    CAMERA_RAW,
+    TransferDecision,
+    decide_transfer,
+    given_transfer,
+    kind_of_file,
+    slope_of_shots,
+    stated_transfer,
 )
 from polarguide.capture.filter.shots import (
     Shots,
@@ -54,7 +61,7 @@ from polarguide.capture.filter.shots import (
     read_stack,
     require_four_shots,
 )
-from polarguide.capture.formats.pictures import is_lossy, read_picture, stated_size
+from polarguide.capture.formats.pictures import read_picture, stated_size
 from polarguide.capture.layout import require_memory_of_each
 from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.view import ANGLES, listed
@@ -118,6 +125,26 @@ class ShotsSource(Source):
         pixel = max(map(len, self._of_view.values())) * _WORKED
         remedy = "Make all pictures smaller by the same factor."
         require_memory_of_each(self._shots, pixel, what, remedy=remedy)
+
+    def _angles(self, view: str) -> Sequence[Angle]:
+        """The angles of a view's pictures, as the user counts them."""
+        return ANGLES
+
+    def _decided(self, levels: Levels | None) -> TransferDecision:
+        """The transfer of the capture: as given, or by a few views spread over it and what the files state."""
+        kind = CAMERA_RAW if all(map(is_camera_raw, self._shots)) else kind_of_file(self._shots[0])
+        given = given_transfer(kind, self._settings.transfer)
+        if given is not None:
+            return given
+        stated = stated_transfer(self._shots)
+        several = [view for view in self.views if len(self._of_view[view]) > 1]
+        views = several[:: max(1, math.ceil(len(several) / _JUDGED_VIEWS))] or self.views[:1]
+        judged = [read_stack(self._of_view[view], self._white, levels) for view in views]
+        slope = slope_of_shots(judged, [self._angles(view) for view in views]) if several else None
+        decision = decide_transfer(kind, stated, eight=judged[0].pictures.dtype == np.uint8, slope=slope)
+        if decision.doubt:
+            warnings.warn(decision.doubt, PolarguideWarning, stacklevel=2)
+        return decision
 
     def _rounding(self, transfer: str, smallest: float) -> Rounding:
         """Rounding of codes: by the steps of 8-bit values, which grow with sRGB's; none for 16 bits."""
@@ -205,23 +232,11 @@ class FilterSource(ShotsSource):
         self._require_memory("four shots")
         settings = self._settings
         gains, notes = settings.calibration.gains, []
-        transfer: str = settings.transfer
-        if transfer == "auto" and all(map(is_camera_raw, self.paths)):
-            transfer, note = transfer_of_kind(CAMERA_RAW, transfer)
-            notes.append(note)
         levels, counted = levels_of_shots(self._shots, self._white, self._settings)
-        notes += counted
-        if transfer == "auto":
-            require_known_encoding(self._shots[0])
-            step = max(1, math.ceil(len(self.views) / _JUDGED_VIEWS))
-            judged = [read_stack(self._of_view[view], self._white, levels) for view in self.views[::step]]
-            decision = decide_transfer(judged, lossy=is_lossy(self.paths[0]))
-            transfer = decision.transfer
-            notes.append(f"Transfer {decision.reason}.")
-            if decision.doubt:
-                warnings.warn(decision.doubt, PolarguideWarning, stacklevel=2)
-        stated = stated_exposures(self._of_view, advance) if settings.gains == "auto" else {}
-        notes += exposure_notes(stated, len(self.views))
+        decision = self._decided(levels)
+        notes += [*counted, decision.note]
+        stated, missing = stated_exposures(self._of_view, advance) if settings.gains == "auto" else ({}, "")
+        notes += [missing] if missing else exposure_notes(stated)
         # One scale for all shots, with room for the largest gain that is corrected.
         room = math.sqrt(1.0 - LARGEST_IMBALANCE)
         if gains is None and settings.gains == "auto":
@@ -231,9 +246,9 @@ class FilterSource(ShotsSource):
         smallest = scale / (max(gains) if gains is not None else 1.0 / room)
         every = [value for of_view in stated.values() for value in of_view] or [1.0]
         return {
-            "transfer": transfer,
+            "transfer": decision.transfer,
             "scale": scale * min(1.0, *every),
-            "rounding": self._rounding(transfer, smallest * min(1.0, *every) / max(1.0, *every)),
+            "rounding": self._rounding(decision.transfer, smallest * min(1.0, *every) / max(1.0, *every)),
             "levels": None if levels is None else asdict(levels),
             "light": {
                 self._name(path): value
@@ -312,21 +327,6 @@ def development_of(paths: Sequence[Path], settings: PrepareSettings) -> tuple[fl
     return white
 
 
-def shift_notes(view: str, shifts: list[Shift]) -> list[str]:
-    """Notes about shots that were shifted, and about shots without a reliable estimate."""
-    named = list(zip(ANGLES, shifts, strict=True))
-    moved = [
-        f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f}){'' if shift.warp is None else ' and turned'}"
-        for angle, shift in named
-        if shift.corrected
-    ]
-    doubtful = [str(angle) for angle, shift in named if not shift.trusted]
-    notes = [f"{view}: shots moved, in pixels: {', '.join(moved)}."] if moved else []
-    if doubtful:
-        notes.append(f"{view}: no reliable shift of the shots at {', '.join(doubtful)}; used as they are.")
-    return notes
-
-
 class SinglesSource(ShotsSource):
     """Photographs of one camera through a linear polarizer that was turned between them, or without one."""
 
@@ -361,29 +361,35 @@ class SinglesSource(ShotsSource):
             if size is not None:
                 sizes.setdefault(f"{max(size)}x{min(size)}", path)
         self._require_one(sizes, "size", "Export all pictures of one camera alike, without a crop.")
-        transfer, reason = self._transfer()
+        kinds: dict[str, Path] = {}
+        for path in self._shots:
+            kinds.setdefault(kind_of_file(path), path)
+        self._require_one(kinds, "kind of file", "Keep one kind: their brightness cannot be compared.")
         levels, counted = levels_of_shots(self._shots, self._white, self._settings)
-        light: dict[str, float] = {}
+        decision = self._decided(levels)
+        every: dict[Path, ExposureData] = {}
         cameras: dict[str, Path] = {}
         for number, view in enumerate(self.views, 1):
             for path in self._of_view[view]:
-                taken = read_exposure_data(path)
+                every[path] = taken = read_exposure_data(path)
                 if taken.camera:
                     cameras.setdefault(taken.camera, path)
-                if taken.light is not None:
-                    light[self._name(path)] = taken.light
             advance(number)
         remedy = "Prepare those of one camera; only one set of intrinsics is estimated."
         self._require_one(cameras, "camera", remedy)
-        whole = len(self._shots)
-        stating = "All" if len(light) == whole else f"{len(light) or 'None'} of {whole}"
+        missing, light = missing_tags(every), {}
+        if not missing:
+            light = {
+                self._name(path): value for path, taken in every.items() if (value := taken.light) is not None
+            }
+        stating = f"{'All' if light else 'None'} of {len(every)} files state their exposure (EXIF)."
         return {
-            "transfer": transfer,
+            "transfer": decision.transfer,
             "scale": 1.0,
-            "rounding": self._rounding(transfer, 1.0),
+            "rounding": self._rounding(decision.transfer, 1.0),
             "levels": None if levels is None else asdict(levels),
             "light": light,
-            "notes": [self._summary(), reason, *counted, f"{stating} files state their exposure (EXIF)."],
+            "notes": [self._summary(), decision.note, *counted, missing or stating],
         }
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
@@ -418,19 +424,8 @@ class SinglesSource(ShotsSource):
                 self._root, expected=f"photographs of one {what}", found=" and ".join(names), remedy=remedy
             )
 
-    def _transfer(self) -> tuple[str, str]:
-        """How the files are encoded, and why.
-
-        Raises:
-            PolarguideError: the files are of several kinds.
-        """
-        kinds: dict[str, Path] = {}
-        for path in self._shots:
-            kinds.setdefault(kind_of_file(path), path)
-        self._require_one(kinds, "kind of file", "Keep one kind: their brightness cannot be compared.")
-        if self._settings.transfer == "auto":
-            require_known_encoding(self._shots[0])
-        return transfer_of_kind(next(iter(kinds)), self._settings.transfer)
+    def _angles(self, view: str) -> list[Angle]:
+        return [shot.angle for shot in self._singles[view]]
 
     def _summary(self) -> str:
         """How many photographs there are, and at which angles."""

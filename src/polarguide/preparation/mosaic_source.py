@@ -23,9 +23,11 @@ from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_
 from polarguide.capture.sensor.pattern import (
     FULL_16,
     SENSOR_NAMES,
+    SENSOR_SIZES,
     SIDE,
     Levels,
     Pattern,
+    agreed_full_scale,
     estimate_levels,
     level_notes,
     require_kind,
@@ -41,6 +43,8 @@ from polarguide.core.progress import Advance
 from polarguide.preparation.settings import PrepareSettings, white_gains
 from polarguide.preparation.source import DevelopedView, Source, Stored
 
+QUARTER_TURNS = ("90", "270")
+"""Of ``flip``: degrees counter-clockwise by which mosaics were turned."""
 SMALLEST = 16
 """Pixels of the shorter side of a mosaic."""
 WORKED = {"quarter": 16, "half": 60, "full": 240}
@@ -68,7 +72,7 @@ class MosaicFiles:
                 found="none",
                 remedy="Name it; color and monochrome sensors have different patterns.",
             )
-        self._settings = settings
+        self._settings, self._sensor = settings, settings.sensor
         self._raw = RawFormat(settings.width, settings.height, settings.packing)
         pattern = sensor_pattern(settings.sensor).shifted(settings.offset_x, settings.offset_y)
         self.crop = pattern.cell_corner()
@@ -87,7 +91,7 @@ class MosaicFiles:
         elif raw.width is not None and raw.height is not None:
             what = f"a mosaic of {raw.width}x{raw.height}"
             require_memory(path, worked * raw.width * raw.height, what, remedy=remedy)
-        return self._unmirrored(read_mosaic(path, self._raw, least=SMALLEST))
+        return self._turned_back(path, read_mosaic(path, self._raw, least=SMALLEST))
 
     def given(self, values: NDArray[Any], where: str) -> NDArray[Any]:
         """The values of a whole mosaic in memory, [H, W] uint8 or uint16, as ``read`` gives those of a file.
@@ -96,11 +100,25 @@ class MosaicFiles:
             PolarguideError: the values are too few, or four pictures side by side.
         """
         require_mosaic(where, values, least=SMALLEST)
-        return self._unmirrored(values)
+        return self._turned_back(where, values)
 
-    def _unmirrored(self, values: NDArray[Any]) -> NDArray[Any]:
-        """A stored mosaic without the mirroring that ``flip`` names."""
+    def _turned_back(self, where: Path | str, values: NDArray[Any]) -> NDArray[Any]:
+        """A stored mosaic without the mirroring or the quarter turn that ``flip`` names.
+
+        Raises:
+            PolarguideError: it fits the sensor on its side alone.
+        """
         flip = self._settings.flip
+        if flip in QUARTER_TURNS:
+            return np.rot90(values, -1 if flip == "90" else 1)
+        size, across = SENSOR_SIZES[self._sensor], values.shape
+        if across[0] > size[1] and across[0] <= size[0] and across[1] <= size[1]:
+            raise PolarguideError(
+                where,
+                expected=f"a mosaic as the sensor lies, at most {size[0]}x{size[1]} pixels",
+                found=f"{across[1]}x{across[0]}, one that was turned by a quarter",
+                remedy="Give --flip 90 if it was turned counter-clockwise before it was saved, 270 if clockwise.",
+            )
         values = values[:, ::-1] if flip in ("x", "xy") else values
         return values[::-1] if flip in ("y", "xy") else values
 
@@ -108,10 +126,13 @@ class MosaicFiles:
         """Bits that a pixel takes in the file."""
         return self._raw.container(path, values.dtype)
 
+    def full_scale(self, path: Path, values: NDArray[Any]) -> int | None:
+        """The full scale that a file states for its values; None where it does not, or where ``bits`` says it."""
+        return self._raw.full_scale(path, values) if self._settings.bits is None else None
+
     def require_kind(self, blocks: NDArray[Any], levels: Levels) -> None:
         """Refuse mosaics of the other kind of sensor: nothing later would tell."""
-        assert self._settings.sensor is not None
-        require_kind(self._settings.sensor, blocks, levels)
+        require_kind(self._sensor, blocks, levels)
 
     def cut(self, values: NDArray[Any]) -> NDArray[Any]:
         """Crop to whole cells."""
@@ -122,7 +143,7 @@ class MosaicFiles:
         """The dark frame, cut like the mosaics."""
         if self._settings.dark_frame is None:
             return None
-        dark = self._unmirrored(read_mosaic(self._settings.dark_frame, self._raw))
+        dark = self._turned_back(self._settings.dark_frame, read_mosaic(self._settings.dark_frame, self._raw))
         if dark.shape != shape:
             raise PolarguideError(
                 self._settings.dark_frame,
@@ -248,6 +269,8 @@ class MosaicSource(Source):
         width, height = self._settings.width, self._settings.height
         stated = None if width is None or height is None else (width, height)
         size = stated_size(self._files[view]) or stated
+        if size is not None and self._settings.flip in QUARTER_TURNS:
+            size = size[::-1]
         step = DEMOSAIC_MODES[self._settings.demosaic]
         if size is None or step == 1:
             return Stored(size)
@@ -258,6 +281,7 @@ class MosaicSource(Source):
         """Levels, gains of the angles and white balance of the capture; every file is read once."""
         counts = np.zeros(FULL_16 + 1, np.int64)
         container, shape = 0, None
+        stated: dict[Path, int | None] = {}
         samples: list[NDArray[Any]] = []
         blocks: list[NDArray[Any]] = []
         for count, path in enumerate(self._files.values(), 1):
@@ -268,16 +292,17 @@ class MosaicSource(Source):
                 offset = (self._settings.offset_x, self._settings.offset_y)
                 self._analyzers.require_region(offset, values.shape[::-1], self._settings.analyzers)
             container = self._mosaics.container(path, values)
+            stated[path] = self._mosaics.full_scale(path, values)
             counts += np.bincount(values.ravel(), minlength=len(counts))
             samples.append(sample_blocks(self._mosaics.cut(values), 2 * self._pattern.period))
             blocks.append(sample_blocks(self._mosaics.cut(values), SIDE))
             advance(count)
         assert shape is not None
         settings = self._settings
-        occurring = np.flatnonzero(counts)
+        occurring, full = np.flatnonzero(counts), agreed_full_scale(stated)
         levels = estimate_levels(
             int(occurring[-1]), int(np.bitwise_or.reduce(occurring)), container,
-            bits=settings.bits, black=settings.black_level, saturation=settings.saturation, counts=counts,
+            bits=settings.bits, black=settings.black_level, saturation=settings.saturation, counts=counts, stated=full,
         )  # fmt: skip
         levels = replace(levels, gamma=settings.gamma if self._dataset is None else self._dataset.gamma)
         if self._dataset is None:
@@ -296,7 +321,7 @@ class MosaicSource(Source):
         ratio = pair_ratio(angles, usable)
         gains, notes = self._gains(ratio)
         notes += [] if self._dataset is None else self._dataset.notes
-        notes += level_notes(levels, counts, container, settings.bits)
+        notes += level_notes(levels, counts, container, settings.bits, full)
         standing_out = int(self._defects(levels).sum())
         if standing_out:
             notes.append(defects_note(standing_out, shape[0][0] * shape[0][1]))

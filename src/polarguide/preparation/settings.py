@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, Sense, checked, read_calibration
 from polarguide.capture.sensor.analyzer_file import is_analyzer_file
-from polarguide.capture.sensor.pattern import MosaicOptions, Positive
+from polarguide.capture.sensor.pattern import MosaicOptions, Positive, require_sensor
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options, option_name
 from polarguide.core.text import decimals
@@ -49,7 +49,8 @@ class PrepareSettings(MosaicOptions):
         bits: Bits of a sensor value in 16-bit files; without it those of the value at which samples pile up, else 12 if
             no value exceeds 4095, else 16.
         gamma: Gamma that the camera applied to mosaics: stored = light ^ gamma.
-        flip: Which way the camera mirrored the mosaics (Reverse X, Reverse Y): undone before anything else.
+        flip: Which way the mosaics were mirrored (Reverse X, Reverse Y), or the degrees by which they were turned
+            counter-clockwise: undone before anything else.
         dark_frame: Picture with the lens covered, subtracted in place of the black level.
         saturation: Stored value from which the sensor saturates; without it full scale.
         white_balance: none, gray (the mean color becomes gray), or gains of R, G and B such as 1.9,1,1.6.
@@ -81,7 +82,7 @@ class PrepareSettings(MosaicOptions):
     format: Literal["auto", "mosaic", "filter", "singles"] | Dataset = "auto"
     bits: Annotated[int, Meta(ge=8, le=16)] | None = None
     gamma: Annotated[float, Meta(ge=0.1, le=4.0)] = 1.0
-    flip: Literal["none", "x", "y", "xy"] = "none"
+    flip: Literal["none", "x", "y", "xy", "90", "270"] = "none"
     dark_frame: Path | None = None
     saturation: Positive | None = None
     white_balance: str = "none"
@@ -110,6 +111,7 @@ class PrepareSettings(MosaicOptions):
         Raises:
             PolarguideError: a value is out of range.
         """
+        require_sensor(self.sensor)
         check_options(self)
         checked(self.calibration, "calibration")
         white_gains(self.white_balance)

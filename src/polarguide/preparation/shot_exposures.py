@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import Gains
 from polarguide.capture.checks import measured_gains, pair_moments
-from polarguide.capture.filter.camera_files import is_camera_raw, read_exposure_data
+from polarguide.capture.filter.camera_files import (
+    ExposureData,
+    is_camera_raw,
+    missing_tags,
+    read_exposure_data,
+)
 from polarguide.capture.filter.shots import read_stack
 from polarguide.capture.formats.pictures import may_use_fewer_bits
 from polarguide.capture.sensor.pattern import FULL_16, Levels, estimate_levels, level_notes
@@ -29,7 +34,7 @@ _EQUAL = 1e-3
 
 def stated_exposures(
     views: Mapping[str, Sequence[Path]], advance: Advance | None = None
-) -> dict[str, list[float]]:
+) -> tuple[dict[str, list[float]], str]:
     """Relative exposures that the files of views state (EXIF), their geometric mean over all of these views 1.
 
     Args:
@@ -37,23 +42,23 @@ def stated_exposures(
         advance: receives the number of views that were read.
 
     Returns:
-        Those of the views whose files all state one; nothing where all state the same.
+        Those of all views; nothing where all state the same, or where files do not state the same tags. And a sentence
+        for the user in that last case, else "".
 
     Raises:
         PolarguideError: a file cannot be read.
     """
-    logs: dict[str, list[float]] = {}
-    for number, (view, paths) in enumerate(views.items(), 1):
-        light = [read_exposure_data(path).light for path in paths]
-        if all(value is not None for value in light):
-            logs[view] = [math.log(value) for value in light if value is not None]
+    taken: dict[Path, ExposureData] = {}
+    for number, paths in enumerate(views.values(), 1):
+        taken |= {path: read_exposure_data(path) for path in paths}
         if advance is not None:
             advance(number)
-    every = [value for of_view in logs.values() for value in of_view]
-    if not every or max(every) - min(every) < _EQUAL:
-        return {}
-    mean = sum(every) / len(every)
-    return {view: [math.exp(value - mean) for value in of_view] for view, of_view in logs.items()}
+    missing = missing_tags(taken)
+    logs = {path: math.log(light) for path, data in taken.items() if (light := data.light) is not None}
+    if missing or not logs or max(logs.values()) - min(logs.values()) < _EQUAL:
+        return {}, missing
+    mean = sum(logs.values()) / len(logs)
+    return {view: [math.exp(logs[path] - mean) for path in paths] for view, paths in views.items()}, ""
 
 
 def corrected_note(stated: Sequence[float]) -> str:
@@ -61,16 +66,15 @@ def corrected_note(stated: Sequence[float]) -> str:
     return f"The files state exposures that differ by a factor of {max(stated) / min(stated):.3g}; corrected."
 
 
-def exposure_notes(stated: Mapping[str, Sequence[float]], views: int) -> list[str]:
+def exposure_notes(stated: Mapping[str, Sequence[float]]) -> list[str]:
     """The exposures that the files state, in a sentence for the user."""
     if not stated:
         return []
     every = [value for of_view in stated.values() for value in of_view]
     stops = math.log2(max(every) / min(every))
     within = sum(math.log(max(mine) / min(mine)) >= _EQUAL for mine in stated.values())
-    known = "" if len(stated) == views else f" (stated for {len(stated)} of {views} views)"
     return [
-        f"Exposures differ by up to {stops:.2f} stops by EXIF{known}, in {within} views from shot to shot: taken back "
+        f"Exposures differ by up to {stops:.2f} stops by EXIF, in {within} views from shot to shot: taken back "
         "(--gains none leaves them)."
     ]
 

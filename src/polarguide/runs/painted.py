@@ -6,6 +6,7 @@ They have the size of the views that were trained on, and count before those of 
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -55,7 +56,7 @@ def read_painted(run: Path, scene: Scene) -> PaintedMaterials | None:
         PolarguideError: a picture belongs to no view, or is damaged, of another size, or has a number that
             ``scene.json`` does not explain.
     """
-    if not (run / FOLDER).exists():
+    if not os.path.lexists(run / FOLDER):  # a link to nowhere is no absence
         return None
     digest, numbers = hashlib.sha256(), dict[str, Tensor]()
     known = {0, 1, 2, *scene.indices}

@@ -14,15 +14,9 @@ from polarguide.capture import checks
 from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented, pair_ratio
 from polarguide.capture.exposures import FOUR
 from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
-from polarguide.capture.filter.develop import (
-    align_shots,
-    decide_transfer,
-    estimate_shifts,
-    linear_intensities,
-    require_known_encoding,
-)
+from polarguide.capture.filter.develop import align_shots, estimate_shifts, linear_intensities, moved_shots
+from polarguide.capture.filter.encoding import transfer_of_set
 from polarguide.capture.filter.shots import Shots, read_shots, require_four_shots, stacked
-from polarguide.capture.formats.pictures import is_lossy
 from polarguide.capture.layout import (
     KEPT,
     READ,
@@ -34,7 +28,7 @@ from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic, spoiled
 from polarguide.capture.sensor.pattern import (
-    SENSOR_SIZE,
+    SENSOR_SIZES,
     SIDE,
     Levels,
     Pattern,
@@ -79,12 +73,12 @@ AROUND = 32
 
 def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -> Developed:
     files = MosaicFiles(options.preparation())
-    stored, container = _stored(shot, files)
+    stored, container, full = _stored(shot, files)
     pattern = files.pattern
     _require_on_sensor(shot.where, stored.shape, options)
     dark = files.dark(stored.shape)
     values = files.cut(stored)
-    levels, notes = _levels_of(stored, container, options)
+    levels, notes = _levels_of(stored, container, full, options)
     files.require_kind(sample_blocks(values, SIDE), levels)
     assert options.sensor is not None
     x, y = options.offset_x + files.crop[0], options.offset_y + files.crop[1]
@@ -129,17 +123,19 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     )
 
 
-def _stored(shot: ExposureSet, files: MosaicFiles) -> tuple[NDArray[Any], int]:
-    """The values of a mosaic, and the bits that one takes where it is stored."""
+def _stored(shot: ExposureSet, files: MosaicFiles) -> tuple[NDArray[Any], int, int | None]:
+    """The values of a mosaic, the bits that one takes where it is stored, and the full scale that the file states."""
     if shot.stored is not None:
-        return files.given(shot.stored, shot.name), 8 * shot.stored.dtype.itemsize
+        return files.given(shot.stored, shot.name), 8 * shot.stored.dtype.itemsize, None
     path = shot.files[0]
     stored = files.read(path)
-    return stored, files.container(path, stored)
+    return stored, files.container(path, stored), files.full_scale(path, stored)
 
 
-def _levels_of(stored: NDArray[Any], container: int, options: ShotOptions) -> tuple[Levels, list[str]]:
-    """Black, full scale and saturation of a mosaic, and notes of what was not stated."""
+def _levels_of(
+    stored: NDArray[Any], container: int, full: int | None, options: ShotOptions
+) -> tuple[Levels, list[str]]:
+    """Black, full scale and saturation of a mosaic, and notes of what its type does not imply."""
     levels = estimate_levels(
         int(stored.max()),
         int(np.bitwise_or.reduce(stored, None)),
@@ -147,9 +143,12 @@ def _levels_of(stored: NDArray[Any], container: int, options: ShotOptions) -> tu
         bits=options.bits,
         black=options.black_level,
         saturation=options.saturation,
+        stated=full,
     )
     notes = []
-    if options.bits is None and container == 16:
+    if full is not None:
+        notes.append(f"{levels.white} is full scale, as the file states (--bits says otherwise).")
+    elif options.bits is None and container == 16:
         notes.append(f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale.")
     pile, piled = piled_up(stored, container, options)
     if pile is not None and pile < levels.saturation:
@@ -225,13 +224,15 @@ def _read(path: Path, *_: int) -> AnalyzerCalibration:
 
 def _require_on_sensor(path: Path | str, shape: tuple[int, ...], options: ShotOptions) -> None:
     """Refuse what is larger than the sensor: another one, or no mosaic."""
-    most = tuple(n - o for n, o in zip(SENSOR_SIZE, (options.offset_x, options.offset_y), strict=True))
+    assert options.sensor is not None
+    size = SENSOR_SIZES[options.sensor]
+    most = tuple(n - o for n, o in zip(size, (options.offset_x, options.offset_y), strict=True))
     if shape[1] > most[0] or shape[0] > most[1]:
         raise PolarguideError(
             path,
             expected=f"at most {most[0]}x{most[1]} pixels of {options.sensor}",
             found=f"{shape[1]}x{shape[0]}",
-            remedy="Check --sensor, --offset-x and --offset-y; prepare reads larger sensors of the same pattern.",
+            remedy="Check --sensor, --offset-x and --offset-y.",
         )
 
 
@@ -316,29 +317,21 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
     levels, notes = levels_of_shot(shots.pictures, 8 * shots.pictures.dtype.itemsize, options)
     if levels is not None:
         shots = _four(shot, levels)
-    transfer: str = options.transfer
-    if transfer == "auto":
-        if paths:
-            require_known_encoding(paths[0])
-        decision = decide_transfer([shots], lossy=bool(paths) and is_lossy(paths[0]))
-        transfer = decision.transfer
-        notes += [f"Transfer {decision.reason}.", *filter(None, [decision.doubt])]
+    decision = transfer_of_set(paths, options.transfer, shots, ANGLES)
+    transfer = decision.transfer
+    notes += [decision.note, *filter(None, [decision.doubt])]
     linear = linear_intensities(shots.pictures, transfer)
     lsb = 1 / float(np.iinfo(shots.pictures.dtype).max if levels is None else levels.white)
     clipped, dark = shots.clipped, shots.dark
     if options.align:
         shifts = estimate_shifts(linear)
         linear, clipped = align_shots(linear, clipped, shifts)
-        moved = [
-            f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f})"
-            for angle, shift in zip(ANGLES, shifts, strict=True)
-            if shift.corrected
-        ]
+        moved = moved_shots(shifts)
         notes += [f"Shots moved, in pixels: {', '.join(moved)}."] if moved else []
     saturated = np.asarray(clipped.any(axis=0))
-    stated = stated_exposures({shot.name: paths}).get(shot.name) if paths else None
-    exposed = np.asarray(stated or UNIT_GAINS)
-    notes += [corrected_note(stated)] if stated else []
+    stated, missing = stated_exposures({shot.name: paths})
+    exposed = np.asarray(stated.get(shot.name, UNIT_GAINS))
+    notes += [corrected_note(stated[shot.name])] if stated else [missing] if missing else []
     if options.gains == "auto" and options.calibration.gains is None:
         labels = [path.name for path in paths] or [f"picture {number}" for number in (1, 2, 3, 4)]
         measured = exposures_of_view(labels, linear.mean(axis=3), ~(saturated | dark), exposed.tolist())

@@ -10,7 +10,7 @@ import tyro
 from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, checked
-from polarguide.capture.sensor.pattern import MosaicOptions, Positive, SensorName
+from polarguide.capture.sensor.pattern import MosaicOptions, Positive, SensorName, require_sensor
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import check_finite
 from polarguide.core.records import check_options, option_name
@@ -53,15 +53,16 @@ class ShotOptions(MosaicOptions):
     """How the files of a shot become intensities, and from when on a pixel counts.
 
     Attributes:
-        sensor: Sensor of raw mosaics: IMX250MYR and IMX264MYR are color, IMX250MZR is monochrome. Without it files are
-            shots through a filter.
+        sensor: Sensor of raw mosaics (IMX250, IMX253 or IMX264 with MYR for color, MZR for monochrome), or the model of
+            the camera. Without it files are shots through a filter.
         bits: Bits of a value in 16-bit files; without it 16 for shots through a filter, for mosaics 12 if no value
             exceeds 4095, else 16.
         dark_frame: Picture with the lens covered, subtracted in place of the black level.
         saturation: Stored value from which the sensor saturates; without it that at which samples pile up, or full
             scale.
         gamma: Gamma that the camera applied to mosaics: stored = light ^ gamma.
-        flip: Which way the camera mirrored the mosaics (Reverse X, Reverse Y): undone before anything else.
+        flip: Which way the mosaics were mirrored (Reverse X, Reverse Y), or the degrees by which they were turned
+            counter-clockwise: undone before anything else.
         demosaic: full, half or quarter resolution of the sensor.
         interpolation: How half and full fill in colors and angles.
         transfer: Encoding of filter shots; auto by the curvature of the response.
@@ -80,7 +81,7 @@ class ShotOptions(MosaicOptions):
     dark_frame: Path | None = None
     saturation: Positive | None = None
     gamma: Annotated[float, Meta(ge=0.1, le=4.0)] = 1.0
-    flip: Literal["none", "x", "y", "xy"] = "none"
+    flip: Literal["none", "x", "y", "xy", "90", "270"] = "none"
     demosaic: Literal["half", "quarter", "full"] = "full"
     interpolation: Literal["bilinear", "guided"] = "bilinear"
     transfer: Literal["auto", "linear", "srgb"] = "auto"
@@ -98,6 +99,7 @@ class ShotOptions(MosaicOptions):
         Raises:
             PolarguideError: a value is out of range, or means nothing beside the others.
         """
+        require_sensor(self.sensor)
         check_options(self)
         checked(self.calibration, "calibration")
         if self.read_noise and self.full_well is None:

@@ -13,12 +13,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from polarguide.capture import checks
 from polarguide.capture.calibration import ANGLES, Calibration
 from polarguide.capture.exposures import Angle, Exposure, analyzers, nominal, turned
 from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
-from polarguide.capture.filter.develop import kind_of_file, require_known_encoding, transfer_of_kind
+from polarguide.capture.filter.encoding import VIDEO, kind_of_file, transfer_of_set
 from polarguide.capture.filter.shots import Shots, read_stack, stacked
-from polarguide.capture.formats.pictures import linear_codes, rescaled
+from polarguide.capture.formats.decoders import rescaled
+from polarguide.capture.formats.pictures import linear_codes
 from polarguide.capture.layout import require_memory
 from polarguide.capture.sensor.pattern import FULL_16, Levels, clipping_bits, estimate_levels
 from polarguide.capture.view import FULL_CODE, View
@@ -99,7 +101,7 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
     unused = len(pictures)
     pictures = [picture for picture in pictures if not isinstance(picture.angle, str)]
     unused -= len(pictures)
-    transfer, note = _transfer(pictures, options.transfer)
+    _require_one_kind(pictures)
     count = len(pictures)
     values: NDArray[Any] | None = None
     lost: NDArray[Any] | None = None
@@ -128,8 +130,10 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
     read = Shots(values, code, lost, dark)
     angles = [_degrees(picture.angle) for picture in pictures]
     labels = tuple(picture.label for picture in pictures)
-    samples = _samples(read, kind, labels, angles, gains, transfer, options)
-    return replace(samples, notes=(note, *samples.notes, *words, *_unused(unused)))
+    files = list(dict.fromkeys(picture.path for picture in pictures))
+    film = files[0] if pictures[0].frame is not None else None
+    samples = _samples(read, kind, labels, angles, gains, options, files, film)
+    return replace(samples, notes=(*samples.notes, *words, *_unused(unused)))
 
 
 def samples_of_arrays(
@@ -146,12 +150,10 @@ def samples_of_arrays(
     gray = bool((shots.pictures[..., :1] == shots.pictures).all())
     values = shots.pictures[..., :1] if gray else shots.pictures
     read = replace(shots, pictures=values.astype(np.uint16), clipped=shots.clipped.copy())
-    transfer = "linear" if options.transfer == "auto" else options.transfer
     labels = tuple(f"picture {k + 1}" for k in places)
     known = [_degrees(angles[k]) for k in places]
-    samples = _samples(read, stored.dtype, labels, known, [1.0] * len(places), transfer, options)
-    note = f"Transfer {transfer}, {'as arrays are' if options.transfer == 'auto' else 'as given'}."
-    return replace(samples, notes=(note, *samples.notes, *_unused(len(angles) - len(places))))
+    samples = _samples(read, stored.dtype, labels, known, [1.0] * len(places), options)
+    return replace(samples, notes=(*samples.notes, *_unused(len(angles) - len(places))))
 
 
 def _samples(
@@ -160,15 +162,21 @@ def _samples(
     labels: tuple[str, ...],
     angles: Sequence[float],
     gains: Sequence[float],
-    transfer: str,
     options: ShotOptions,
+    files: Sequence[Path] = (),
+    film: Path | None = None,
 ) -> SetSamples:
-    """Linear samples of stored ones, upright; ``read`` is used up: uint16, whatever ``kind`` the values have."""
+    """Linear samples of stored ones, upright; ``read`` is used up: uint16, whatever ``kind`` the values have.
+
+    ``files``: of the pictures; ``film``: the video that they are frames of.
+    """
     values, lost, dark, code = read.pictures, read.clipped, read.dark, read.orientation
     levels, notes = levels_of_shot(values, 8 * kind.itemsize, options)
     every, step = np.arange(np.iinfo(kind).max + 1, dtype=kind), 1 / float(np.iinfo(kind).max)
     if levels is not None:
         every, step = rescaled(every, levels.white), 1 / levels.white
+    decision = transfer_of_set(files, options.transfer, _judged(read, every), angles, video=film)
+    transfer = decision.transfer
     linear = linear_codes(every, transfer)
     as_stored = levels is None and kind == np.uint16 and transfer == "linear"
     for picture, clipped in zip(values, lost, strict=True):  # one after the other, as memory is
@@ -188,8 +196,15 @@ def _samples(
         dark=apply_orientation(dark, code),
         masked=np.zeros(apply_orientation(dark, code).shape, bool),
         step=step,
-        notes=tuple(notes),
+        notes=(decision.note, *filter(None, [decision.doubt]), *notes),
     )
+
+
+def _judged(read: Shots, every: NDArray[Any]) -> Shots:
+    """A sample of pictures with full scale that of the type of ``every``, which has what each stored value becomes."""
+    usable = ~(read.clipped.any(axis=0) | read.dark)
+    pictures, sample = checks.sampled(read.pictures), checks.sampled(usable[None])
+    return Shots(every[pictures], 1, ~sample, np.zeros(sample.shape[1:], bool))
 
 
 def levels_of_shot(
@@ -278,16 +293,15 @@ def _video(path: Path, frames: Sequence[int | None]) -> Iterator[Shots]:
         yield Shots(picture[None], 1, clipped[None], ~lit)
 
 
-def _transfer(pictures: Sequence[SetPicture], transfer: str) -> tuple[str, str]:
-    """How the files are encoded, and why: as ``prepare`` takes photographs at any angles.
+def _require_one_kind(pictures: Sequence[SetPicture]) -> None:
+    """Refuse files of several kinds.
 
     Raises:
-        PolarguideError: the files are of several kinds.
+        PolarguideError: there are such.
     """
     kinds: dict[str, Path] = {}
     for picture in pictures:
-        kind = "video" if picture.frame is not None else kind_of_file(picture.path)
-        kinds.setdefault(kind, picture.path)
+        kinds.setdefault(VIDEO if picture.frame is not None else kind_of_file(picture.path), picture.path)
     if len(kinds) > 1:
         raise PolarguideError(
             pictures[0].path.parent,
@@ -295,18 +309,17 @@ def _transfer(pictures: Sequence[SetPicture], transfer: str) -> tuple[str, str]:
             found=" and ".join(f"{kind} ({path.name})" for kind, path in kinds.items()),
             remedy="Keep one kind: their brightness cannot be compared.",
         )
-    if transfer == "auto" and "video" not in kinds:
-        require_known_encoding(pictures[0].path)
-    return transfer_of_kind(next(iter(kinds)), transfer)
 
 
 def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:
     """The gain of each picture: as the table states, else as the files state their exposure; and notes."""
     gains = [picture.gain for picture in pictures]
     if all(gain is None and picture.frame is None for gain, picture in zip(gains, pictures, strict=True)):
-        stated = stated_exposures({"": [picture.path for picture in pictures]}).get("")
-        if stated is not None:
-            return stated, [corrected_note(stated)]
+        stated, missing = stated_exposures({"": [picture.path for picture in pictures]})
+        if stated:
+            return stated[""], [corrected_note(stated[""])]
+        if missing:
+            return [1.0] * len(pictures), [missing]
     return [1.0 if gain is None else gain for gain in gains], []
 
 

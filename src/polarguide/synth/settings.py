@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from polarguide.capture.sensor.pattern import SENSORS, any_case, sensor_named
+from polarguide.capture.sensor.pattern import SENSORS, Sensor, any_case, sensor_named
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.records import check_options
 from polarguide.synth.schema import SceneSpec, parse_scene, read_scene_file
@@ -157,7 +157,7 @@ class SynthSettings:
     samples: Annotated[int, Meta(ge=1, le=65536)] = 64
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
     sensor: Annotated[
-        Literal["ideal", "IMX250MYR", "IMX264MYR", "IMX250MZR", "filter"],
+        Literal["ideal", "filter"] | Sensor,
         any_case("ideal", *SENSORS, "filter"),
     ] = "ideal"
     noise: Annotated[float, Meta(ge=0, le=100)] = 0.0

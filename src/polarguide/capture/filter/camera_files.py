@@ -11,10 +11,8 @@ import contextlib
 import importlib
 import io
 import math
-import struct
 import warnings
-import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,17 +23,22 @@ from PIL import Image
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.formats.arrays import array_kind
-from polarguide.capture.formats.decoders import heif_head, heif_tags, is_heif, is_webp, webp_chunks
+from polarguide.capture.formats.decoders import (
+    heif_head,
+    heif_tags,
+    is_heif,
+    is_webp,
+    webp_chunks,
+)
 from polarguide.capture.formats.integrity import (
     LARGEST_PIXELS,
     ORIENTATION,
     TIFF,
     jpeg_segments,
-    png_chunks,
-    tiff_entries,
-    tiff_order,
+    png_chunk,
 )
 from polarguide.capture.formats.pictures import read_picture
+from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import read_file
 
@@ -222,7 +225,7 @@ def tags_of(data: bytes) -> dict[int, Any]:
         contents = (content for kind, content in jpeg_segments(data) if kind == 0xE1)
         tiff = next((content[6:] for content in contents if content.startswith(b"Exif\0\0")), b"")
     elif data.startswith(b"\x89PNG"):
-        tiff = next((data[at + 8 : end - 4] for kind, at, end in png_chunks(data) if kind == b"eXIf"), b"")
+        tiff = png_chunk(data, b"eXIf") or b""
     elif is_webp(data):
         tiff = next((data[at:end] for kind, at, end in webp_chunks(data) if kind == b"EXIF"), b"")
         tiff = tiff.removeprefix(b"Exif\0\0")
@@ -246,16 +249,42 @@ _TIME, _F_NUMBER, _ISO = 33434, 33437, 34855
 
 @dataclass(frozen=True)
 class ExposureData:
-    """How a photograph was taken, as its file says.
+    """How a photograph was taken, as its file says; None for what it does not say, or not plausibly.
 
     Attributes:
         camera: maker and model; empty where it does not say.
-        light: how much light was let in and how it was amplified: seconds * ISO / f-number^2; None where it does not
-            say the time. ISO and f-number count as 100 and 1 where they are not said.
+        seconds, iso, f_number: of the exposure.
     """
 
-    camera: str
-    light: float | None
+    camera: str = ""
+    seconds: float | None = None
+    iso: float | None = None
+    f_number: float | None = None
+
+    @property
+    def light(self) -> float | None:
+        """How much light was let in and how it was amplified: seconds * ISO / f-number^2; None without a time.
+
+        Comparable among files that say the same of the three: ISO and f-number count as 100 and 1 where none does.
+        """
+        return (
+            None if self.seconds is None else self.seconds * (self.iso or 100.0) / (self.f_number or 1.0) ** 2
+        )
+
+
+_NAMES = {"seconds": "ExposureTime", "iso": "ISO", "f_number": "FNumber"}
+
+
+def missing_tags(taken: Mapping[Path, ExposureData]) -> str:
+    """A sentence where some files do not say what others say of their exposure; "" where they are comparable."""
+    for field, name in _NAMES.items():
+        without = [path.name for path, data in taken.items() if getattr(data, field) is None]
+        if 0 < len(without) < len(taken):
+            return (
+                f"{len(without)} of {len(taken)} files have no {name} in their EXIF tags ({listed(without)}), and the "
+                "others have: EXIF corrects no exposure."
+            )
+    return ""
 
 
 def read_exposure_data(path: Path) -> ExposureData:
@@ -267,13 +296,13 @@ def read_exposure_data(path: Path) -> ExposureData:
     raw = is_camera_raw(path)
     data = read_file(path) if raw else read_picture(path)
     exposure = exif_data(data)
-    if not raw or exposure.light is not None or data[:4] in TIFF:
+    if not raw or exposure.seconds is not None or data[:4] in TIFF:
         return exposure
     libraw = optional_import("rawpy", str(path))
     # LibRaw's errors: whoever develops the file says what is wrong with it.
     with contextlib.suppress(Exception), libraw.imread(io.BytesIO(data)) as opened:
         other = opened.other  # which some versions of rawpy do not have
-        return ExposureData("", _light(other.shutter, other.iso_speed, other.aperture))
+        return _plausible("", other.shutter, other.iso_speed, other.aperture)
     return exposure
 
 
@@ -281,91 +310,25 @@ def exif_data(data: bytes) -> ExposureData:
     """Exposure data in the EXIF tags of a picture file; damaged tags count as missing."""
     tags = tags_of(data)
     names = (str(tags.get(tag, "")).partition("\0")[0].strip() for tag in (_MAKER, _MODEL))
-    light = _light(*(_number(tags.get(tag)) for tag in (_TIME, _ISO, _F_NUMBER)))
-    return ExposureData(" ".join(filter(None, names)), light)
+    return _plausible(
+        " ".join(filter(None, names)), *(number_of(tags.get(tag)) for tag in (_TIME, _ISO, _F_NUMBER))
+    )
 
 
-def _light(seconds: float | None, iso: float | None, f_number: float | None) -> float | None:
-    """Relative exposure of plausible numbers; None without a time."""
-    if seconds is None or not 0 < seconds < 1e5:
-        return None
-    iso = iso if iso is not None and 0 < iso < 1e8 else 100.0
-    f_number = f_number if f_number is not None and 0.1 < f_number < 1000 else 1.0
-    return seconds * iso / f_number**2
+def _plausible(camera: str, seconds: float | None, iso: float | None, f_number: float | None) -> ExposureData:
+    """Exposure data without numbers that no camera has, such as the 0 of a lens that states no aperture."""
+    return ExposureData(
+        camera,
+        seconds if seconds is not None and 0 < seconds < 1e5 else None,
+        iso if iso is not None and 0 < iso < 1e8 else None,
+        f_number if f_number is not None and 0.1 < f_number < 1000 else None,
+    )
 
 
-def _number(value: Any) -> float | None:
+def number_of(value: Any) -> float | None:
     """A tag as a number, the first of several; None where it is missing or not finite."""
     try:
         number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, IndexError, ZeroDivisionError):
         return None
     return number if math.isfinite(number) else None
-
-
-_TIFF_PROFILE = 34675
-_JPEG_PROFILE = b"ICC_PROFILE\0"
-_CURVES = (b"rTRC", b"kTRC")
-_PARAMETERS = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}
-_MIDDLE = 0.5
-
-
-def stated_exponent(data: bytes) -> float | None:
-    """The exponent e that the ICC profile of a PNG, JPEG, WebP or TIFF file states: light = value ^ e at half scale.
-
-    1 is linear, 2.2 sRGB and Adobe RGB, 1.8 ProPhoto RGB. None where there is no profile, or none of this kind.
-    """
-    try:
-        profile = _profile(data)
-        decoded = None if profile is None else _decoded_middle(profile)
-    except (struct.error, zlib.error, OverflowError, ValueError, IndexError):
-        return None  # a damaged profile states nothing
-    if decoded is None or not 0 < decoded < 1:
-        return None
-    return math.log(decoded) / math.log(_MIDDLE)
-
-
-def _profile(data: bytes) -> bytes | None:
-    """The ICC profile in a picture file."""
-    if data.startswith(b"\xff\xd8"):
-        parts = [content for kind, content in jpeg_segments(data) if kind == 0xE2]
-        parts = [part[len(_JPEG_PROFILE) + 2 :] for part in parts if part.startswith(_JPEG_PROFILE)]
-        return b"".join(parts) or None
-    if data.startswith(b"\x89PNG"):
-        chunk = next((data[at + 8 : end - 4] for kind, at, end in png_chunks(data) if kind == b"iCCP"), None)
-        return None if chunk is None else zlib.decompress(chunk[chunk.index(b"\0") + 2 :])
-    if is_webp(data):
-        return next((data[at:end] for kind, at, end in webp_chunks(data) if kind == b"ICCP"), None)
-    if data[:4] in TIFF:
-        for tag, _, count, place in tiff_entries(data):
-            if tag == _TIFF_PROFILE:
-                (at,) = struct.unpack_from(tiff_order(data) + "I", data, place)
-                return data[at : at + count]
-    return None
-
-
-def _decoded_middle(profile: bytes) -> float | None:
-    """Value of a profile's red or gray curve at half scale (ICC.1, curveType and parametricCurveType)."""
-    (count,) = struct.unpack_from(">I", profile, 128)
-    entries = [struct.unpack_from(">4sII", profile, 132 + 12 * number) for number in range(min(count, 100))]
-    at = next((at for name, at, _ in entries if name in _CURVES), None)
-    if at is None:
-        return None
-    kind = profile[at : at + 4]
-    if kind == b"curv":
-        (count,) = struct.unpack_from(">I", profile, at + 8)
-        if count == 0:
-            return _MIDDLE
-        if count == 1:
-            return float(_MIDDLE ** (struct.unpack_from(">H", profile, at + 12)[0] / 256))
-        return float(struct.unpack_from(">H", profile, at + 12 + 2 * round(_MIDDLE * (count - 1)))[0]) / 65535
-    if kind != b"para":
-        return None
-    (form,) = struct.unpack_from(">H", profile, at + 8)
-    if form not in _PARAMETERS:
-        return None
-    numbers = [n / 65536 for n in struct.unpack_from(f">{_PARAMETERS[form]}i", profile, at + 12)]
-    factor, shift = numbers[1:3] if form else (1.0, 0.0)
-    # Half scale lies above the linear part of every curve in use.
-    raised = numbers[{2: 3, 4: 5}[form]] if form in (2, 4) else 0.0
-    return float(max(0.0, factor * _MIDDLE + shift) ** max(numbers[0], 0.1) + raised)

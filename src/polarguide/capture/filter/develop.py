@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture import checks
-from polarguide.capture.filter.camera_files import is_camera_raw, stated_exponent
-from polarguide.capture.filter.shots import Shots
-from polarguide.capture.formats.pictures import is_lossy, linear_codes, read_picture
-from polarguide.capture.view import FULL_CODE
+from polarguide.capture.formats.pictures import linear_codes
+from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.write import Rounding, rounding_of
-from polarguide.core.errors import PolarguideError
 from polarguide.optics.color import srgb_decode_array
 
 SMALLEST = 0.2
@@ -127,6 +122,25 @@ def remapped_mask(mask: NDArray[np.bool_], x: Any, y: Any) -> NDArray[np.bool_]:
     return np.asarray(weight > 0)
 
 
+def moved_shots(shifts: Sequence[Shift]) -> list[str]:
+    """The shots that were shifted back, and by how much, in words."""
+    return [
+        f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f}){'' if shift.warp is None else ' and turned'}"
+        for angle, shift in zip(ANGLES, shifts, strict=True)
+        if shift.corrected
+    ]
+
+
+def shift_notes(view: str, shifts: Sequence[Shift]) -> list[str]:
+    """Notes about shots that were shifted, and about shots without a reliable estimate."""
+    moved = moved_shots(shifts)
+    doubtful = [str(angle) for angle, shift in zip(ANGLES, shifts, strict=True) if not shift.trusted]
+    notes = [f"{view}: shots moved, in pixels: {', '.join(moved)}."] if moved else []
+    if doubtful:
+        notes.append(f"{view}: no reliable shift of the shots at {', '.join(doubtful)}; used as they are.")
+    return notes
+
+
 def _detail(shot: NDArray[np.float32]) -> NDArray[np.float32]:
     gray = np.log(shot.mean(axis=2) + np.float32(0.01))
     fine = cv2.GaussianBlur(gray, (0, 0), 0.8) - cv2.GaussianBlur(gray, (0, 0), 5.0)
@@ -199,15 +213,6 @@ def _turn(reference: NDArray[np.float32], other: NDArray[np.float32], shift: Shi
     return Shift(x, y, True, tuple(float(f"{value:.9g}") for value in warp[:2].ravel()))
 
 
-@dataclass(frozen=True)
-class TransferDecision:
-    """The chosen transfer function, the reason, and what to warn of: "" or a sentence."""
-
-    transfer: str
-    reason: str
-    doubt: str = ""
-
-
 def linear_intensities(pictures: NDArray[Any], transfer: str) -> NDArray[np.float32]:
     """Stored values -> linear intensities in [0, 1], same shape, float32."""
     return linear_codes(pictures, transfer).astype(np.float32) / np.float32(FULL_CODE)
@@ -221,85 +226,3 @@ def rounding_of_bytes(transfer: str, smallest: float) -> Rounding:
     """
     levels = np.arange(256) / 255
     return rounding_of(FULL_CODE * smallest * (srgb_decode_array(levels) if transfer == "srgb" else levels))
-
-
-LOSSY, PLAIN, CAMERA_RAW = "JPEG, WebP or HEIC", "PNG, TIFF or BMP", "camera raw"
-"""Kinds of picture files by their usual encoding."""
-
-
-def kind_of_file(path: Path) -> str:
-    """The kind of a photograph by its suffix."""
-    return CAMERA_RAW if is_camera_raw(path) else LOSSY if is_lossy(path) else PLAIN
-
-
-def transfer_of_kind(kind: str, transfer: str) -> tuple[str, str]:
-    """How files of a kind are usually encoded, and why; ``transfer``: as specified, or auto."""
-    if kind == CAMERA_RAW:
-        return "linear", "Transfer linear: camera raw, developed without tone curve, alike for all shots."
-    if transfer != "auto":
-        return transfer, f"Transfer {transfer}, as given."
-    usual = "linear" if kind == PLAIN else "srgb"
-    return usual, f"Transfer {usual}, as {kind} files usually are (--transfer sets it)."
-
-
-_SRGB_EXPONENT, _NEAR = 2.22, 0.1
-"""Of sRGB at half scale; share by which an exponent may differ. DoLP is off by as much as the exponent."""
-
-
-def require_known_encoding(path: Path) -> None:
-    """Refuse a photograph whose color profile states an encoding that is neither linear nor like sRGB.
-
-    Raises:
-        PolarguideError: the profile states such an encoding.
-    """
-    exponent = None if is_camera_raw(path) else stated_exponent(read_picture(path))
-    if exponent is None or any(abs(exponent / known - 1) <= _NEAR for known in (1.0, _SRGB_EXPONENT)):
-        return
-    raise PolarguideError(
-        path,
-        expected="a linear picture, or one encoded as sRGB (gamma 2.2)",
-        found=f"a color profile (ICC) that states gamma {exponent:.2f}",
-        remedy="Export with a linear profile or sRGB: DoLP would be wrong by the ratio of the two. If the profile is "
-        "wrong, give --transfer linear or srgb.",
-    )
-
-
-def decide_transfer(shots: Sequence[Shots], *, lossy: bool) -> TransferDecision:
-    """The transfer by the curvature of the response (``checks.encoding``), as ``inspect`` judges it.
-
-    Args:
-        shots: some views, aligned well enough (as from a tripod).
-        lossy: whether the files are JPEG, WebP or HEIC, for the default where the curvature does not decide.
-    """
-    slope = _slope(shots, "linear")
-    encoding = checks.encoding(slope)
-    evidence = "too few pixels are polarized to tell"
-    if slope is not None:
-        evidence = f"the curvature of the response is {slope:+.2f}; linear files have 0, sRGB about -0.6"
-    if encoding is not None:
-        return TransferDecision(encoding, f"{encoding}: {evidence}", _doubt(shots, encoding))
-    fallback = "srgb" if lossy else "linear"
-    kind = "JPEG, WebP and HEIC files" if lossy else "PNG, TIFF and BMP files"
-    reason = f"{fallback}, as {kind} usually are: {evidence} (--transfer sets it)"
-    return TransferDecision(fallback, reason, _doubt(shots, fallback))
-
-
-def _slope(shots: Sequence[Shots], transfer: str) -> float | None:
-    """The curvature of the response that a transfer leaves, over all views."""
-    return checks.curvature(
-        [
-            checks.measure(linear_codes(view.pictures, transfer), ~(view.clipped.any(axis=0) | view.dark))
-            for view in shots
-        ]
-    )
-
-
-def _doubt(shots: Sequence[Shots], transfer: str) -> str:
-    """The warning where the chosen transfer leaves the response curved, as a camera's own tone curve does."""
-    left = _slope(shots, transfer)
-    if left is None or checks.ENCODED[0] <= left <= checks.DECODED[0]:
-        return ""
-    return (
-        f"Read as {transfer}, the response still has a curvature of {left:+.2f} (0 if it is linear): the files have "
-        "another tone curve, and DoLP is wrong. Export 16-bit TIFF without a tone curve, or take camera raw."
-    )

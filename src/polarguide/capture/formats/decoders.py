@@ -153,7 +153,7 @@ _BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif
 _AVIF = (b"avif", b"avis")
 _ORIENTATION_OF_TURNS = (1, 8, 3, 6)
 """EXIF's number for quarter turns counter-clockwise."""
-_HIGH_RANGE = {16: "PQ", 18: "HLG"}
+HIGH_RANGE = {16: "PQ", 18: "HLG"}
 """Transfer characteristics (ITU-T H.273) of displays, which depend on more than the light at a pixel."""
 
 
@@ -255,7 +255,17 @@ def heif_tags(data: bytes) -> bytes:
         return b""
 
 
-def heif_pixels(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
+def heif_colors(data: bytes) -> tuple[int | None, bytes | None]:
+    """Transfer characteristics and ICC profile that a HEIC file states.
+
+    Raises:
+        Exception: of several kinds, where the file is damaged or pillow-heif is not installed.
+    """
+    info = optional_import("pillow_heif", "color").open_heif(io.BytesIO(data)).info
+    return (info.get("nclx_profile") or {}).get("transfer_characteristics"), info.get("icc_profile")
+
+
+def heif_pixels(path: Path, data: bytes) -> NDArray[Any]:
     """The picture of a HEIC file as the camera stored it, before it is turned for display.
 
     Args:
@@ -263,7 +273,7 @@ def heif_pixels(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
         data: the whole file, without damage that its structure tells.
 
     Returns:
-        [H, W, C] uint8, or uint16 of more than 8 bits, in OpenCV's order of channels; and the value of full scale.
+        [H, W, C] uint8, or uint16 of more than 8 bits brought to full scale, in OpenCV's order of channels.
 
     Raises:
         PolarguideError: pillow-heif is not installed.
@@ -276,16 +286,23 @@ def heif_pixels(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
     if len(opened) > 1:
         raise ValueError(f"a HEIC file of {len(opened)} pictures")
     transfer = (opened.info.get("nclx_profile") or {}).get("transfer_characteristics")
-    if transfer in _HIGH_RANGE:
-        raise ValueError(f"a HEIC file of high dynamic range ({_HIGH_RANGE[transfer]})")
+    if transfer in HIGH_RANGE:
+        raise ValueError(f"a HEIC file of high dynamic range ({HIGH_RANGE[transfer]})")
     bits, pixels = int(opened.info["bit_depth"]), np.asarray(opened)
     pixels = np.rot90(pixels, -head.turns)
     if pixels.shape[1::-1] != head.size:
         raise ValueError("a HEIC file whose picture has another size than its header states")
     if pixels.dtype == np.uint8:
-        return np.ascontiguousarray(pixels), 255
+        return np.ascontiguousarray(pixels)
     # The decoder puts the bits at the top of 16.
-    return np.ascontiguousarray(pixels >> (16 - bits)), (1 << bits) - 1
+    return rescaled(np.ascontiguousarray(pixels >> (16 - bits)), (1 << bits) - 1)
+
+
+def rescaled(pixels: NDArray[Any], full: int) -> NDArray[Any]:
+    """Whole numbers of which ``full`` is full scale, as such of the whole range of their type."""
+    whole = np.iinfo(pixels.dtype).max
+    table = np.rint(np.minimum(np.arange(whole + 1) * (whole / full), whole)).astype(pixels.dtype)
+    return np.asarray(table[pixels])
 
 
 # It logs what it finds odd in a file; what matters of it is an error here.
@@ -294,7 +311,7 @@ logging.getLogger("tifffile").addHandler(logging.NullHandler())
 _GRAY, _RGB, _PALETTE, _YCBCR = 1, 2, 3, 6
 _WHITE_IS_ZERO = 0
 _SAMPLES = {_GRAY: 1, _RGB: 3, _PALETTE: 1, _YCBCR: 3}
-_JPEG = (6, 7)
+JPEG_IN_TIFF = (6, 7)
 """Compressions that decode to RGB what is stored as luminance and color differences."""
 _NO_PICTURE, _OLD_REDUCED = 1 | 4, 2
 """Of NewSubfileType: a smaller copy, or a mask of transparency; of the older tag: a smaller copy."""
@@ -305,7 +322,7 @@ class UnreadableTiffError(ValueError):
     """A TIFF file that is no ordinary picture; the text is a noun phrase that says why."""
 
 
-def decode_tiff(data: bytes) -> tuple[NDArray[Any], int]:
+def decode_tiff(data: bytes) -> NDArray[Any]:
     """The picture of a TIFF or BigTIFF file, neither turned nor scaled.
 
     Args:
@@ -313,7 +330,7 @@ def decode_tiff(data: bytes) -> tuple[NDArray[Any], int]:
 
     Returns:
         [H, W] or [H, W, C] in OpenCV's order of channels (blue, green, red, alpha), of 8- or 16-bit whole numbers or
-        floating-point numbers; and the bits of a sample, which may be fewer than those of the array.
+        floating-point numbers.
 
     Raises:
         UnreadableTiffError: the file has several pictures, or samples that mean something else.
@@ -331,15 +348,36 @@ def decode_tiff(data: bytes) -> tuple[NDArray[Any], int]:
         raise UnreadableTiffError("a TIFF file of several layers")
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     if bits == 1 and pixels.dtype.kind in "bu":
-        pixels, bits = pixels.astype(np.uint8) * np.uint8(255), 8
+        pixels = pixels.astype(np.uint8) * np.uint8(255)
     if colors is not None:
         # Palettes have 16 bits; those of 8-bit colors are multiples of 257.
-        pixels, bits = np.rint(np.asarray(colors).T[pixels] / 257).astype(np.uint8), 8
+        pixels = np.rint(np.asarray(colors).T[pixels] / 257).astype(np.uint8)
     if transparent and samples == 2:
-        return pixels[..., [0, 0, 0, 1]], bits
+        return pixels[..., [0, 0, 0, 1]]
     if pixels.ndim == 3:
         pixels = pixels[..., [2, 1, 0, 3]] if transparent else pixels[..., ::-1]
-    return pixels, bits
+    return pixels
+
+
+_LARGEST = 281
+
+
+def tiff_full_scale(file: tifffile.TiffFile) -> int | None:
+    """The full scale that a TIFF file states below that of its type; None where it does not.
+
+    By the bits of a sample, or by MaxSampleValue where that is all ones in binary: the tag may also hold the largest
+    value that occurs.
+    """
+    page = file.pages.first
+    kind, bits = page.dtype, int(page.bitspersample)
+    if kind is None or kind.kind != "u" or bits == 1 or page.photometric == _PALETTE:
+        return None
+    stated = page.tags.valueof(_LARGEST, 0)
+    largest = max(stated) if isinstance(stated, tuple) else int(stated)
+    full = (1 << bits) - 1
+    if 0 < largest < full and largest & (largest + 1) == 0:
+        full = largest
+    return full if full < np.iinfo(kind).max else None
 
 
 def _only_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
@@ -373,7 +411,7 @@ def _judged(page: tifffile.TiffPage) -> tuple[int, bool]:
     meaning, samples = int(page.photometric), int(page.samplesperpixel)
     if meaning == _WHITE_IS_ZERO:
         raise UnreadableTiffError("a TIFF file whose white is 0")
-    if meaning not in _SAMPLES or (meaning == _YCBCR and int(page.compression) not in _JPEG):
+    if meaning not in _SAMPLES or (meaning == _YCBCR and int(page.compression) not in JPEG_IN_TIFF):
         name = getattr(page.photometric, "name", str(meaning)).lower()
         raise UnreadableTiffError(f"a TIFF file of the color model {name}")
     more = samples - _SAMPLES[meaning]

@@ -25,7 +25,7 @@ from polarguide.capture.formats.decoders import (
 )
 from polarguide.core.errors import PolarguideError
 
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG = b"\x89PNG\r\n\x1a\n"
 # Within JPEG scan data, 0xFF followed by 0 is a stuffed byte and by 0xD0-0xD7 a restart; all else ends it.
 _JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
@@ -60,7 +60,7 @@ def find_damage(data: bytes) -> str | None:
     """
     if not data:
         return "an empty file"
-    if data.startswith(_PNG_SIGNATURE):
+    if data.startswith(PNG):
         return _png_damage(data)
     if data.startswith(b"\xff\xd8"):
         return _jpeg_damage(data)
@@ -79,7 +79,7 @@ def find_damage(data: bytes) -> str | None:
 
 def declared_size(data: bytes) -> tuple[int, int] | None:
     """Width and height in the header of a picture file; None where decoders might see others, or none."""
-    if data.startswith(_PNG_SIGNATURE):
+    if data.startswith(PNG):
         return struct.unpack_from(">II", data, 16) if data[12:16] == b"IHDR" and len(data) >= 24 else None
     if data.startswith(b"\xff\xd8"):
         return _jpeg_size(data)
@@ -96,11 +96,22 @@ def declared_size(data: bytes) -> tuple[int, int] | None:
 
 def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
     """Kind, start and end of the chunks of a PNG file; the last may end beyond the file."""
-    at = len(_PNG_SIGNATURE)
+    at = len(PNG)
     while at + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
         yield kind, at, at + 12 + length
         at += 12 + length
+
+
+def png_chunk(data: bytes, kind: bytes) -> bytes | None:
+    """The content of the first chunk of a kind in a PNG file; None where there is none."""
+    return next((data[at + 8 : end - 4] for name, at, end in png_chunks(data) if name == kind), None)
+
+
+def significant_bits(data: bytes) -> int | None:
+    """The largest count of significant bits of gray or a color that a PNG file states (sBIT)."""
+    stated = png_chunk(data, b"sBIT")
+    return max(stated[:3] if len(stated) > 2 else stated[:1]) if stated else None
 
 
 def _jpeg_marks(data: bytes) -> Iterator[tuple[int, int, int]]:

@@ -11,26 +11,33 @@ from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
 
 from polarguide.capture.formats.arrays import BROKEN, array_header, exr_size, hdr_size
 from polarguide.capture.formats.decoders import (
+    JPEG_IN_TIFF,
     UnreadableTiffError,
     decode_tiff,
     heif_pixels,
     is_heif,
+    is_webp,
     plain_head,
     plain_pixels,
+    rescaled,
+    tiff_full_scale,
+    webp_chunks,
 )
 from polarguide.capture.formats.integrity import (
     BIG_TIFF,
     LARGEST_PIXELS,
     MOST_ENTRIES,
+    PNG,
     TIFF,
     damaged,
     declared_size,
     find_damage,
-    tiff_entries,
+    significant_bits,
     tiff_order,
 )
 from polarguide.capture.view import FULL_CODE
@@ -58,8 +65,8 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
         path: where ``data`` came from, for messages.
         data: the whole file: PNG, JPEG, WebP, HEIC, BMP, PGM, PPM or TIFF of 8 or 16 bits a channel, gray or color;
             TIFF of floating-point numbers from 0 to 1, which become 16 bits (larger ones are at full scale). Those of
-            fewer bits (10 to 14 in TIFF, PGM of another full scale) are brought to the full scale of 8 or 16. Alpha is
-            dropped, an orientation tag is not applied (poses belong to the stored pixels).
+            fewer bits, as ``stated_full_scale`` says, are brought to the full scale of 8 or 16. Alpha is dropped,
+            an orientation tag is not applied (poses belong to the stored pixels).
 
     Returns:
         [H, W, 3] uint8 or uint16, RGB, as stored. A gray picture becomes three equal channels.
@@ -67,10 +74,11 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
     Raises:
         PolarguideError: the file is damaged, cut short, of another kind, or transparent somewhere.
     """
-    pixels, full = _decoded(path, data)
+    pixels = decode_stored(path, data)
+    full = stated_full_scale(path, io.BytesIO(data), pixels)
     if pixels.dtype.kind == "f":
         pixels = _codes_of_floats(path, pixels)
-    elif pixels.dtype.kind == "u" and full < np.iinfo(pixels.dtype).max:
+    elif full is not None:
         pixels = rescaled(pixels, full)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise PolarguideError(
@@ -189,9 +197,16 @@ def decode_materials(path: Path, data: bytes) -> NDArray[np.uint8]:
     """Decode a picture of materials into [H, W]: 0 unknown, 1 dielectric, 2 metal, from 3 on what ``scene.json`` says.
 
     Raises:
-        PolarguideError: the file is damaged, cut short, of another kind, or has a larger value than a byte holds.
+        PolarguideError: the file is damaged, cut short, of another kind, lossy, or has a value beyond 255.
     """
     pixels = decode_stored(path, data)
+    if _loses_detail(data):
+        raise PolarguideError(
+            path,
+            expected="a lossless picture, such as PNG, which keeps the numbers of materials",
+            found="a compression that changes them (JPEG, HEIC, WebP)",
+            remedy=f"Save it as PNG. {MATERIAL_REMEDY}",
+        )
     gray = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)
     if int(gray.max(initial=0)) > MOST_MATERIAL:
         raise PolarguideError(
@@ -219,40 +234,25 @@ def _table(full: int, transfer: str) -> NDArray[np.uint16]:
     return np.rint(levels * FULL_CODE).astype(np.uint16)
 
 
-def rescaled(pixels: NDArray[Any], full: int) -> NDArray[Any]:
-    """Whole numbers of which ``full`` is full scale, as such of the whole range of their type."""
-    whole = np.iinfo(pixels.dtype).max
-    table = np.rint(np.minimum(np.arange(whole + 1) * (whole / full), whole)).astype(pixels.dtype)
-    return np.asarray(table[pixels])
-
-
 def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
     """Decode a picture exactly as stored: [H, W] or [H, W, C] in OpenCV's channel order, any value type.
 
     Raises:
         PolarguideError: the file is damaged, cut short, of another kind, or has samples that are no picture's.
     """
-    return _decoded(path, data)[0]
-
-
-def _decoded(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
-    """The same, and the value of full scale.
-
-    TIFF goes to tifffile, PNG, JPEG and WebP to OpenCV once their structure is known to be whole, and to no other
-    decoder: Pillow would return 8 bits of 16-bit color.
-    """
+    # TIFF goes to tifffile, PNG, JPEG and WebP to OpenCV once their structure is known to be whole, and to no other
+    # decoder: Pillow would return 8 bits of 16-bit color.
     damage = find_damage(data)
     size = None if damage is not None else declared_size(data)
     if size is not None and size[0] * size[1] > LARGEST_PIXELS:
         damage = f"one of {size[0]}x{size[1]} pixels, more than any camera takes"
     if damage is not None:
         raise _unreadable(path, damage)
-    pixels, full = None, 0
+    pixels = None
     head = plain_head(data)
     if data[:4] in (*TIFF, *BIG_TIFF):
         try:
-            pixels, bits = decode_tiff(data)
-            full = (1 << bits) - 1
+            pixels = decode_tiff(data)
         except UnreadableTiffError as error:
             raise PolarguideError(
                 path,
@@ -264,7 +264,7 @@ def _decoded(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
         except Exception:  # tifffile and its codecs raise what they please for damaged files
             pixels = None
     elif head is not None:
-        return plain_pixels(data, head), head.full
+        return plain_pixels(data, head)
     elif is_heif(data):
         try:
             return heif_pixels(path, data)
@@ -280,9 +280,7 @@ def _decoded(path: Path, data: bytes) -> tuple[NDArray[Any], int]:
     if pixels is None:
         _require_room(path, size)
         raise _unreadable(path, "one that cannot be decoded")
-    if full == 0 and pixels.dtype.kind == "u":
-        full = int(np.iinfo(pixels.dtype).max)
-    return np.asarray(pixels), full
+    return np.asarray(pixels)
 
 
 def _unreadable(path: Path, found: str) -> PolarguideError:
@@ -302,36 +300,80 @@ def is_lossy(path: Path) -> bool:
     return path.suffix.lower() in _LOSSY
 
 
-_BITS, _FORMAT, _UNSIGNED = 258, 339, 1
+def _loses_detail(data: bytes) -> bool:
+    """Whether the compression of a picture changes its values; by its content, whatever its suffix."""
+    if is_webp(data):
+        return any(kind == b"VP8 " for kind, _, _ in webp_chunks(data))
+    if data[:4] in (*TIFF, *BIG_TIFF):
+        with tifffile.TiffFile(io.BytesIO(data)) as tiff:
+            return int(tiff.pages.first.compression) in JPEG_IN_TIFF
+    return data.startswith(b"\xff\xd8") or is_heif(data)
+
+
+def stated_full_scale(path: Path, file: BinaryIO, samples: NDArray[Any]) -> int | None:
+    """The full scale that a picture file states below that of its type; None where it does not.
+
+    By the maximum of PGM and PPM, bits and MaxSampleValue of TIFF, and the significant bits (sBIT) of PNG.
+
+    Args:
+        path: for messages. file: the file, open, or its bytes. samples: its values as stored.
+
+    Raises:
+        PolarguideError: a sample exceeds it.
+    """
+    head = file.read(HEAD)
+    colors = samples[..., :3] if samples.ndim == 3 else samples
+    if samples.dtype.kind != "u":
+        return None
+    if head.startswith(PNG):
+        return _full_of_significant(colors, significant_bits(head))
+    full = None
+    plain = plain_head(head)
+    if plain is not None:
+        full = plain.full if plain.full < np.iinfo(samples.dtype).max else None
+    elif head[:4] in (*TIFF, *BIG_TIFF):
+        file.seek(0)
+        with tifffile.TiffFile(file) as tiff:
+            full = tiff_full_scale(tiff)
+    if full is not None and int(colors.max(initial=0)) > full:
+        raise PolarguideError(
+            path,
+            expected=f"values up to {full}, which its header states as the largest",
+            found=f"{int(colors.max())}",
+            remedy="Write the file with the maximum of the camera's values (1023 of 10 bits, 4095 of 12).",
+        )
+    return full
+
+
+def _full_of_significant(samples: NDArray[Any], bits: int | None) -> int | None:
+    """Full scale of the samples of a PNG file that states their significant bits.
+
+    The standard wants them at the top of all bits, and programs of cameras write them at the bottom: then all are
+    small, and low bits are used.
+    """
+    kind = np.iinfo(samples.dtype)
+    if bits is None or not 0 < bits < kind.bits:
+        return None
+    spare = kind.bits - bits
+    at_bottom = int(samples.max(initial=0)) < 1 << bits and bool((samples & ((1 << spare) - 1)).any())
+    return (1 << bits) - 1 if at_bottom else int(kind.max) >> spare << spare
 
 
 def may_use_fewer_bits(path: Path) -> bool:
     """Whether the whole numbers of a picture file may fill fewer than the 16 bits that its samples take.
 
-    Cameras of 10 to 14 bits write PNG and TIFF files of 16 bits, which do not say so.
+    Cameras of 10 to 14 bits write PNG and TIFF files of 16 bits, most of which do not say so.
     """
     if not path.is_file():  # opening a pipe would wait for its writer; whoever reads the picture refuses it
         return False
-    with contextlib.suppress(struct.error, OverflowError, OSError), open(path, "rb") as file:
-        start = file.read(32)
-        if start.startswith(b"\x89PNG"):
-            return start[24] == 16
-        if start[:4] not in (*TIFF, *BIG_TIFF):
-            return False
-        head = _directory(file, start[:16])
-        bits, kind = 0, _UNSIGNED
-        for tag, _, count, at in tiff_entries(head):
-            if tag in (_BITS, _FORMAT):
-                inline = count <= (4 if start[:4] in BIG_TIFF else 2)
-                at_value = at if inline else None
-                if at_value is None:
-                    place = tiff_order(head) + ("Q" if start[:4] in BIG_TIFF else "I")
-                    file.seek(struct.unpack_from(place, head, at)[0])
-                    (value,) = struct.unpack(tiff_order(head) + "H", file.read(2))
-                else:
-                    (value,) = struct.unpack_from(tiff_order(head) + "H", head, at_value)
-                bits, kind = (value, kind) if tag == _BITS else (bits, value)
-        return bits == 16 and kind == _UNSIGNED
+    with contextlib.suppress(Exception), open(path, "rb") as file:  # tifffile raises what it pleases
+        head = file.read(HEAD)
+        if head.startswith(PNG):
+            return head[24] == 16 and significant_bits(head) is None
+        if head[:4] in (*TIFF, *BIG_TIFF):
+            file.seek(0)
+            with tifffile.TiffFile(file) as tiff:
+                return tiff.pages.first.dtype == np.uint16 and tiff_full_scale(tiff) is None
     return False
 
 

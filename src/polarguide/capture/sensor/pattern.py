@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from msgspec import Meta
@@ -15,15 +18,62 @@ from polarguide.core.errors import PolarguideError
 _CELL = np.array([[90, 45], [135, 0]])
 _BAYER = np.array([[0, 1], [1, 2]])  # R G / G B, one entry a polarizer cell
 
-SENSORS: dict[str, bool] = {"IMX250MYR": True, "IMX264MYR": True, "IMX250MZR": False}
-"""Sony sensors by name, and whether they are color sensors."""
-SENSOR_NAMES = "IMX250MYR and IMX264MYR (color), IMX250MZR (monochrome)"
+Sensor = Literal["IMX250MYR", "IMX250MZR", "IMX253MYR", "IMX253MZR", "IMX264MYR", "IMX264MZR"]
+SENSORS: dict[str, bool] = {name: name.endswith("MYR") for name in get_args(Sensor)}
+"""Sony sensors by name, and whether they are color sensors. All color ones have one pattern, all others another."""
+SENSOR_NAMES = (
+    "IMX250MYR, IMX253MYR, IMX264MYR (color), IMX250MZR, IMX253MZR, IMX264MZR (monochrome), a camera's model"
+)
 """The same for people."""
+SENSOR_SIZES = {name: (4112, 3008) if "253" in name else (2464, 2056) for name in SENSORS}
+"""Width and height in pixels; cameras give some less, such as 2448 x 2048."""
+
+_CAMERAS: dict[str, Sensor] = {
+    "PHX050S-P": "IMX250MZR", "TRI050S-P": "IMX250MZR", "BFS-U3-51S5P": "IMX250MZR", "BFS-PGE-51S5P": "IMX250MZR",
+    "acA2440-75umPOL": "IMX250MZR", "DZK 33UX250": "IMX250MZR", "DZK 33GX250": "IMX250MZR", "exo250ZU3": "IMX250MZR",
+    "exo250ZGE": "IMX250MZR", "GO-5100MP": "IMX250MZR", "PL-D755MU-POL": "IMX250MZR", "CS505MUP1": "IMX250MZR",
+    "PHX050S-Q": "IMX250MYR", "TRI050S-Q": "IMX250MYR", "BFS-U3-51S5PC": "IMX250MYR", "BFS-PGE-51S5PC": "IMX250MYR",
+    "acA2440-75ucPOL": "IMX250MYR", "DYK 33UX250": "IMX250MYR", "DYK 33GX250": "IMX250MYR",
+    "BFS-PGE-123S6P": "IMX253MZR",
+    "PHX050S1-P": "IMX264MZR", "TRI050S1-P": "IMX264MZR", "PHX050S1-Q": "IMX264MYR", "TRI050S1-Q": "IMX264MYR",
+}  # fmt: skip
+"""The sensor of a camera by the maker's model name, which a mount or an interface of three letters may follow."""
+_MOUNT = re.compile(r"-?[A-Z0-9]{0,3}")
+
+
+def _spelled(name: str) -> str:
+    """A name in capitals, with hyphens for blanks: people and programs write names either way."""
+    return re.sub(r"[\s_]+", "-", name.strip()).upper()
 
 
 def sensor_named(name: str) -> str:
-    """The name of a sensor whose letters may be small; another word as it is."""
-    return name.upper() if name.upper() in SENSORS else name
+    """The sensor of this name, or in the camera of this model; another word as it is."""
+    spelled = _spelled(name)
+    if spelled in SENSORS:
+        return spelled
+    # The longest: BFS-U3-51S5PC is another camera than BFS-U3-51S5P with the mount C.
+    for model in sorted(_CAMERAS, key=len, reverse=True):
+        begin = _spelled(model)
+        if spelled.startswith(begin) and _MOUNT.fullmatch(spelled[len(begin) :]):
+            return _CAMERAS[model]
+    return name
+
+
+def require_sensor(name: str | None) -> None:
+    """Refuse a name that is no sensor's and no known camera's.
+
+    Raises:
+        PolarguideError: it is such a one.
+    """
+    if name is None or name in SENSORS:
+        return
+    raise PolarguideError(
+        "--sensor",
+        expected=f"a sensor ({', '.join(SENSORS)}) or a camera's model ({', '.join(_CAMERAS)})",
+        found=repr(name),
+        remedy="Give the sensor of the camera's data sheet. IMX250MZR has the same pattern as all monochrome ones, "
+        "IMX250MYR as all color ones.",
+    )
 
 
 def any_case(*names: str) -> PrimitiveConstructorSpec[Any]:
@@ -37,10 +87,7 @@ def any_case(*names: str) -> PrimitiveConstructorSpec[Any]:
     )
 
 
-SensorName = Annotated[Literal["IMX250MYR", "IMX264MYR", "IMX250MZR"], any_case(*SENSORS)]
-
-SENSOR_SIZE = (2464, 2056)
-"""Width and height of all of them, in pixels; cameras give 2448 x 2048."""
+SensorName = Annotated[Sensor, any_case(*SENSORS)]
 
 Packing = Literal["8", "16", "16be", "10p", "10packed", "10mipi", "12p", "12packed", "12mipi"]
 """How ``.raw`` files hold values, see ``sensor.raw_file.PACKINGS``."""
@@ -55,7 +102,8 @@ class MosaicOptions:
     """How raw mosaics lie in their files, and on the sensor.
 
     Attributes:
-        sensor: Sensor of raw mosaics: IMX250MYR and IMX264MYR are color, IMX250MZR is monochrome.
+        sensor: Sensor of raw mosaics (IMX250, IMX253 or IMX264 with MYR for color, MZR for monochrome), or the model of
+            the camera.
         packing: Packing of .raw files (there are several of 10 and of 12 bits; never guessed).
         width: Width of .raw files in pixels; others must have it, too.
         height: Height of .raw files in pixels.
@@ -132,13 +180,7 @@ def sensor_pattern(sensor: str) -> Pattern:
     Raises:
         PolarguideError: the sensor is unknown.
     """
-    if sensor not in SENSORS:
-        raise PolarguideError(
-            "--sensor",
-            expected=f"one of {', '.join(SENSORS)}",
-            found=repr(sensor),
-            remedy="Give one of these names: of your camera's sensor, or of a sensor with the same pattern.",
-        )
+    require_sensor(sensor)
     if not SENSORS[sensor]:
         return Pattern(_CELL.copy(), None)
     return Pattern(np.tile(_CELL, (2, 2)), np.kron(_BAYER, np.ones((2, 2), int)))
@@ -191,12 +233,13 @@ def estimate_levels(
     black: float,
     saturation: int | None,
     counts: NDArray[np.int64] | None = None,
+    stated: int | None = None,
 ) -> Levels:
     """Estimate the full scale of a capture.
 
-    Without ``bits``: 8 in 8-bit files; in 16-bit files those of the value at which samples pile up, else 12 if no value
-    exceeds 4095 (the sensors' converters have 12 bits), else 16. Values whose low bits are never used (12 bits shifted
-    to the top of 16) end at the last value that can occur.
+    Without ``bits``: as the files state; else 8 in 8-bit files; in 16-bit files those of the value at which samples
+    pile up, else 12 if no value exceeds 4095 (the sensors' converters have 12 bits), else 16. Values whose low bits are
+    never used (12 bits shifted to the top of 16) end at the last value that can occur.
 
     Args:
         largest: the largest stored value of the capture.
@@ -206,12 +249,16 @@ def estimate_levels(
         black: black level in stored values.
         saturation: stored value at which the sensor saturates, or None for full scale.
         counts: how often each stored value occurs, from 0 on.
+        stated: full scale that the files state; None where they do not.
 
     Raises:
         PolarguideError: a value exceeds the range, or the levels are not in order.
     """
+    stated = stated if bits is None else None
     clipped = None if counts is None or container != 16 else clipping_bits(counts)
-    if bits is None:
+    if stated is not None:
+        bits = stated.bit_length()
+    elif bits is None:
         bits = clipped or (12 if container == 16 and largest < 4096 else container)
     if largest >= 1 << bits:
         raise PolarguideError(
@@ -220,10 +267,10 @@ def estimate_levels(
             found=str(largest),
             remedy="Give the number of bits that the files really use.",
         )
-    white = (1 << bits) - 1
+    white = stated or (1 << bits) - 1
     unused = (used & -used).bit_length() - 1 if used else 0
     if container == 16 and 0 < unused <= 8:
-        white -= (1 << unused) - 1
+        white = white >> unused << unused
     top = white if clipped is None else min(white, largest)
     top = top if saturation is None else saturation
     if not 0 <= black < top <= white:
@@ -234,6 +281,28 @@ def estimate_levels(
             remedy=f"Give both in stored values, for {bits} bits.",
         )
     return Levels(bits, white, top, float(black))
+
+
+def agreed_full_scale(stated: Mapping[Path, int | None]) -> int | None:
+    """The full scale that all files of a capture state; None where none does.
+
+    Raises:
+        PolarguideError: two say otherwise.
+    """
+    (first, full), *others = stated.items()
+    for path, other in others:
+        if other != full:
+            raise PolarguideError(
+                path,
+                expected=f"{_full_words(full)}, like {first.name}",
+                found=_full_words(other),
+                remedy="Export all files with the same settings, or give --bits.",
+            )
+    return full
+
+
+def _full_words(full: int | None) -> str:
+    return "a file that states no full scale" if full is None else f"a file that states full scale {full}"
 
 
 _FEWEST_CLIPPED = 3
@@ -259,12 +328,20 @@ def clipping_bits(counts: NDArray[np.int64]) -> int | None:
     return bits if counts[top] >= max(_FEWEST_CLIPPED, _PILE * beside + 1) else None
 
 
-def level_notes(levels: Levels, counts: NDArray[np.int64], container: int, bits: int | None) -> list[str]:
-    """Notes for the user on the assumed levels of 16-bit files; ``bits``: as specified, or None."""
-    if container != 16:
-        return []
+def level_notes(
+    levels: Levels,
+    counts: NDArray[np.int64],
+    container: int,
+    bits: int | None,
+    stated: int | None = None,
+) -> list[str]:
+    """Notes for the user on levels that the files' type does not imply; ``bits``, ``stated``: as for the estimate."""
     notes = []
-    if bits is None:
+    if bits is None and stated is not None:
+        notes.append(f"{levels.white} is full scale, as the files state (--bits says otherwise).")
+    if container != 16:
+        return notes
+    if bits is None and stated is None:
         notes.append(f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale.")
     if clipping_bits(counts) is not None and levels.saturation < FULL_16:
         share = float(counts[levels.saturation :].sum() / counts.sum())
@@ -358,10 +435,10 @@ def require_kind(sensor: str, blocks: NDArray[Any], levels: Levels) -> None:
     filters = color_filters(blocks, levels.saturation, levels.black)
     if filters is None or (filters == "color") == SENSORS[sensor]:
         return
-    other = next(name for name, colored in SENSORS.items() if colored != SENSORS[sensor])
+    other = sensor[:-3] + ("MZR" if SENSORS[sensor] else "MYR")
     raise PolarguideError(
         "--sensor",
         expected=f"mosaics of {sensor}, a {'color' if SENSORS[sensor] else 'monochrome'} sensor",
         found="no sign of color filters" if SENSORS[sensor] else "the Bayer pattern of color filters",
-        remedy=f"Use --sensor {other}, or that of your camera with this pattern.",
+        remedy=f"Use --sensor {other}.",
     )

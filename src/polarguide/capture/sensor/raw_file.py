@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.formats.arrays import array_kind, read_array
-from polarguide.capture.formats.pictures import decode_stored, read_picture
+from polarguide.capture.formats.pictures import decode_stored, read_picture, stated_full_scale
 from polarguide.capture.sensor.pattern import Packing
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
@@ -80,6 +80,13 @@ class RawFormat:
         """Bits that a pixel of type ``kind`` takes in a file."""
         packing = self.packing if path.suffix.lower() == ".raw" else None
         return kind.itemsize * 8 if packing is None else PACKINGS[packing][2]
+
+    def full_scale(self, path: Path, values: NDArray[Any]) -> int | None:
+        """The full scale that a file states for its values [H, W], as ``stated_full_scale``."""
+        if path.suffix.lower() in (".raw", ".npy"):
+            return None
+        with open(path, "rb") as file:
+            return stated_full_scale(path, file, values)
 
 
 def read_mosaic(path: Path, raw: RawFormat, *, least: int = 1) -> NDArray[Any]:

@@ -12,7 +12,13 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from polarguide.capture.calibration import Sense
-from polarguide.capture.sensor.pattern import MosaicOptions, Positive, SensorName, sensor_pattern
+from polarguide.capture.sensor.pattern import (
+    MosaicOptions,
+    Positive,
+    SensorName,
+    require_sensor,
+    sensor_pattern,
+)
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import check_options
 from polarguide.core.text import decimals
@@ -28,7 +34,8 @@ class CalibrateSettings(MosaicOptions):
     """How the shots of a polarizer were taken, and what is estimated from them.
 
     Attributes:
-        sensor: Sensor of the mosaics: IMX250MYR and IMX264MYR are color, IMX250MZR is monochrome.
+        sensor: Sensor of the mosaics (IMX250, IMX253 or IMX264 with MYR for color, MZR for monochrome), or the model of
+            the camera.
         lens: Name of the lens, for the file; its own polarization is part of what is calibrated.
         angles: Angles of the polarizer in degrees, in the order of the files' names, such as 0,15,30; names if the
             files' names end in them, after _ or a space; without it they are estimated.
@@ -62,6 +69,7 @@ class CalibrateSettings(MosaicOptions):
         Raises:
             PolarguideError: a value is out of range, or does not fit another.
         """
+        require_sensor(self.sensor)
         check_options(self)
         if not self.lens.isprintable():
             found = repr(self.lens)

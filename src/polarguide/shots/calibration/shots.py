@@ -16,6 +16,7 @@ from polarguide.capture.sensor.pattern import (
     SIDE,
     Levels,
     Pattern,
+    agreed_full_scale,
     estimate_levels,
     require_kind,
     sensor_pattern,
@@ -104,6 +105,7 @@ class Shots:
         sums: list[Array] = []
         counts: list[NDArray[np.int64]] = []
         blocks: list[NDArray[Any]] = []
+        stated: dict[Path, int | None] = {}
         light = None
         with reporter.track("reading shots", len(files) + len(self._dark)) as advance:
             if self._dark:
@@ -111,6 +113,8 @@ class Shots:
             for number, path in enumerate(files, 1):
                 values = self._read(path)
                 counts.append(np.bincount(values.ravel(), minlength=256))
+                if self._settings.bits is None:
+                    stated[path] = self._raw.full_scale(path, values)
                 if number <= len(self.files):
                     left, top = self.pattern.cell_corner()
                     blocks.append(sample_blocks(values[top:, left:], SIDE))
@@ -122,7 +126,7 @@ class Shots:
                 light = above / mean if light is None else light + above / mean
                 advance(number + len(self._dark))
         assert light is not None
-        levels = self._levels(counts)
+        levels = self._levels(counts, agreed_full_scale(stated) if stated else None)
         for path, count in zip(files, counts, strict=True):
             self._require_exposed(path, count, levels)
         require_kind(self._settings.sensor, np.concatenate(blocks), levels)
@@ -175,7 +179,7 @@ class Shots:
         planes = (values[row::period, column::period] for row, column in np.ndindex(period, period))
         return np.array([plane.mean(dtype=np.float64) for plane in planes])
 
-    def _levels(self, counts: list[NDArray[np.int64]]) -> Levels:
+    def _levels(self, counts: list[NDArray[np.int64]], stated: int | None) -> Levels:
         used = [np.flatnonzero(count) for count in counts]
         largest = max(int(values[-1]) for values in used)
         bits = int(np.bitwise_or.reduce(np.concatenate(used)))
@@ -184,8 +188,9 @@ class Shots:
         container = self._raw.container(path, np.dtype(kind))
         black = 0.0 if self._dark else settings.black_level
         return estimate_levels(
-            largest, bits, container, bits=settings.bits, black=black, saturation=settings.saturation
-        )
+            largest, bits, container,
+            bits=settings.bits, black=black, saturation=settings.saturation, stated=stated,
+        )  # fmt: skip
 
     def _too_dark(self, path: Path, values: NDArray[Any]) -> PolarguideError:
         dark = "dark frame" if self._dark else "black level"
