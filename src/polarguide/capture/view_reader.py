@@ -6,7 +6,7 @@ import functools
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import checks
+from polarguide.capture.colmap.model import ColmapModel, fit_camera
 from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.formats.integrity import declared_size
 from polarguide.capture.formats.pictures import (
@@ -29,7 +30,15 @@ from polarguide.capture.formats.pictures import (
 )
 from polarguide.capture.ground_truth import GroundTruth, read_ground_truth
 from polarguide.capture.layout import Layout
-from polarguide.capture.view import Latest, Loader, View
+from polarguide.capture.point_exposures import (
+    MOST_POINTS,
+    PointExposures,
+    PointSamples,
+    exposures_of_points,
+    matte,
+    samples_at,
+)
+from polarguide.capture.view import EVEN, Latest, Loader, View
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import LARGEST_FILE, read_file
 from polarguide.core.records import LARGEST_RECORD
@@ -82,6 +91,7 @@ class ViewData:
         black: whether some pixel of the box is 0 in all angles and channels, [H, W].
         histogram: ``checks.top_histogram`` of the stored values.
         digests: SHA-256 of every file read.
+        samples: at the points that the view observes; None where they are not compared.
     """
 
     name: str
@@ -97,19 +107,26 @@ class ViewData:
     exposures: tuple[Exposure, ...]
     materials: NDArray[np.uint8] | None = None
     material_numbers: frozenset[int] = frozenset()
+    samples: PointSamples | None = None
 
     def saturated(self, scale: int | None) -> NDArray[np.bool_]:
         """``View.saturated``, given the stored value at which the capture saturates (None: it does not)."""
         return self.black if scale is None else np.asarray(self.black | (self.peak >= scale))
 
     def view(
-        self, camera: Camera, scale: int | None, mount: Mount = "sensor", files: ViewFiles | None = None
+        self,
+        camera: Camera,
+        scale: int | None,
+        mount: Mount = "sensor",
+        files: ViewFiles | None = None,
+        gains: tuple[float, float, float] = EVEN,
     ) -> View:
         """The view with its camera and its saturated pixels.
 
         Args:
             camera: camera of the view. scale: as for ``saturated``. mount: where the polarizer was.
             files: load codes and ground truth when they are read; None: those that are here stay in memory.
+            gains: as in ``View``.
         """
         invalid, saturated = torch.from_numpy(self.invalid), torch.from_numpy(self.saturated(scale))
         return View(
@@ -123,6 +140,7 @@ class ViewData:
             exposures=self.exposures,
             mount=mount,
             materials=None if self.materials is None else torch.from_numpy(self.materials),
+            gains=gains,
         )
 
 
@@ -181,8 +199,14 @@ def _compact(mask: Tensor) -> Tensor:
     return mask if bool(mask.any()) else torch.zeros((), dtype=torch.bool).expand(mask.shape)
 
 
-def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewData:
+def read_view(
+    layout: Layout, name: str, *, factor: int, transfer: str, points: ComparedPoints | None = None
+) -> ViewData:
     """Read all files of one view, averaged over boxes of ``factor`` x ``factor`` pixels.
+
+    Args:
+        layout: the files. name: of the view. transfer: how the pictures are encoded.
+        points: what its pictures are sampled at, in full size.
 
     Raises:
         PolarguideError: a file is damaged, or the sizes of the files differ.
@@ -200,7 +224,7 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
     if name in layout.ground_truth:
         path = layout.ground_truth[name]
         ground_truth = read_ground_truth(path, files.read(path), size=(height, width), factor=factor)
-    return view_data(
+    data = view_data(
         name,
         raw,
         layout.exposures(name),
@@ -212,6 +236,7 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
         ground_truth=ground_truth,
         digests=files.digests,
     )
+    return data if points is None else replace(data, samples=points.samples(name, raw, invalid, transfer))
 
 
 def require_factor(factor: int, height: int, width: int) -> None:
@@ -370,6 +395,51 @@ def _read_beside(
 
 
 @dataclass(frozen=True, eq=False)
+class ComparedPoints:
+    """The points of a model by which the exposures of its views are compared.
+
+    Attributes:
+        model: the model. places: [N, 3]. columns: views by name. observed: which views observe each point, [N, V].
+    """
+
+    model: ColmapModel
+    places: NDArray[np.float64]
+    columns: Mapping[str, int]
+    observed: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, model: ColmapModel, views: Sequence[str]) -> ComparedPoints | None:
+        """The points with the longest tracks; None where no tracks are stored."""
+        observed = model.observations(views).numpy()
+        longest = np.argsort(-observed.sum(axis=1), kind="stable")[:MOST_POINTS]
+        observed = observed[longest]
+        if not observed.any():
+            return None
+        places = model.points.double().numpy()[longest]
+        return cls(model, places, {view: column for column, view in enumerate(views)}, observed)
+
+    def samples(
+        self, view: str, raw: Sequence[NDArray[Any]], bad: NDArray[np.bool_] | None, transfer: str
+    ) -> PointSamples | None:
+        """Samples of a view's stored pictures at the points that it observes; None without a pose."""
+        if view not in self.columns:
+            return None
+        height, width = raw[0].shape[:2]
+        camera = fit_camera(self.model.camera(view), width, height, folder=self.model.folder, view=view)
+        return samples_at(self.places[self.observed[:, self.columns[view]]], camera, raw, bad, transfer)
+
+    def exposures(self, data: Sequence[ViewData], full_scale: int | None) -> PointExposures:
+        """Exposures of views of four angles, [V, 3] in their order; NaN where one has no pose."""
+        values = np.full((len(self.places), len(data), 3), np.nan, np.float32)
+        for place, item in enumerate(data):
+            if item.samples is not None:
+                fine = item.samples.peaks < (np.inf if full_scale is None else full_scale)
+                seen = self.observed[:, self.columns[item.name]]
+                values[seen, place] = np.where(fine[:, None], matte(item.samples.values), np.nan)
+        return exposures_of_points(values, self.places)
+
+
+@dataclass(frozen=True, eq=False)
 class StoredViews:
     """The views of a capture as read, with a pose or without.
 
@@ -379,6 +449,7 @@ class StoredViews:
         measures: ``checks.measure`` of each view.
         largest_value: the largest value that the files can store, 255 or 65535.
         full_scale: the stored value at which the capture saturates; None if nothing is saturated.
+        exposures: those of each view by points in common; None where they are not compared.
     """
 
     data: tuple[ViewData, ...]
@@ -386,10 +457,16 @@ class StoredViews:
     measures: tuple[checks.Measures, ...]
     largest_value: int
     full_scale: int | None
+    exposures: PointExposures | None = None
 
     @classmethod
-    def of(cls, data: Sequence[ViewData], cameras: Sequence[Camera | None]) -> StoredViews:
-        """Measure views, and find where they saturate.
+    def of(
+        cls,
+        data: Sequence[ViewData],
+        cameras: Sequence[Camera | None],
+        points: ComparedPoints | None = None,
+    ) -> StoredViews:
+        """Measure views, find where they saturate, and compare their exposures at points.
 
         Raises:
             PolarguideError: the views differ in bit depth.
@@ -400,7 +477,15 @@ class StoredViews:
             checks.measure(item.codes, ~(item.invalid | item.saturated(scale)), four=item.exposures == FOUR)
             for item in data
         ]
-        return cls(tuple(data), tuple(cameras), tuple(measures), largest_value, scale)
+        exposures = None if points is None else points.exposures(data, scale)
+        return cls(tuple(data), tuple(cameras), tuple(measures), largest_value, scale, exposures)
+
+    def gains(self) -> list[tuple[float, float, float]]:
+        """The significant gains of R, G and B of each view; 1 where they are not known."""
+        if self.exposures is None:
+            return [EVEN] * len(self.data)
+        logs = np.nan_to_num(self.exposures.significant)
+        return [(float(r), float(g), float(b)) for r, g, b in np.exp(logs).round(6)]
 
     def picture_warnings(self, transfer: str) -> list[str]:
         """Warnings about the exposure, encoding and order of the pictures."""

@@ -26,7 +26,9 @@ from polarguide.capture.calibration import (
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.exposures import Angle, angle_text, turned
 from polarguide.capture.filter.camera_files import (
+    Lens,
     apply_orientation,
+    camera_groups,
     is_camera_raw,
     orientation,
     orientation_calibration,
@@ -100,6 +102,10 @@ class ShotsSource(Source):
         if is_camera_raw(first):
             return Stored(*stored_frame(first))
         return Stored(stated_size(first), orientation(read_picture(first)))
+
+    def lenses(self) -> dict[str, Lens]:
+        """By the EXIF tags of each view's first shot."""
+        return camera_groups({view: paths[0] for view, paths in self._of_view.items()})
 
     def use_stored(self, views: Collection[str]) -> None:
         """Develop these views without turning them."""
@@ -352,7 +358,7 @@ class SinglesSource(ShotsSource):
         """The transfer, and what the files say about their exposure.
 
         Raises:
-            PolarguideError: the photographs are too large, or not of one camera and size.
+            PolarguideError: the photographs are too large, or not of one size.
         """
         self._require_memory("photographs of a view")
         sizes: dict[str, Path] = {}  # but for the side they were held on
@@ -364,17 +370,12 @@ class SinglesSource(ShotsSource):
         transfer, reason = self._transfer()
         levels, counted = levels_of_shots(self._shots, self._white, self._settings)
         light: dict[str, float] = {}
-        cameras: dict[str, Path] = {}
         for number, view in enumerate(self.views, 1):
             for path in self._of_view[view]:
                 taken = read_exposure_data(path)
-                if taken.camera:
-                    cameras.setdefault(taken.camera, path)
                 if taken.light is not None:
                     light[self._name(path)] = taken.light
             advance(number)
-        remedy = "Prepare those of one camera; only one set of intrinsics is estimated."
-        self._require_one(cameras, "camera", remedy)
         whole = len(self._shots)
         stating = "All" if len(light) == whole else f"{len(light) or 'None'} of {whole}"
         return {

@@ -377,6 +377,7 @@ class Workshop:
             untried=_untried(settings, self._pictures.kind),
             intrinsics=None if settings.intrinsics is None else known_intrinsics(settings.intrinsics),
             refine=settings.refine_intrinsics,
+            lenses=self._pictures.lenses(),
         )
 
     def points(self, poses: Poses) -> tuple[Poses, dict[str, Any]]:

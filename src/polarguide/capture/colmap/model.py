@@ -352,15 +352,18 @@ def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
 
 def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...], int]:
     """Finite points, their colors and the numbers of the images that see them; how many points are not finite."""
-    points = [point for _, point in sorted(model.points3D.items())]
+    numbered = sorted(model.points3D.items())
+    points = [point for _, point in numbered]
     with np.errstate(over="ignore"):
         places = np.array([point.xyz for point in points]).reshape(-1, 3).astype(np.float32)
     colors = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
     finite = (np.abs(places) <= FARTHEST).all(axis=1)
-    tracks = tuple(
-        tuple(element.image_id for element in point.track.elements)
-        for point in (points[place] for place in np.flatnonzero(finite))
-    )
+    seen = {number: {element.image_id for element in point.track.elements} for number, point in numbered}
+    for number, image in model.images.items():  # exported models may have tracks there alone
+        for observed in image.points2D:
+            if observed.has_point3D() and observed.point3D_id in seen:
+                seen[observed.point3D_id].add(number)
+    tracks = tuple(tuple(sorted(seen[numbered[place][0]])) for place in np.flatnonzero(finite))
     return torch.from_numpy(places[finite]), torch.from_numpy(colors[finite]), tracks, int((~finite).sum())
 
 

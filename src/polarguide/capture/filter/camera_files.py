@@ -14,7 +14,7 @@ import math
 import struct
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -242,6 +242,19 @@ def tags_of(data: bytes) -> dict[int, Any]:
 
 _MAKER, _MODEL, _DIRECTORY = 271, 272, 34665
 _TIME, _F_NUMBER, _ISO = 33434, 33437, 34855
+_FOCAL_LENGTH, _FOCAL_LENGTH_OF_FILM, _SERIAL_NUMBER, _LENS = 37386, 41989, 42033, 42036
+
+
+@dataclass(frozen=True)
+class Lens:
+    """The camera and the lens of a picture, as far as its file states them.
+
+    Attributes:
+        camera: in words. focal: focal length, in a unit that pictures of one ``camera`` share; None: not known.
+    """
+
+    camera: str
+    focal: float | None = None
 
 
 @dataclass(frozen=True)
@@ -250,12 +263,14 @@ class ExposureData:
 
     Attributes:
         camera: maker and model; empty where it does not say.
+        lens: body and lens, with the focal length in mm of the 35 mm film, else as it is.
         light: how much light was let in and how it was amplified: seconds * ISO / f-number^2; None where it does not
             say the time. ISO and f-number count as 100 and 1 where they are not said.
     """
 
     camera: str
     light: float | None
+    lens: Lens = Lens("")
 
 
 def read_exposure_data(path: Path) -> ExposureData:
@@ -282,7 +297,42 @@ def exif_data(data: bytes) -> ExposureData:
     tags = tags_of(data)
     names = (str(tags.get(tag, "")).partition("\0")[0].strip() for tag in (_MAKER, _MODEL))
     light = _light(*(_number(tags.get(tag)) for tag in (_TIME, _ISO, _F_NUMBER)))
-    return ExposureData(" ".join(filter(None, names)), light)
+    camera = " ".join(filter(None, names))
+    return ExposureData(camera, light, _lens(camera, tags))
+
+
+def _lens(camera: str, tags: dict[int, Any]) -> Lens:
+    """Bodies and lenses count as one where their focal lengths are stated: then these tell cameras apart."""
+    focal, of_film = (_number(tags.get(tag)) for tag in (_FOCAL_LENGTH, _FOCAL_LENGTH_OF_FILM))
+    stated = [(unit, value) for unit, value in (("film", of_film), ("lens", focal)) if value and value > 0]
+    if stated:
+        return Lens(f"{camera} ({stated[0][0]})", stated[0][1])
+    more = (str(tags.get(tag, "")).partition("\0")[0].strip() for tag in (_SERIAL_NUMBER, _LENS))
+    return Lens(" ".join(filter(None, (camera, *more))))
+
+
+_FOCAL_AGREES = 0.01
+"""Relative difference of focal lengths that are one: tags are rounded, and lenses breathe with focus."""
+
+
+def camera_groups(paths: Mapping[str, Path]) -> dict[str, Lens]:
+    """The lens of each view, by its first file; focal lengths that agree become one. Empty where all have one lens.
+
+    Raises:
+        PolarguideError: a file cannot be read.
+    """
+    lenses = {view: read_exposure_data(path).lens for view, path in paths.items()}
+    alike: list[Lens] = []
+    groups: dict[str, Lens] = {}
+    for view in sorted(lenses, key=lambda view: (lenses[view].camera, lenses[view].focal or 0.0, view)):
+        lens, last = lenses[view], alike[-1] if alike else None
+        same = last is not None and lens.camera == last.camera
+        if same and last is not None and lens.focal and last.focal:
+            same = lens.focal < (1 + _FOCAL_AGREES) * last.focal
+        if not same:
+            alike.append(lens)
+        groups[view] = alike[-1]
+    return groups if len(alike) > 1 else {}
 
 
 def _light(seconds: float | None, iso: float | None, f_number: float | None) -> float | None:
