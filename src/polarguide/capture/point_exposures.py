@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from polarguide.capture.colmap.model import ColmapModel, fit_camera
 from polarguide.capture.formats.pictures import linear_codes
 from polarguide.geometry.camera import Camera
 
@@ -63,6 +65,12 @@ class PointExposures:
         told = np.where(significant(np.abs(bright), self.errors), bright, 0.0)[:, None]
         tinted = np.where(significant(strongest, self.color_errors)[:, None], color, 0.0)
         return np.where(np.isfinite(self.logs), told + tinted, np.nan)
+
+    def gains(self) -> list[tuple[float, float, float]]:
+        """The significant gains of R, G and B of each picture; 1 where they are not known."""
+        return [
+            (float(r), float(g), float(b)) for r, g, b in np.exp(np.nan_to_num(self.significant)).round(6)
+        ]
 
 
 def significant(sizes: Array, errors: Array) -> NDArray[np.bool_]:
@@ -207,7 +215,11 @@ class PointSamples:
 
 
 def samples_at(
-    places: Array, camera: Camera, pictures: list[NDArray[Any]], bad: NDArray[np.bool_] | None, transfer: str
+    places: Array,
+    camera: Camera,
+    pictures: Sequence[NDArray[Any]],
+    bad: NDArray[np.bool_] | None,
+    transfer: str,
 ) -> PointSamples:
     """Sample K stored pictures [H, W, 3] of one view at points.
 
@@ -242,3 +254,52 @@ def matte(values: Array) -> Array:
     first = values[:, 0] - values[:, 2], values[:, 1] - values[:, 3]
     least = values.mean(axis=1) - np.hypot(*first) / 2
     return np.where(least > _DARK / 4, least, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedPoints:
+    """The points of a model by which the exposures of its views are compared.
+
+    Attributes:
+        model: the model. places: [N, 3]. columns: views by name. observed: which views observe each point, [N, V].
+    """
+
+    model: ColmapModel
+    places: NDArray[np.float64]
+    columns: Mapping[str, int]
+    observed: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, model: ColmapModel, views: Sequence[str]) -> ComparedPoints | None:
+        """The points with the longest tracks; None where no tracks are stored."""
+        observed = model.observations(views).numpy()
+        longest = np.argsort(-observed.sum(axis=1), kind="stable")[:MOST_POINTS]
+        observed = observed[longest]
+        if not observed.any():
+            return None
+        places = model.points.double().numpy()[longest]
+        return cls(model, places, {view: column for column, view in enumerate(views)}, observed)
+
+    def samples(
+        self, view: str, raw: Sequence[NDArray[Any]], bad: NDArray[np.bool_] | None, transfer: str
+    ) -> PointSamples | None:
+        """Samples of a view's stored pictures at the points that it observes; None without a pose."""
+        if view not in self.columns:
+            return None
+        height, width = raw[0].shape[:2]
+        camera = fit_camera(self.model.camera(view), width, height, folder=self.model.folder, view=view)
+        return samples_at(self.places[self.observed[:, self.columns[view]]], camera, raw, bad, transfer)
+
+    def exposures(self, samples: Mapping[str, PointSamples | None], full_scale: int | None) -> PointExposures:
+        """Exposures of views of four angles, in their order.
+
+        Args:
+            samples: by view; None without a pose. full_scale: stored value at which they saturate, if they do.
+        """
+        values = np.full((len(self.places), len(samples), 3), np.nan, np.float32)
+        for place, (view, sampled) in enumerate(samples.items()):
+            if sampled is not None:
+                fine = sampled.peaks < (np.inf if full_scale is None else full_scale)
+                seen = self.observed[:, self.columns[view]]
+                values[seen, place] = np.where(fine[:, None], matte(sampled.values), np.nan)
+        return exposures_of_points(values, self.places)

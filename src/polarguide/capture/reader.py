@@ -20,10 +20,10 @@ from polarguide.capture.formats.pictures import TRANSFERS
 from polarguide.capture.ground_truth import GroundTruth, objects_of
 from polarguide.capture.layout import Layout, check_memory, find_layout, select_views, stated_size
 from polarguide.capture.metadata import held_out, indices_of, keeps_gains, mount_of, refractive_index_of
+from polarguide.capture.point_exposures import ComparedPoints
 from polarguide.capture.scene import Scene, chosen_views, far_from_training, held_out_band
 from polarguide.capture.view import EVEN, listed
 from polarguide.capture.view_reader import (
-    ComparedPoints,
     Files,
     StoredViews,
     ViewData,
@@ -112,7 +112,8 @@ def load_scene(
             found=f"none in {len(counted)} views",
             remedy="White is invalid there: invert the pictures, or remove them.",
         )
-    gains = [EVEN] * len(names) if keeps_gains(root / "scene.json", about) else stored.gains()
+    even = stored.exposures is None or keeps_gains(root / "scene.json", about)
+    gains = [EVEN] * len(names) if even or stored.exposures is None else stored.exposures.gains()
     stays = None if hold else ViewFiles(layout, downscale, transfer, files.digests)
     posed_views = tuple(
         item.view(camera, stored.full_scale, mount, stays, gain)

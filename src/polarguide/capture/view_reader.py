@@ -17,7 +17,6 @@ from torch import Tensor
 
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import checks
-from polarguide.capture.colmap.model import ColmapModel, fit_camera
 from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.formats.integrity import declared_size
 from polarguide.capture.formats.pictures import (
@@ -30,14 +29,7 @@ from polarguide.capture.formats.pictures import (
 )
 from polarguide.capture.ground_truth import GroundTruth, read_ground_truth
 from polarguide.capture.layout import Layout
-from polarguide.capture.point_exposures import (
-    MOST_POINTS,
-    PointExposures,
-    PointSamples,
-    exposures_of_points,
-    matte,
-    samples_at,
-)
+from polarguide.capture.point_exposures import ComparedPoints, PointExposures, PointSamples
 from polarguide.capture.view import EVEN, Latest, Loader, View
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import LARGEST_FILE, read_file
@@ -395,51 +387,6 @@ def _read_beside(
 
 
 @dataclass(frozen=True, eq=False)
-class ComparedPoints:
-    """The points of a model by which the exposures of its views are compared.
-
-    Attributes:
-        model: the model. places: [N, 3]. columns: views by name. observed: which views observe each point, [N, V].
-    """
-
-    model: ColmapModel
-    places: NDArray[np.float64]
-    columns: Mapping[str, int]
-    observed: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, model: ColmapModel, views: Sequence[str]) -> ComparedPoints | None:
-        """The points with the longest tracks; None where no tracks are stored."""
-        observed = model.observations(views).numpy()
-        longest = np.argsort(-observed.sum(axis=1), kind="stable")[:MOST_POINTS]
-        observed = observed[longest]
-        if not observed.any():
-            return None
-        places = model.points.double().numpy()[longest]
-        return cls(model, places, {view: column for column, view in enumerate(views)}, observed)
-
-    def samples(
-        self, view: str, raw: Sequence[NDArray[Any]], bad: NDArray[np.bool_] | None, transfer: str
-    ) -> PointSamples | None:
-        """Samples of a view's stored pictures at the points that it observes; None without a pose."""
-        if view not in self.columns:
-            return None
-        height, width = raw[0].shape[:2]
-        camera = fit_camera(self.model.camera(view), width, height, folder=self.model.folder, view=view)
-        return samples_at(self.places[self.observed[:, self.columns[view]]], camera, raw, bad, transfer)
-
-    def exposures(self, data: Sequence[ViewData], full_scale: int | None) -> PointExposures:
-        """Exposures of views of four angles, [V, 3] in their order; NaN where one has no pose."""
-        values = np.full((len(self.places), len(data), 3), np.nan, np.float32)
-        for place, item in enumerate(data):
-            if item.samples is not None:
-                fine = item.samples.peaks < (np.inf if full_scale is None else full_scale)
-                seen = self.observed[:, self.columns[item.name]]
-                values[seen, place] = np.where(fine[:, None], matte(item.samples.values), np.nan)
-        return exposures_of_points(values, self.places)
-
-
-@dataclass(frozen=True, eq=False)
 class StoredViews:
     """The views of a capture as read, with a pose or without.
 
@@ -477,15 +424,9 @@ class StoredViews:
             checks.measure(item.codes, ~(item.invalid | item.saturated(scale)), four=item.exposures == FOUR)
             for item in data
         ]
-        exposures = None if points is None else points.exposures(data, scale)
+        samples = {item.name: item.samples for item in data}
+        exposures = None if points is None else points.exposures(samples, scale)
         return cls(tuple(data), tuple(cameras), tuple(measures), largest_value, scale, exposures)
-
-    def gains(self) -> list[tuple[float, float, float]]:
-        """The significant gains of R, G and B of each view; 1 where they are not known."""
-        if self.exposures is None:
-            return [EVEN] * len(self.data)
-        logs = np.nan_to_num(self.exposures.significant)
-        return [(float(r), float(g), float(b)) for r, g, b in np.exp(logs).round(6)]
 
     def picture_warnings(self, transfer: str) -> list[str]:
         """Warnings about the exposure, encoding and order of the pictures."""

@@ -55,6 +55,7 @@ from polarguide.inspection.shots import (
     pictures_check,
     shot_checks,
 )
+from polarguide.inspection.view_checks import lens_check, view_exposure_check
 from polarguide.raster import Backend
 
 NEIGHBORS = 4
@@ -317,8 +318,9 @@ def inspect_scene(
     checks = picture_checks(capture, measurements, pairing)
     calibrated = analyzer_check(capture, settings.calibration)
     checks += [] if calibrated is None else [calibrated]
+    checks.append(view_exposure_check(capture))
     with reporter.track("matching features", 1):
-        checks += [pose_check(capture), coverage_check(capture)]
+        checks += [pose_check(capture), lens_check(capture), coverage_check(capture)]
     angles, pixels = _angles(capture, out, settings, index, pairing or 0, backend, reporter)
     checks += [order_check(angles), handedness_check(angles), zero_check(angles)]
     checks.append(dielectric_check(measurements, pixels, index))
@@ -337,7 +339,7 @@ def _shots(
     """The checks of a capture with other pictures than four angles a view, and what these tell of their polarizers."""
     checks = [pictures_check(capture), *agreement_checks(capture), *light_checks(capture, measurements)]
     with reporter.track("matching features", 1):
-        checks += [pose_check(capture), coverage_check(capture)]
+        checks += [pose_check(capture), lens_check(capture), coverage_check(capture)]
     if len(capture.posed) < FEWEST_TO_TRAIN:
         why = f"The angles are checked by a short training, which takes {FEWEST_TO_TRAIN} views with a pose."
         findings = ShotFindings(why=why)

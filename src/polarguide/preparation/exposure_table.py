@@ -15,9 +15,14 @@ from numpy.typing import NDArray
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.exposures import TABLE, angle_text
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_picture
-from polarguide.capture.point_exposures import FEWEST, PointExposures, exposures_of_points, significant
+from polarguide.capture.point_exposures import (
+    FEWEST,
+    ComparedPoints,
+    PointExposures,
+    exposures_of_points,
+    significant,
+)
 from polarguide.capture.view import listed
-from polarguide.capture.view_reader import ComparedPoints
 from polarguide.capture.write import picture_names
 from polarguide.core.files import write_whole
 from polarguide.core.progress import Reporter
