@@ -148,7 +148,7 @@ def broken(result: RenderResult) -> RenderResult:
     [
         (bright, "burned"),
         (broken, "burned"),
-        (dim, "far under"),
+        (dim, "stops: v04 +2.0"),
         (hollow, "holes"),
         (dark, "stops: v04 +0.3"),
         (warm, "stops: v04 +0.3"),

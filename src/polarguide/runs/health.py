@@ -358,7 +358,8 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
             "was measured. Their pictures do not determine the light there: do not use this run; add pictures of "
             "these views at other angles, or without a filter, and train again."
         )
-    explained = burned.keys() | bare.keys()
+    exposed = {name: stops for name, stops in _exposed(views, limits).items() if name not in burned | bare}
+    explained = burned | bare | exposed
     far = [name for name in _far_under(views, limits) if name not in explained]
     if far:
         worst = ", ".join(
@@ -370,9 +371,6 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
             f"these photographs may be wrong: compare them with polarguide render --views {','.join(far[:4])}, and "
             "correct them or leave them out."
         )
-    exposed = {
-        name: stops for name, stops in _exposed(views, limits).items() if name not in {*explained, *far}
-    }
     if exposed:
         told = listed([f"{name} {stops:+.2f}" for name, stops in exposed.items()])
         warnings.append(
