@@ -179,9 +179,8 @@ def _estimate(root: Path, pictures: list[_Exposure], posed: bool, reporter: Repo
         log = estimate.logs[place] if math.isfinite(estimate.logs[place]) else middle
         for k in rows[view]:
             pictures[k].log, pictures[k].points = float(log + within[k]), int(numbers[place])
-    _say_how(views, points, of_view, estimate.scatter, lost, reporter)
-    if compared is not None and not np.isfinite(of_view).any():
-        _say_significance(compared.significant[:, 0], errors, reporter)
+    how = "" if compared is None else _significance(compared.significant[:, 0], errors)
+    _say_how(views, points, of_view, estimate.scatter, lost, how, reporter)
     _warn([views[k] for k in estimate.contradicted], pictures, of_view, reporter)
 
 
@@ -242,6 +241,7 @@ def _say_how(
     files: NDArray[np.float64],
     scatter: float | None,
     lost: list[str],
+    significance: str,
     reporter: Reporter,
 ) -> None:
     """Where the gains come from."""
@@ -252,7 +252,7 @@ def _say_how(
     elif by_points:
         reporter.say(
             f"Gains: from points in common ({by_points} of {len(views)} views); the files do not state exposures. "
-            "Reflections and polarization mislead them by some percent."
+            f"{significance}"
         )
     elif by_files:
         reporter.say(f"Gains: exposures that the files state ({by_files} of {len(views)} views).")
@@ -263,17 +263,14 @@ def _say_how(
         )
 
 
-def _say_significance(points: Array, errors: Array, reporter: Reporter) -> None:
-    """How many of the gains by points were applied."""
-    applied = int(np.count_nonzero(np.nan_to_num(points)))
+def _significance(logs: Array, errors: Array) -> str:
+    """How many of the gains by points are applied."""
+    known = int(np.isfinite(logs).sum())
+    applied = int(np.count_nonzero(np.nan_to_num(logs)))
     usual = float(np.median(errors))
-    known = int(np.isfinite(points).sum())
     if applied:
-        reporter.say(
-            f"{known - applied} of {known} gains are not significant (error {usual:.0%}): not applied."
-        )
-    elif known:
-        reporter.say(f"The exposures do not differ significantly (error {usual:.0%}): no gain is applied.")
+        return f"{known - applied} of {known} are not significant (error {usual:.0%}) and not applied."
+    return f"They do not differ significantly (error {usual:.0%}): none is applied."
 
 
 def _warn(
@@ -296,7 +293,9 @@ def _warn(
 
 
 def _tell(pictures: list[_Exposure], reporter: Reporter) -> None:
-    """Print the table: all pictures, or the most unusual ones of many."""
+    """Print the table: all pictures, or the most unusual ones of many; nothing where all gains are 1."""
+    if all(picture.record["gain"] == 1 for picture in pictures):
+        return
     listing = pictures
     if len(pictures) > _LISTED:
         listing = sorted(

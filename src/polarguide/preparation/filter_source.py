@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import (
     LARGEST_IMBALANCE,
-    UNIDENTIFIED,
     UNIT_GAINS,
     balancing_gains,
     oriented,
@@ -45,6 +44,7 @@ from polarguide.capture.filter.develop import (
     linear_intensities,
     require_known_encoding,
     rounding_of_bytes,
+    shift_notes,
     transfer_of_kind,
 )
 from polarguide.capture.filter.shots import (
@@ -82,6 +82,8 @@ class ShotsSource(Source):
     """Shots of an ordinary camera through a polarizing filter: what four a view and single ones have in common."""
 
     cameras = None
+    assumed: tuple[str, ...] = ()
+    """What was taken for granted, in sentences for the user."""
     _root: Path
 
     def __init__(self, paths: list[Path], views: dict[str, list[Path]], settings: PrepareSettings) -> None:
@@ -194,11 +196,14 @@ class FilterSource(ShotsSource):
     kind = "filter"
     needs = ("transfer", "scale", "light")
 
-    def __init__(self, root: Path, settings: PrepareSettings) -> None:
+    def __init__(
+        self, root: Path, settings: PrepareSettings, shots: dict[str, dict[int, Path]] | None = None
+    ) -> None:
+        """Use the shots of a folder: as their names say, or as given by view and angle."""
         self._root = root
-        shots = find_shots(root, nested=True)
+        unused = [path.name for path in list_shots(root, nested=True)[1]] if shots is None else []
+        shots = find_shots(root, nested=True) if shots is None else shots
         require_four_shots(root, shots)
-        unused = [path.name for path in list_shots(root, nested=True)[1]]
         unused += [path.name for files in shots.values() for a, path in files.items() if a not in ANGLES]
         if unused:
             fault = f"{root} has pictures without an angle in their names, or at other angles than 0, 45, 90 and 135"
@@ -210,7 +215,7 @@ class FilterSource(ShotsSource):
         """The transfer of the capture, from a few views spread over it."""
         self._require_memory("four shots")
         settings = self._settings
-        gains, notes = settings.calibration.gains, []
+        gains, notes = settings.calibration.gains, [*self.assumed]
         transfer: str = settings.transfer
         if transfer == "auto" and all(map(is_camera_raw, self.paths)):
             transfer, note = transfer_of_kind(CAMERA_RAW, transfer)
@@ -230,8 +235,6 @@ class FilterSource(ShotsSource):
         notes += exposure_notes(stated, len(self.views))
         # One scale for all shots, with room for the largest gain that is corrected.
         room = math.sqrt(1.0 - LARGEST_IMBALANCE)
-        if gains is None and settings.gains == "auto":
-            notes.append(UNIDENTIFIED)
         scale = min(1.0, *gains) if gains is not None else room if settings.gains == "auto" else 1.0
         scale /= settings.calibration.peak
         smallest = scale / (max(gains) if gains is not None else 1.0 / room)
@@ -318,21 +321,6 @@ def development_of(paths: Sequence[Path], settings: PrepareSettings) -> tuple[fl
     return white
 
 
-def shift_notes(view: str, shifts: list[Shift]) -> list[str]:
-    """Notes about shots that were shifted, and about shots without a reliable estimate."""
-    named = list(zip(ANGLES, shifts, strict=True))
-    moved = [
-        f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f}){'' if shift.warp is None else ' and turned'}"
-        for angle, shift in named
-        if shift.corrected
-    ]
-    doubtful = [str(angle) for angle, shift in named if not shift.trusted]
-    notes = [f"{view}: shots moved, in pixels: {', '.join(moved)}."] if moved else []
-    if doubtful:
-        notes.append(f"{view}: no reliable shift of the shots at {', '.join(doubtful)}; used as they are.")
-    return notes
-
-
 class SinglesSource(ShotsSource):
     """Photographs of one camera through a linear polarizer that was turned between them, or without one."""
 
@@ -345,7 +333,7 @@ class SinglesSource(ShotsSource):
         Raises:
             PolarguideError: one has no angle, or the settings do not fit the files.
         """
-        shots, tables = find_single_shots(root, settings.angles)
+        shots, tables = find_single_shots(root, settings.angles, settings.shots_per_view or 1)
         self._root = root
         self._singles: dict[str, list[SingleShot]] = {}
         for shot in shots:
@@ -384,7 +372,13 @@ class SinglesSource(ShotsSource):
             "rounding": self._rounding(transfer, 1.0),
             "levels": None if levels is None else asdict(levels),
             "light": light,
-            "notes": [self._summary(), reason, *counted, f"{stating} files state their exposure (EXIF)."],
+            "notes": [
+                *self.assumed,
+                self._summary(),
+                reason,
+                *counted,
+                f"{stating} files state their exposure (EXIF).",
+            ],
         }
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:

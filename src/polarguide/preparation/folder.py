@@ -23,6 +23,7 @@ from polarguide.capture.colmap.poses import Geometry, Poses
 from polarguide.capture.colmap.sfm import reconstruct, tone_mapped
 from polarguide.capture.colmap.triangulate import add_points
 from polarguide.capture.exposures import Angle
+from polarguide.capture.filter.consecutive import chosen_matching
 from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.view import ANGLES, FULL_CODE, listed
 from polarguide.capture.write import (
@@ -166,6 +167,9 @@ class SceneFolder:
         for name in ("analyzers", "angles"):  # earlier journals do not know them
             before["settings"].setdefault(name, None)
         before["settings"].setdefault("poses_of", "auto")
+        before["settings"].setdefault("shots_per_view", None)
+        if before["settings"]["matching"] == "exhaustive" and now["settings"]["matching"] == "auto":
+            now["settings"]["matching"] = "exhaustive"  # the default of earlier journals
         self._follows_none = before["settings"]["poses"] == "none" != now["settings"]["poses"]
         if self._follows_none:
             for record in (before, now):
@@ -371,7 +375,7 @@ class Workshop:
         return reconstruct(
             self._root,
             sizes,
-            matching=settings.matching,
+            matching=chosen_matching(self._pictures.views, settings.matching, self._reporter),
             seed=settings.seed,
             reporter=self._reporter,
             untried=_untried(settings, self._pictures.kind),
@@ -392,7 +396,7 @@ class Workshop:
             self._root,
             cameras,
             poses.folder,
-            matching=settings.matching,
+            matching=chosen_matching(poses.views, settings.matching, self._reporter),
             seed=settings.seed,
             reporter=self._reporter,
         )
