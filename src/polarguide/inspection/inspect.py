@@ -46,7 +46,13 @@ from polarguide.inspection.evidence import (
     short_run,
     surface_of,
 )
-from polarguide.inspection.picture_checks import dielectric_check, find_pairing, light_checks, picture_checks
+from polarguide.inspection.picture_checks import (
+    dielectric_check,
+    find_pairing,
+    light_checks,
+    picture_checks,
+    with_noise,
+)
 from polarguide.inspection.settings import Check, InspectSettings, Verdict, worst
 from polarguide.inspection.shots import (
     ShotFindings,
@@ -322,6 +328,7 @@ def inspect_scene(
     with reporter.track("matching features", 1):
         checks += [pose_check(capture), lens_check(capture), coverage_check(capture)]
     angles, pixels = _angles(capture, out, settings, index, pairing or 0, backend, reporter)
+    angles = with_noise(angles, measurements)
     checks += [order_check(angles), handedness_check(angles), zero_check(angles)]
     checks.append(dielectric_check(measurements, pixels, index))
     return Inspection(capture, settings, index, tuple(measurements), tuple(checks), angles)
