@@ -392,8 +392,6 @@ def refused(root: Path, settings: PrepareSettings, fault: Fault) -> None:
             Fault(found="1 of 2 without an angle in their names (IMG_0012.jpg)"),
         ),
         (("img_001.jpg", "img_002.jpg"), {"format": "singles"}, Fault(found="2 of 2 without an angle")),
-        (("img_001.jpg", "img_002.jpg"), {}, Fault(remedy="--angles unknown, or angles.csv")),
-        (("img_001.jpg", "img_002.jpg"), {}, Fault(remedy="in --out in-scene --angles none")),
         (("a_a30.jpg", "a-30.png"), {}, Fault(expected="one photograph of a at 30 degrees")),
         (("a_a30.jpg", "b_a30.png"), {}, Fault(expected="one kind of file", found=") and PNG, TIFF or BMP")),
         (("IMG_1.jpg", "IMG_1.png"), {"angles": "unknown"}, Fault(expected="one file called IMG_1")),

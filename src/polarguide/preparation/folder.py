@@ -11,7 +11,7 @@ import json
 import re
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -371,11 +371,12 @@ class Workshop:
             PolarguideError: too few views are registered.
         """
         sizes = {view: geometry.size for view, geometry in self._photographs(self._pictures.views).items()}
-        settings = self._settings
+        matching = chosen_matching(self._pictures.views, self._settings.matching, self._reporter)
+        settings = replace(self._settings, matching=matching)  # type: ignore[arg-type]
         return reconstruct(
             self._root,
             sizes,
-            matching=chosen_matching(self._pictures.views, settings.matching, self._reporter),
+            matching=matching,
             seed=settings.seed,
             reporter=self._reporter,
             untried=_untried(settings, self._pictures.kind),
