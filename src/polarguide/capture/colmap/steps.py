@@ -25,6 +25,7 @@ LEAST_VIEWS = 3
 """Views of the smallest model."""
 _WEAK_PAIR, _WEAK_START, _WEAK_POSE = 10, 50, 15
 Report = Callable[[int], None]
+"""Receives the number of finished units."""
 
 
 def set_seed(options: Any, seed: int) -> None:
@@ -108,7 +109,12 @@ def triangulate(seed: int, report: Report, *, database: str, images: str, start:
     pycolmap.triangulate_points(model, database, images, out, options=options).write_binary(out)
 
 
-STEPS = {"extract": extract, "match": match, "place": place, "triangulate": triangulate}
+STEPS: dict[str, Callable[..., Any]] = {
+    "extract": extract,
+    "match": match,
+    "place": place,
+    "triangulate": triangulate,
+}
 
 
 def _end_with(parent: Any) -> None:
