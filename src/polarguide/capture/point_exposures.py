@@ -99,20 +99,25 @@ def exposures_of_points(values: Array, places: Array) -> PointExposures:
     count, channels = values.shape[1:]
     unknown = np.full((count, channels), np.nan)
     errors = np.full((2, count), np.inf)
-    valid = np.isfinite(values).all(axis=2)
+    valid = _measured(values)
     chosen_points = np.argsort(-valid.sum(axis=1), kind="stable")[:MOST_POINTS]
     chosen_points = chosen_points[valid[chosen_points].sum(axis=1) >= min(_LEAST_TRACK, count)]
     values, valid, places = values[chosen_points], valid[chosen_points], places[chosen_points]
     numbers = valid.sum(axis=0)
     chosen = _connected(valid, FEWEST)
     if len(chosen) < 2:
-        return PointExposures(unknown, *errors, numbers)
+        return PointExposures(unknown, errors[0], errors[1], numbers)
     logs = unknown.copy()
     logs[chosen] = _solved(values[:, chosen])
     divisions = int(np.log2(max(1.0, float(np.median(numbers[chosen])) / FEWEST)))
     parts = _parts(places, int(np.clip(divisions, _LEAST_DIVISIONS, _MOST_DIVISIONS)))
     errors[:, chosen] = _errors(values[:, chosen], parts, logs[chosen])
-    return PointExposures(logs, *errors, numbers)
+    return PointExposures(logs, errors[0], errors[1], numbers)
+
+
+def _measured(values: Array) -> NDArray[np.bool_]:
+    """Where all channels [..., C] are measured."""
+    return np.asarray(np.isfinite(values).all(axis=-1), np.bool_)
 
 
 def _connected(valid: NDArray[np.bool_], fewest: int) -> NDArray[np.int64]:
@@ -127,7 +132,7 @@ def _connected(valid: NDArray[np.bool_], fewest: int) -> NDArray[np.int64]:
 
 def _solved(values: Array) -> Array:
     """Logarithms of the exposures of connected pictures, [V, C], mean 0."""
-    valid = np.isfinite(values).all(axis=2)
+    valid = _measured(values)
     paired = valid.sum(axis=1) >= 2
     point, picture = np.nonzero(valid[paired])
     logs = np.log(values[paired][point, picture].astype(np.float64))
@@ -182,7 +187,7 @@ def _errors(values: Array, parts: NDArray[np.int64], logs: Array) -> Array:
     total, used = np.zeros(len(logs)), np.zeros(len(logs), np.int64)
     for part in np.unique(parts):
         mine = values[parts == part]
-        seen = np.isfinite(mine).all(axis=2)
+        seen = _measured(mine)
         chosen = _connected(seen, FEWEST // 4)
         if len(chosen) < 2:
             continue

@@ -125,7 +125,7 @@ def _begin_with_focal_lengths(
                 image = link.read_image_with_name(f"{group[0]}.png")
                 assert image is not None
                 camera = link.read_camera(image.camera_id)
-                params = np.array(camera.params)
+                params: Any = np.array(camera.params)
                 params[list(camera.focal_length_idxs())] *= focal / median(known)
                 camera.params = params
                 link.update_camera(camera)
