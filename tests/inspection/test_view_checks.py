@@ -13,6 +13,7 @@ import pytest
 from glossy_ball import camera_at
 
 import polarguide
+from polarguide.capture.point_exposures import PointExposures
 from polarguide.inspection.capture import read_capture
 from polarguide.inspection.view_checks import lens_check, view_exposure_check
 
@@ -56,6 +57,13 @@ def test_views_of_one_exposure_get_no_gain(whole_demo: Path) -> None:
     assert check.verdict == "ok"
     assert 0 < check.figures["error_stops"] < 0.15
     assert {view.gains for view in polarguide.load_scene(whole_demo, downscale=4).views} == {(1.0, 1.0, 1.0)}
+
+
+def test_too_few_points_do_not_confirm_equal_exposures() -> None:
+    unsure = PointExposures(np.full((6, 3), 0.2), np.full(6, 0.7), np.full(6, 0.5), np.full(6, 30))
+    views = [SimpleNamespace(name=str(k)) for k in range(6)]
+    capture = SimpleNamespace(exposures=unsure, views=views, keeps_gains=False)
+    assert view_exposure_check(capture).verdict == "not verified"  # type: ignore[arg-type]
 
 
 def test_gains_none_leaves_exposures(whole_demo: Path, tmp_path: Path) -> None:

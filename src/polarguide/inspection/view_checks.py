@@ -21,6 +21,8 @@ FEWEST = 50
 FOCAL_DIFFERS, FOCAL_WRONG = 0.01, 0.05
 """Differences of the logarithm of a focal length: 1 % turns a ray at 30 degrees by 0.25 degrees."""
 TO_DEVIATION = 1.4826
+STEP = 1 / 3
+"""Stops by which cameras set exposures: with a larger error, equal exposures are not confirmed."""
 
 
 def view_exposure_check(capture: Capture) -> Check:
@@ -42,6 +44,13 @@ def view_exposure_check(capture: Capture) -> Check:
         "unknown": int((~known).sum()),
     }
     precision = f"to {errors[0]:.2f} stops, colors to {errors[1]:.2f}"
+    if not strongest and errors[0] > STEP:
+        finding = (
+            f"The points that views have in common are too few to compare their exposures ({precision})."
+        )
+        return Check(
+            key, title, "not verified", finding, "Add views between those there are.", figures=figures
+        )
     if not strongest:
         finding = f"The points that views have in common are equally bright in all of them ({precision})."
         return Check(key, title, "ok", finding, figures=figures)
