@@ -17,9 +17,10 @@ from polarguide.capture import load_scene
 from polarguide.capture.calibration import Calibration, combined, oriented
 from polarguide.capture.exposures import FOUR, Exposure, read_table, table_text
 from polarguide.capture.filter.shots import find_single_shots
+from polarguide.capture.point_exposures import PointExposures, exposures_of_points
 from polarguide.geometry.polarizer import ANGLES, malus, stokes_of_four
 from polarguide.inspection.capture import read_capture
-from polarguide.preparation.exposure_table import exposures_of_points, reconciled
+from polarguide.preparation.exposure_table import reconciled
 from tests.helpers.tiny_capture import NAMES, TinyCapture, write_picture, write_tiny_capture
 
 
@@ -268,9 +269,16 @@ def made(pictures: int, points: int, seed: int, *, share: float = 0.5) -> tuple[
     return values, logs - logs.mean()
 
 
+def compared(values: np.ndarray, seed: int = 0) -> PointExposures:
+    """Exposures of gray pictures of points that are spread over a cube."""
+    places = np.random.default_rng(seed).uniform(-1, 1, (len(values), 3))
+    return exposures_of_points(values[..., None], places)
+
+
 def test_exact_intensities_give_exact_exposures() -> None:
     values, logs = made(12, 300, 0)
-    found, numbers = exposures_of_points(values)
+    exposures = compared(values)
+    found, numbers = exposures.logs[:, 0], exposures.points
     np.testing.assert_allclose(found, logs, atol=1e-6)
     assert (numbers > 100).all()
 
@@ -283,7 +291,7 @@ def test_polarized_and_mirroring_points_are_outvoted() -> None:
     polarized *= 1 + 0.4 * np.cos(2 * angles)
     values[160:200] *= np.exp(rng.normal(0, 1.0, (40, 20)))
     values *= np.exp(rng.normal(0, 0.02, values.shape))
-    found, _ = exposures_of_points(values)
+    found = compared(values).logs[:, 0]
     assert np.abs(found - logs).max() < 0.02
     plain = np.nanmean(np.log(values) - np.nanmean(np.log(values), axis=1, keepdims=True), axis=0)
     assert np.abs(plain - plain.mean() - logs).max() > 0.1
@@ -294,12 +302,47 @@ def test_pictures_without_points_in_common_are_not_compared() -> None:
     values[:200, 6:] = np.nan  # two groups that nothing links, and one picture that sees next to nothing
     values[200:, :6] = np.nan
     values[10:, 0] = np.nan
-    found, numbers = exposures_of_points(values)
+    exposures = compared(values)
+    found, numbers = exposures.logs[:, 0], exposures.points
     assert np.isnan(found[[0, 6, 7, 8]]).all()
     assert numbers[0] < 20
     np.testing.assert_allclose(found[1:6], logs[1:6] - logs[1:6].mean(), atol=1e-6)
-    alone, _ = exposures_of_points(values[:, :1])
-    assert np.isnan(alone).all()
+    assert np.isnan(compared(values[:, :1]).logs).all()
+
+
+def lit_by_reflections(logs: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Intensities [points, pictures, 3] at places, whose parts of space brighten by some percent from view to view."""
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-1, 1, (1500, 3))
+    parts = (places > 0) @ [1, 2, 4]
+    brighter = rng.normal(0, 0.05, (8, len(logs)))[parts][..., None]
+    noise = rng.normal(0, 0.02, (1500, len(logs), 3))
+    values = rng.uniform(0.05, 0.8, (1500, 1, 3)) * np.exp(logs + brighter + noise)
+    values[rng.uniform(size=values.shape[:2]) > 0.4] = np.nan
+    return values, places
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_equal_exposures_get_no_gain(seed: int) -> None:
+    values, places = lit_by_reflections(np.zeros((30, 3)), seed)
+    found = exposures_of_points(values, places)
+    assert np.abs(found.logs).max() > 0.02
+    assert (found.significant == 0).all()
+    assert found.gains() == [(1.0, 1.0, 1.0)] * 30
+
+
+@pytest.mark.parametrize("color", [False, True])
+def test_exposures_that_differ_are_found_in_every_channel(color: bool) -> None:
+    rng = np.random.default_rng(5)
+    logs = np.log(2) * rng.uniform(-0.5, 0.5, (30, 3 if color else 1)) * np.ones(3)
+    logs -= logs.mean(axis=0)
+    values, places = lit_by_reflections(logs, 6)
+    found = exposures_of_points(values, places)
+    assert np.abs(found.logs - logs).max() < 0.08
+    strong = np.abs(logs).max(axis=1) > 0.25
+    assert (found.significant[strong] != 0).all()
+    left = np.abs(found.significant - logs)
+    assert float(np.sqrt((left**2).mean())) < 0.06 < float(logs.std())
 
 
 def test_files_are_corrected_a_little_and_only_a_little() -> None:

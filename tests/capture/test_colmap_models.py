@@ -332,7 +332,7 @@ def test_pairs_connect_views_where_they_agree_better_than_by_chance(
 def test_a_model_of_wrong_matches_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = SimpleNamespace(num_reg_images=lambda: 3)
     monkeypatch.setattr(sfm, "match_features", lambda database, *_, **__: write_database(database, 0.0))
-    monkeypatch.setattr(sfm, "_map", lambda *_, **__: {0: model})
+    monkeypatch.setattr(sfm, "_map", lambda *_, **__: [model])
     Fault(found="3 of 3 views registered, by matches that agree no better").raised_by(
         reconstruct, tmp_path, SIZES, matching="exhaustive", seed=0, reporter=SILENT, untried=""
     )

@@ -16,7 +16,7 @@ from faults import Fault
 from tiny_capture import encode_srgb, write_picture
 
 from polarguide.capture.filter.camera_files import apply_orientation, orientation
-from polarguide.capture.filter.develop import Shift, estimate_shifts
+from polarguide.capture.filter.develop import Shift, estimate_shifts, shift_notes
 from polarguide.capture.filter.shots import find_shots
 from polarguide.core.errors import PolarguideWarning
 from polarguide.preparation.prepare import prepare_scene
@@ -212,10 +212,18 @@ def test_exposures_that_differ_from_shot_to_shot(tmp_path: Path) -> None:
         np.testing.assert_allclose(read_polar(tmp_path / "out", view), expected, rtol=2e-3)
 
 
+def test_shifts_are_doubted_only_where_pair_sums_disagree() -> None:
+    """Without detail no shift is found: pair sums tell whether anything moved, and only then it is said."""
+    light = behind(np.tile([0.5, 0.1, 0.1], (3, 40, 40, 1)).transpose(3, 1, 2, 0)).astype(np.float32)
+    assert shift_notes("v", estimate_shifts(light)) == []
+    (note,) = shift_notes("v", [Shift(0, 0, True), *[Shift(0, 0, False)] * 3])
+    assert "no shift of the shots at 45, 90, 135 explains it" in note
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 400), (400, 1)])
 def test_shots_without_detail_are_not_shifted(tmp_path: Path, size: tuple[int, int]) -> None:
     light = behind(np.tile([0.5, 0.1, 0.1], (3, *size, 1)).transpose(3, 1, 2, 0))
-    assert estimate_shifts(light.astype(np.float32)) == [Shift(0, 0, True), *[Shift(0, 0, False)] * 3]
+    assert estimate_shifts(light.astype(np.float32)) == [Shift(0, 0, True)] * 4
     write_shots(tmp_path / "in", "v", light)
     done = prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, align=True))
     assert done.views == ["v"]

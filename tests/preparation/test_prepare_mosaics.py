@@ -158,7 +158,7 @@ def test_gains_of_the_angles_are_found(tmp_path: Path, pattern: tuple[str, ...])
     prepare_scene(tmp_path / "in", tmp_path / "out", settings)
     found = summary(tmp_path / "out")
     assert found["pair_ratio"] == pytest.approx(0.98, abs=0.003)
-    assert any("cannot be told" in note for note in found["notes"])
+    assert any("look like polarization and stay" in note for note in found["notes"])
     expected = superpixels(light, pattern) * found["scale"] * np.sqrt(0.98)
     np.testing.assert_allclose(read_polar(tmp_path / "out", "v"), expected, rtol=0.004)
 

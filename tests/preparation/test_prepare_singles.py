@@ -24,9 +24,10 @@ from tiny_capture import encode_srgb, write_picture
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import read_model
-from polarguide.capture.filter.camera_files import TURNS, apply_orientation
+from polarguide.capture.filter.camera_files import TURNS, Lens, apply_orientation
 from polarguide.geometry.polarizer import malus
 from polarguide.preparation import prepare as prepare_module
+from polarguide.preparation.filter_source import SinglesSource
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.synth.sensor import exif_tags
@@ -391,8 +392,6 @@ def refused(root: Path, settings: PrepareSettings, fault: Fault) -> None:
             Fault(found="1 of 2 without an angle in their names (IMG_0012.jpg)"),
         ),
         (("img_001.jpg", "img_002.jpg"), {"format": "singles"}, Fault(found="2 of 2 without an angle")),
-        (("img_001.jpg", "img_002.jpg"), {}, Fault(remedy="--angles unknown, or angles.csv")),
-        (("img_001.jpg", "img_002.jpg"), {}, Fault(remedy="in --out in-scene --angles none")),
         (("a_a30.jpg", "a-30.png"), {}, Fault(expected="one photograph of a at 30 degrees")),
         (("a_a30.jpg", "b_a30.png"), {}, Fault(expected="one kind of file", found=") and PNG, TIFF or BMP")),
         (("IMG_1.jpg", "IMG_1.png"), {"angles": "unknown"}, Fault(expected="one file called IMG_1")),
@@ -437,4 +436,5 @@ def test_several_sizes_and_cameras(tmp_path: Path) -> None:
         pixels = np.full((48, 64, 3), 20_000, np.uint16)
         tags = [(272, "s", 0, model, True)]
         tifffile.imwrite(tmp_path / "in" / f"{name}_a30.tif", pixels, extratags=tags, photometric="rgb")
-    refused(tmp_path, PLAIN, Fault(expected="photographs of one camera", found="and two"))
+    source = SinglesSource(tmp_path / "in", PLAIN)
+    assert source.lenses() == {"a": Lens("one"), "b": Lens("two")}

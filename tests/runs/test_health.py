@@ -117,6 +117,16 @@ def dim(result: RenderResult) -> RenderResult:
     return dataclasses.replace(result, final=0.25 * result.final)
 
 
+def dark(result: RenderResult) -> RenderResult:
+    """As of an exposure that is longer by a third of a stop."""
+    return dataclasses.replace(result, final=2 ** (-1 / 3) * result.final)
+
+
+def warm(result: RenderResult) -> RenderResult:
+    """As of another white balance."""
+    return dataclasses.replace(result, final=result.final * torch.tensor([1.0, 1.0, 0.8]))
+
+
 def noisy(result: RenderResult) -> RenderResult:
     """What every training leaves, so that a view without a fault is not perfect."""
     wave = 0.02 * torch.sin(torch.arange(result.final.shape[1], dtype=torch.float32))[None, :, None]
@@ -135,8 +145,15 @@ def broken(result: RenderResult) -> RenderResult:
 
 @pytest.mark.parametrize(
     ("fault", "words"),
-    [(bright, "burned"), (broken, "burned"), (dim, "far under"), (hollow, "holes")],
-    ids=["bright", "not-finite", "dim", "hollow"],
+    [
+        (bright, "burned"),
+        (broken, "burned"),
+        (dim, "stops: v04 +2.0"),
+        (hollow, "holes"),
+        (dark, "stops: v04 +0.3"),
+        (warm, "stops: v04 +0.3"),
+    ],
+    ids=["bright", "not-finite", "dim", "hollow", "dark", "warm"],
 )
 def test_a_fault_of_one_view_is_one_warning_that_names_it(
     fault: Callable[[RenderResult], RenderResult], words: str

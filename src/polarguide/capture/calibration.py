@@ -26,8 +26,8 @@ LARGEST_ZERO = 3600.0
 ROTATED_PEAK = (1.0 + math.sqrt(2.0)) / 2.0
 """The most a turned analyzer can measure where four angles stay under 1."""
 UNIDENTIFIED = (
-    "Only the ratio of the pair sums is estimated: I0/I90 and I45/I135 of the instrument cannot be told from the "
-    "polarization of the scene, nor the common gain from its brightness."
+    "Gains inside a pair (0 against 90, 45 against 135 degrees) look like polarization and stay: polarguide calibrate "
+    "measures them."
 )
 _FEWEST = 32
 

@@ -164,6 +164,18 @@ def mount_of(path: Path, data: bytes) -> Mount:
     return decode(data, _Polarizer, path, remedy=remedy).polarizer
 
 
+def keeps_gains(path: Path, data: bytes) -> bool:
+    """Whether the scene was prepared with ``--gains none``, which leaves exposures as they are.
+
+    Args:
+        path: ``scene.json``, for messages. data: its content.
+    """
+    prepared = decode(data, _Scene, path, remedy="Prepare the scene again.").prepare
+    request = prepared.get("request") if isinstance(prepared, dict) else None
+    settings = request.get("settings") if isinstance(request, dict) else None
+    return isinstance(settings, dict) and settings.get("gains") == "none"
+
+
 def applied_calibration(path: Path, data: bytes) -> Calibration | None:
     """Order, sense and zero that the pictures of a prepared scene were made with, corrections included.
 

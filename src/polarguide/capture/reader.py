@@ -15,13 +15,22 @@ from numpy.typing import NDArray
 
 from polarguide.capture import checks
 from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unseen_points, unused_poses
+from polarguide.capture.exposures import FOUR
 from polarguide.capture.formats.pictures import TRANSFERS
 from polarguide.capture.ground_truth import GroundTruth, objects_of
 from polarguide.capture.layout import Layout, check_memory, find_layout, select_views, stated_size
-from polarguide.capture.metadata import held_out, indices_of, mount_of, refractive_index_of
+from polarguide.capture.metadata import held_out, indices_of, keeps_gains, mount_of, refractive_index_of
+from polarguide.capture.point_exposures import ComparedPoints
 from polarguide.capture.scene import Scene, chosen_views, far_from_training, held_out_band
-from polarguide.capture.view import listed
-from polarguide.capture.view_reader import Files, StoredViews, ViewData, ViewFiles, check_materials, read_view
+from polarguide.capture.view import EVEN, listed
+from polarguide.capture.view_reader import (
+    Files,
+    StoredViews,
+    ViewData,
+    ViewFiles,
+    check_materials,
+    read_view,
+)
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import Split, check_choice, check_count
 from polarguide.core.progress import SILENT, Reporter
@@ -103,10 +112,12 @@ def load_scene(
             found=f"none in {len(counted)} views",
             remedy="White is invalid there: invert the pictures, or remove them.",
         )
+    even = stored.exposures is None or keeps_gains(root / "scene.json", about)
+    gains = [EVEN] * len(names) if even or stored.exposures is None else stored.exposures.gains()
     stays = None if hold else ViewFiles(layout, downscale, transfer, files.digests)
     posed_views = tuple(
-        item.view(camera, stored.full_scale, mount, stays)
-        for item, camera in zip(stored.data, stored.cameras, strict=True)
+        item.view(camera, stored.full_scale, mount, stays, gain)
+        for item, camera, gain in zip(stored.data, stored.cameras, gains, strict=True)
         if camera is not None
     )
     check_materials(layout, stored.data, indices)
@@ -118,6 +129,7 @@ def load_scene(
         *_content_warnings(layout, stored, without_pixels),
         *unseen_points(model.points, [camera for camera in stored.cameras if camera is not None]),
         *_pose_warnings(model, layout.names, stored.data),
+        *_gain_warnings(names, gains),
     ]
     return Scene(
         root=root,
@@ -188,8 +200,13 @@ def read_views(
         PolarguideError: a file cannot be used, a camera does not fit its pictures, or the views differ in depth.
     """
 
+    four = all(layout.exposures(name) == FOUR for name in names)
+    points = None
+    if model is not None and four:
+        points = ComparedPoints.of(model, [name for name in names if name in model.names])
+
     def read(name: str) -> ViewData:
-        view = read_view(layout, name, factor=downscale, transfer=transfer)
+        view = read_view(layout, name, factor=downscale, transfer=transfer, points=points)
         return view if hold else _without_pictures(view)
 
     posed = frozenset(() if model is None else model.names)
@@ -207,7 +224,7 @@ def read_views(
                 camera = camera if downscale == 1 else camera.downscaled(downscale)
             cameras.append(camera)
             advance(len(data))
-    return StoredViews.of(data, cameras)
+    return StoredViews.of(data, cameras, points)
 
 
 def _without_pictures(data: ViewData) -> ViewData:
@@ -253,6 +270,20 @@ def _content_warnings(layout: Layout, stored: StoredViews, invalid: list[str]) -
             f"Views have the same pictures ({copies}). Copy those of the other views, or leave them out."
         )
     return warnings
+
+
+def _gain_warnings(names: Sequence[str], gains: Sequence[tuple[float, float, float]]) -> list[str]:
+    """The warning that views were exposed differently."""
+    stops = {name: np.log2(gain) for name, gain in zip(names, gains, strict=True) if gain != EVEN}
+    if not stops:
+        return []
+    strongest = sorted(stops, key=lambda name: -float(np.abs(stops[name]).max()))
+    told = [f"{name} {max(stops[name], key=abs):+.2f}" for name in strongest]
+    return [
+        f"{len(stops)} of {len(names)} views were exposed or white-balanced otherwise than the mean, by points in "
+        f"common (stops: {listed(told)}). Each color of theirs is divided by its gain; fix exposure and white balance "
+        "next time."
+    ]
 
 
 def _pose_warnings(model: ColmapModel, all_names: list[str], data: Sequence[ViewData]) -> list[str]:

@@ -18,7 +18,7 @@ from polarguide import optics
 from polarguide.capture.box_filter import agreed, every, maximum, mean_codes
 from polarguide.capture.exposures import FOUR, PLAIN, Exposure
 from polarguide.capture.scene import Scene
-from polarguide.capture.view import FULL_CODE, Latest, Loader, View
+from polarguide.capture.view import EVEN, FULL_CODE, Latest, Loader, View
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import EXPOSURES, Exposures, check_choice
 from polarguide.geometry.camera import seen_at
@@ -180,7 +180,7 @@ def _some(view: View, *places: int, known: bool = True) -> View:
 
 def _computed(view: View, pictures: Callable[[View], list[Tensor]], exposures: tuple[Exposure, ...]) -> View:
     def change(codes: Tensor) -> Tensor:
-        made = torch.stack(pictures(replace(view, pictures=codes))).clamp(0, 1) * FULL_CODE
+        made = torch.stack(pictures(replace(view, pictures=codes, gains=EVEN))).clamp(0, 1) * FULL_CODE
         return made.round().to(torch.int32).to(torch.uint16)
 
     return view.changed(change, exposures)

@@ -104,6 +104,8 @@ class Loader(Generic[T]):
 
 FULL_CODE = 65535
 """The code of linear intensity 1."""
+EVEN = (1.0, 1.0, 1.0)
+"""Gains of a view that is exposed like the others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +129,7 @@ class View:
         materials: the user's labels of surfaces (``materials/<view>.png``), [H, W] uint8, or None: 0 no label,
             1 dielectric, 2 metal; from 3 on, a dielectric whose refractive index is ``Scene.indices[number]``.
         subject_only: whether ``codes`` are 0 outside the mask, which then is needed.
+        gains: exposure of R, G and B relative to other views, beside those of ``exposures``.
     """
 
     name: str
@@ -140,6 +143,7 @@ class View:
     mount: Mount = "sensor"
     materials: Tensor | None = None
     subject_only: bool = False
+    gains: tuple[float, float, float] = EVEN
 
     @property
     def codes(self) -> Tensor:
@@ -237,11 +241,15 @@ class View:
         """Linear intensities of the exposures (0, 45, 90, 135 degrees mostly) on one scale, in [0, 1] unless their
         gains differ: [K, H, W, 3] float32.
         """
-        intensities = self.codes.to(torch.float32) / FULL_CODE
+        intensities = self._even(self.codes.to(torch.float32) / FULL_CODE)
         gains = [exposure.gain for exposure in self.exposures]
         if all(gain == 1 for gain in gains):
             return intensities
         return intensities / intensities.new_tensor(gains)[:, None, None, None]
+
+    def _even(self, intensities: Tensor) -> Tensor:
+        """Intensities [..., 3] on the scale of the scene's other views."""
+        return intensities if self.gains == EVEN else intensities / intensities.new_tensor(self.gains)
 
     def stokes(self) -> Tensor:
         """Stokes vectors [3, H, W, 3] in the lens frame, by least squares.
@@ -264,7 +272,7 @@ class View:
         Where the pictures do not measure S0 (``measures_radiance``), it is the mean of what there is.
         """
         if self.is_four:
-            return self.codes.to(torch.float32).mean(dim=0) / FULL_CODE
+            return self._even(self.codes.to(torch.float32).mean(dim=0) / FULL_CODE)
         if self.is_determined:
             return self.stokes()[0] / 2
         places = radiance_places(self.exposures)

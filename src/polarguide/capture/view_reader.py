@@ -6,7 +6,7 @@ import functools
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,7 +29,8 @@ from polarguide.capture.formats.pictures import (
 )
 from polarguide.capture.ground_truth import GroundTruth, read_ground_truth
 from polarguide.capture.layout import Layout
-from polarguide.capture.view import Latest, Loader, View
+from polarguide.capture.point_exposures import ComparedPoints, PointExposures, PointSamples
+from polarguide.capture.view import EVEN, Latest, Loader, View
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import LARGEST_FILE, read_file
 from polarguide.core.records import LARGEST_RECORD
@@ -82,6 +83,7 @@ class ViewData:
         black: whether some pixel of the box is 0 in all angles and channels, [H, W].
         histogram: ``checks.top_histogram`` of the stored values.
         digests: SHA-256 of every file read.
+        samples: at the points that the view observes; None where they are not compared.
     """
 
     name: str
@@ -97,19 +99,26 @@ class ViewData:
     exposures: tuple[Exposure, ...]
     materials: NDArray[np.uint8] | None = None
     material_numbers: frozenset[int] = frozenset()
+    samples: PointSamples | None = None
 
     def saturated(self, scale: int | None) -> NDArray[np.bool_]:
         """``View.saturated``, given the stored value at which the capture saturates (None: it does not)."""
         return self.black if scale is None else np.asarray(self.black | (self.peak >= scale))
 
     def view(
-        self, camera: Camera, scale: int | None, mount: Mount = "sensor", files: ViewFiles | None = None
+        self,
+        camera: Camera,
+        scale: int | None,
+        mount: Mount = "sensor",
+        files: ViewFiles | None = None,
+        gains: tuple[float, float, float] = EVEN,
     ) -> View:
         """The view with its camera and its saturated pixels.
 
         Args:
             camera: camera of the view. scale: as for ``saturated``. mount: where the polarizer was.
             files: load codes and ground truth when they are read; None: those that are here stay in memory.
+            gains: as in ``View``.
         """
         invalid, saturated = torch.from_numpy(self.invalid), torch.from_numpy(self.saturated(scale))
         return View(
@@ -123,6 +132,7 @@ class ViewData:
             exposures=self.exposures,
             mount=mount,
             materials=None if self.materials is None else torch.from_numpy(self.materials),
+            gains=gains,
         )
 
 
@@ -181,8 +191,14 @@ def _compact(mask: Tensor) -> Tensor:
     return mask if bool(mask.any()) else torch.zeros((), dtype=torch.bool).expand(mask.shape)
 
 
-def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewData:
+def read_view(
+    layout: Layout, name: str, *, factor: int, transfer: str, points: ComparedPoints | None = None
+) -> ViewData:
     """Read all files of one view, averaged over boxes of ``factor`` x ``factor`` pixels.
+
+    Args:
+        layout: the files. name: of the view. transfer: how the pictures are encoded.
+        points: what its pictures are sampled at, in full size.
 
     Raises:
         PolarguideError: a file is damaged, or the sizes of the files differ.
@@ -200,7 +216,7 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
     if name in layout.ground_truth:
         path = layout.ground_truth[name]
         ground_truth = read_ground_truth(path, files.read(path), size=(height, width), factor=factor)
-    return view_data(
+    data = view_data(
         name,
         raw,
         layout.exposures(name),
@@ -212,6 +228,7 @@ def read_view(layout: Layout, name: str, *, factor: int, transfer: str) -> ViewD
         ground_truth=ground_truth,
         digests=files.digests,
     )
+    return data if points is None else replace(data, samples=points.samples(name, raw, invalid, transfer))
 
 
 def require_factor(factor: int, height: int, width: int) -> None:
@@ -379,6 +396,7 @@ class StoredViews:
         measures: ``checks.measure`` of each view.
         largest_value: the largest value that the files can store, 255 or 65535.
         full_scale: the stored value at which the capture saturates; None if nothing is saturated.
+        exposures: those of each view by points in common; None where they are not compared.
     """
 
     data: tuple[ViewData, ...]
@@ -386,10 +404,16 @@ class StoredViews:
     measures: tuple[checks.Measures, ...]
     largest_value: int
     full_scale: int | None
+    exposures: PointExposures | None = None
 
     @classmethod
-    def of(cls, data: Sequence[ViewData], cameras: Sequence[Camera | None]) -> StoredViews:
-        """Measure views, and find where they saturate.
+    def of(
+        cls,
+        data: Sequence[ViewData],
+        cameras: Sequence[Camera | None],
+        points: ComparedPoints | None = None,
+    ) -> StoredViews:
+        """Measure views, find where they saturate, and compare their exposures at points.
 
         Raises:
             PolarguideError: the views differ in bit depth.
@@ -400,7 +424,9 @@ class StoredViews:
             checks.measure(item.codes, ~(item.invalid | item.saturated(scale)), four=item.exposures == FOUR)
             for item in data
         ]
-        return cls(tuple(data), tuple(cameras), tuple(measures), largest_value, scale)
+        samples = {item.name: item.samples for item in data}
+        exposures = None if points is None else points.exposures(samples, scale)
+        return cls(tuple(data), tuple(cameras), tuple(measures), largest_value, scale, exposures)
 
     def picture_warnings(self, transfer: str) -> list[str]:
         """Warnings about the exposure, encoding and order of the pictures."""

@@ -76,7 +76,7 @@ FAILURE = 0.01
 CELLS = 12
 """Cells along the longest side of the box that contains the middle 90 % of the points."""
 _WINDOW = 22
-_GROUPS = 20
+_GROUPS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,13 +178,13 @@ def _peak(profile: Tensor, zero: int) -> tuple[int, float]:
 
 
 def _offset(clusters: Tensor, zero: int) -> tuple[float, float]:
-    """The best zero minus ``zero`` in degrees, and its standard error (jackknife over groups of clusters)."""
+    """The best zero minus ``zero`` in degrees, and its standard error: a jackknife over clusters that lie together."""
     total = clusters.sum(dim=0)
     estimate = _refined(total, zero)
     groups = min(_GROUPS, len(clusters))
     if groups < 2:
         return estimate, math.inf
-    left_out = [_refined(total - clusters[k::groups].sum(dim=0), zero) for k in range(groups)]
+    left_out = [_refined(total - part.sum(dim=0), zero) for part in clusters.tensor_split(groups)]
     spread = sum((value - estimate) ** 2 for value in left_out) * (groups - 1) / groups
     return estimate, max(math.sqrt(spread), 0.05)
 

@@ -24,9 +24,11 @@ from polarguide.capture.metadata import (
     Origin,
     applied_calibration,
     indices_of,
+    keeps_gains,
     origin_of,
     refractive_index_of,
 )
+from polarguide.capture.point_exposures import PointExposures
 from polarguide.capture.reader import read_views
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.view_reader import StoredViews
@@ -89,6 +91,8 @@ class Capture:
         bits: bits of the files. size: width and height of the pictures as stored.
         digest: SHA-256 over the stored pictures.
         origin: the files that ``prepare`` made the pictures of.
+        exposures: of the views by points in common; None where they are not compared.
+        keeps_gains: whether ``prepare --gains none`` leaves them.
     """
 
     root: Path
@@ -104,6 +108,8 @@ class Capture:
     size: tuple[int, int]
     digest: str
     origin: Origin = "other"
+    exposures: PointExposures | None = None
+    keeps_gains: bool = False
 
     @property
     def four(self) -> bool:
@@ -159,6 +165,8 @@ def read_capture(
         size=stored.data[0].size,
         digest=hashlib.sha256("\n".join(lines).encode()).hexdigest(),
         origin=origin_of(metadata, text),
+        exposures=stored.exposures,
+        keeps_gains=keeps_gains(metadata, text),
     )
 
 

@@ -46,7 +46,13 @@ from polarguide.inspection.evidence import (
     short_run,
     surface_of,
 )
-from polarguide.inspection.picture_checks import dielectric_check, find_pairing, light_checks, picture_checks
+from polarguide.inspection.picture_checks import (
+    dielectric_check,
+    find_pairing,
+    light_checks,
+    picture_checks,
+    with_noise,
+)
 from polarguide.inspection.settings import Check, InspectSettings, Verdict, worst
 from polarguide.inspection.shots import (
     ShotFindings,
@@ -55,6 +61,7 @@ from polarguide.inspection.shots import (
     pictures_check,
     shot_checks,
 )
+from polarguide.inspection.view_checks import lens_check, view_exposure_check
 from polarguide.raster import Backend
 
 NEIGHBORS = 4
@@ -317,9 +324,11 @@ def inspect_scene(
     checks = picture_checks(capture, measurements, pairing)
     calibrated = analyzer_check(capture, settings.calibration)
     checks += [] if calibrated is None else [calibrated]
+    checks.append(view_exposure_check(capture))
     with reporter.track("matching features", 1):
-        checks += [pose_check(capture), coverage_check(capture)]
+        checks += [pose_check(capture), lens_check(capture), coverage_check(capture)]
     angles, pixels = _angles(capture, out, settings, index, pairing or 0, backend, reporter)
+    angles = with_noise(angles, measurements)
     checks += [order_check(angles), handedness_check(angles), zero_check(angles)]
     checks.append(dielectric_check(measurements, pixels, index))
     return Inspection(capture, settings, index, tuple(measurements), tuple(checks), angles)
@@ -337,7 +346,7 @@ def _shots(
     """The checks of a capture with other pictures than four angles a view, and what these tell of their polarizers."""
     checks = [pictures_check(capture), *agreement_checks(capture), *light_checks(capture, measurements)]
     with reporter.track("matching features", 1):
-        checks += [pose_check(capture), coverage_check(capture)]
+        checks += [pose_check(capture), lens_check(capture), coverage_check(capture)]
     if len(capture.posed) < FEWEST_TO_TRAIN:
         why = f"The angles are checked by a short training, which takes {FEWEST_TO_TRAIN} views with a pose."
         findings = ShotFindings(why=why)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from polarguide import optics
 from polarguide.capture import checks
 from polarguide.capture.checks import MeasuredGains, measured_gains, pair_moments
 from polarguide.capture.view import ANGLES, FULL_CODE, listed
-from polarguide.inspection.angles import PAIRINGS, swaps
+from polarguide.inspection.angles import PAIRINGS, AngleFindings, swaps
 from polarguide.inspection.capture import POLARIZED, Capture, ViewMeasurements
 from polarguide.inspection.evidence import ZENITH_MARGIN, SurfaceSamples
 from polarguide.inspection.settings import Check, Verdict
@@ -278,6 +279,21 @@ def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
         key, title, verdict, f"{finding} Dark or noisy: {len(off)} views ({listed(list(off))}).",
         "Use a longer exposure at the lowest gain, or average several shots.", off, figures,
     )  # fmt: skip
+
+
+def with_noise(angles: AngleFindings, measurements: Sequence[ViewMeasurements]) -> AngleFindings:
+    """The findings with noise in the error of the zero, where the check of noise warns.
+
+    There, values are steps of a tone curve or what a compression left of them, which is not independent from pixel to
+    pixel. So the error that it makes in the AoLP of one strongly polarized pixel is that of all of them together.
+    """
+    share = float(np.median([r.noise_share for r in measurements]))
+    degree = float(np.median([r.dolp[1] for r in measurements]))
+    if angles.posterior is None or degree <= 0 or _noise(measurements).verdict == "ok":
+        return angles
+    systematic = math.degrees(share / math.sqrt(2) / (2 * degree))
+    error = math.hypot(angles.posterior.offset_error, systematic)
+    return replace(angles, posterior=replace(angles.posterior, offset_error=error))
 
 
 def _brightness(measurements: Sequence[ViewMeasurements]) -> Check:

@@ -9,89 +9,32 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.exposures import TABLE, angle_text
-from polarguide.capture.formats.pictures import decode_mask, decode_picture, linear_codes, read_picture
-from polarguide.capture.view import FULL_CODE, listed
+from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_picture
+from polarguide.capture.point_exposures import (
+    FEWEST,
+    ComparedPoints,
+    PointExposures,
+    exposures_of_points,
+    significant,
+)
+from polarguide.capture.view import listed
 from polarguide.capture.write import picture_names
 from polarguide.core.files import write_whole
 from polarguide.core.progress import Reporter
-from polarguide.geometry.camera import Camera
 from polarguide.preparation.folder import SceneFolder
 
 Array = NDArray[np.floating[Any]]
-FEWEST = 20
-"""Points of which fewer say nothing about a picture."""
 FILE_ERROR = 0.03
 """Relative error of exposures that files state: shutters and apertures have nominal values."""
 POINTS_ERROR = 0.05
 """Relative error of exposures from points, at least: reflections move, and polarization is taken for exposure."""
 LARGEST_DOUBT = 0.5
 """Logarithm of 0.7 stops: points that contradict a file by more, and by more than others do, are believed."""
-_LEAST_TRACK = 3
-_MOST_POINTS = 20_000
-_ROUNDS = 40
-_SMALLEST = 0.03
-
-
-def exposures_of_points(values: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Logarithms of the exposures of pictures from intensities of points.
-
-    Solves ``log(value) = exposure of the picture + brightness of the point`` with the least sum of absolute residuals
-    (iteratively reweighted least squares), where a point counts less the more its own residuals scatter: reflections
-    and polarization make points look different from picture to picture, and matte ones tell exposures best.
-
-    Args:
-        values: [points, pictures] positive linear intensities; NaN where a point is not seen or not measured.
-
-    Returns:
-        [pictures] logarithms, mean 0; NaN for pictures with fewer than ``FEWEST`` points that they share with those of
-        the largest connected set. And the number of points of each picture.
-    """
-    count = values.shape[1]
-    logs = np.full(count, np.nan)
-    valid = np.isfinite(values)
-    long = np.argsort(-valid.sum(axis=1), kind="stable")[:_MOST_POINTS]
-    values, valid = values[long], valid[long]
-    shared = valid.sum(axis=1) >= min(_LEAST_TRACK, count)
-    values, valid = values[shared], valid[shared]
-    numbers = valid.sum(axis=0)
-    chosen = _connected(valid, numbers)
-    if len(chosen) < 2:
-        return logs, numbers
-    valid = valid[:, chosen]
-    paired = valid.sum(axis=1) >= 2
-    valid, log = valid[paired], np.log(np.where(valid, values[:, chosen], 1.0))[paired]
-    weights = valid.astype(np.float64)
-    for _ in range(_ROUNDS):
-        total = weights.sum(axis=1)
-        # The points' brightnesses are eliminated; adding 1 fixes the mean of the exposures at 0.
-        matrix = np.diag(weights.sum(axis=0)) - (weights.T / total) @ weights
-        right = (weights * log).sum(axis=0) - weights.T @ ((weights * log).sum(axis=1) / total)
-        scale = max(float(np.trace(matrix)) / len(matrix), 1e-12)
-        solution = np.linalg.solve(matrix + scale / len(matrix), right)
-        solution -= solution.mean()
-        bright = (weights * (log - solution)).sum(axis=1) / total
-        residual = np.where(valid, log - solution - bright[:, None], 0.0)
-        scatter = (residual**2).sum(axis=1) / np.maximum(valid.sum(axis=1) - 1, 1)
-        weights = valid / np.maximum(np.abs(residual), _SMALLEST) / np.maximum(scatter, _SMALLEST**2)[:, None]
-    logs[chosen] = solution
-    return logs, numbers
-
-
-def _connected(valid: NDArray[np.bool_], numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The pictures of the largest set in which any two are linked by points in common."""
-    enough = np.flatnonzero(numbers >= FEWEST)
-    if len(enough) == 0:
-        return enough
-    links = valid[:, enough].astype(np.float32)
-    _, group = connected_components(links.T @ links >= FEWEST / 4, directed=False)
-    return enough[group == np.argmax(np.bincount(group))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +52,9 @@ class Exposures:
     scatter: float | None
 
 
-def reconciled(points: Array, files: Array, unfiltered: NDArray[np.bool_]) -> Exposures:
+def reconciled(
+    points: Array, files: Array, unfiltered: NDArray[np.bool_], errors: Array | None = None
+) -> Exposures:
     """Exposures from those of points and those of files.
 
     Small differences correct the file's value, within its usual error (``FILE_ERROR``) and the agreement of points and
@@ -119,17 +64,22 @@ def reconciled(points: Array, files: Array, unfiltered: NDArray[np.bool_]) -> Ex
     Args:
         points, files: logarithms, [N]; NaN where one is not known.
         unfiltered: [N] whether a picture was taken without a filter.
+        errors: of those of points, [N]; differences that are not significant count as none.
     """
+    errors = np.zeros(len(points)) if errors is None else errors
     files = files + np.where(unfiltered, np.log(2.0), 0.0)  # an ideal filter leaves half of unpolarized light
     both = np.isfinite(points) & np.isfinite(files)
     if both.sum() < 3:
-        aligned = points + (np.median((files - points)[both]) if both.any() else 0.0)
+        sure = np.where(significant(np.abs(points), errors), points, 0.0)
+        sure = np.where(np.isfinite(points), sure, np.nan)
+        aligned = sure + (np.median((files - points)[both]) if both.any() else 0.0)
         return Exposures(np.where(np.isfinite(files), files, aligned), (), None)
     shifted = files + np.median((points - files)[both])
     for group in (unfiltered, ~unfiltered):
         if (group & both).sum() >= 3:
             shifted = np.where(group, files + np.median((points - files)[group & both]), shifted)
     difference = np.where(both, points - shifted, 0.0)
+    difference = np.where(significant(np.abs(difference), errors), difference, 0.0)
     scatter = 1.4826 * float(np.median(np.abs(difference[both])))
     weight = FILE_ERROR**2 / (FILE_ERROR**2 + max(scatter, POINTS_ERROR) ** 2)
     odd = both & (np.abs(difference) > max(LARGEST_DOUBT, 4 * scatter))
@@ -139,12 +89,9 @@ def reconciled(points: Array, files: Array, unfiltered: NDArray[np.bool_]) -> Ex
     return Exposures(logs, tuple(int(k) for k in np.flatnonzero(odd)), scatter)
 
 
-# Linear intensity below which noise and rounding of 8 bits hide the exposure.
-_DARK = 0.004
 # Logarithm of a gain that is warned of where files do not state it: one and a half stops from the others.
 _FAR = math.log(2.0) * 1.5
 _LISTED = 12
-_PATCH = (3, 3)
 
 
 @dataclass
@@ -218,19 +165,22 @@ def _estimate(root: Path, pictures: list[_Exposure], posed: bool, reporter: Repo
     within = _within_views(pictures, files)
     rows = {view: [k for k, picture in enumerate(pictures) if picture.view == view] for view in views}
     points, numbers = np.full(len(views), math.nan), np.zeros(len(views), np.int64)
-    if posed and len(views) > 1:
-        points, numbers = exposures_of_points(_values(root, pictures, rows, within, reporter))
+    errors = np.full(len(views), math.inf)
+    compared = _of_points(root, pictures, rows, within, reporter) if posed and len(views) > 1 else None
+    if compared is not None:
+        points, numbers, errors = compared.logs[:, 0], compared.points, compared.errors
     of_view = np.array([float(np.mean((files - within)[rows[view]])) for view in views])
     # Views that were photographed both ways: whatever the shots are compared at, most of it passed the filter.
     bare = np.array([all(pictures[k].record["angle"] == "none" for k in rows[view]) for view in views])
-    estimate = reconciled(points, of_view, bare)
+    estimate = reconciled(points, of_view, bare, errors)
     lost = [view for view, log in zip(views, estimate.logs, strict=True) if not math.isfinite(log)]
     middle = float(np.nanmean(estimate.logs)) if len(lost) < len(views) else 0.0
     for place, view in enumerate(views):
         log = estimate.logs[place] if math.isfinite(estimate.logs[place]) else middle
         for k in rows[view]:
             pictures[k].log, pictures[k].points = float(log + within[k]), int(numbers[place])
-    _say_how(views, points, of_view, estimate.scatter, lost, reporter)
+    how = "" if compared is None else _significance(compared.significant[:, 0], errors)
+    _say_how(views, points, of_view, estimate.scatter, lost, how, reporter)
     _warn([views[k] for k in estimate.contradicted], pictures, of_view, reporter)
 
 
@@ -247,56 +197,32 @@ def _within_views(pictures: list[_Exposure], files: NDArray[np.float64]) -> NDAr
     return relative
 
 
-def _values(
+def _of_points(
     root: Path,
     pictures: list[_Exposure],
     rows: dict[str, list[int]],
     within: NDArray[np.float64],
     reporter: Reporter,
-) -> NDArray[np.float64]:
-    """Intensities of the model's points in the views that observe them, [points, views]; NaN elsewhere."""
+) -> PointExposures | None:
+    """Exposures of views by the model's points; None where no tracks are stored."""
     model = read_model(root)
     views = list(rows)
-    observed = model.observations(views).numpy()
-    values = np.full(observed.shape, math.nan)
-    places = model.points.double().numpy()
+    compared = ComparedPoints.of(model, views)
+    if compared is None:
+        return None
+    values = np.full((len(compared.places), len(views), 1), math.nan, np.float32)
     with reporter.track("comparing exposures", len(views)) as advance:
         for column, view in enumerate(views):
-            visible = np.flatnonzero(observed[:, column])
-            if len(visible):
-                files = [root / "polar" / pictures[k].file for k in rows[view]]
-                gray = np.mean(
-                    [_gray(path) / math.exp(within[k]) for path, k in zip(files, rows[view], strict=True)],
-                    axis=0,
-                )
-                path = root / "invalid" / f"{view}.png"
-                bad = decode_mask(path, read_picture(path), any_value=True)
-                values[visible, column] = _at(places[visible], model.camera(view), gray, bad)
+            files = [root / "polar" / pictures[k].file for k in rows[view]]
+            stored = [decode_picture(path, read_picture(path)) for path in files]
+            path = root / "invalid" / f"{view}.png"
+            bad = decode_mask(path, read_picture(path), any_value=True)
+            samples = compared.samples(view, stored, bad, "linear")
+            assert samples is not None
+            even = samples.values.mean(axis=2) / np.exp(within[rows[view]])
+            values[compared.observed[:, column], column, 0] = even.mean(axis=1)
             advance(column + 1)
-    return values
-
-
-def _gray(path: Path) -> NDArray[np.float64]:
-    """The mean of the colors of a picture, linear, [H, W]."""
-    codes = linear_codes(decode_picture(path, read_picture(path)), "linear")
-    return codes.mean(axis=2) / FULL_CODE
-
-
-def _at(
-    places: NDArray[np.float64], camera: Camera, gray: NDArray[np.float64], bad: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """Means of a picture around the projections of points [N, 3]; NaN outside, where dark, or beside bad pixels."""
-    local = places @ camera.rotation.numpy().T + camera.translation.numpy()
-    depth = np.where(local[:, 2] > 0, local[:, 2], np.nan)
-    column = np.floor(camera.fx * local[:, 0] / depth + camera.cx)
-    row = np.floor(camera.fy * local[:, 1] / depth + camera.cy)
-    height, width = gray.shape
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    values = np.full(len(places), math.nan)
-    at = row[inside].astype(int), column[inside].astype(int)
-    means, spoiled = cv2.blur(gray, _PATCH), cv2.dilate(bad.astype(np.uint8), np.ones(_PATCH, np.uint8)) > 0
-    values[inside] = np.where(spoiled[at] | (means[at] < _DARK), math.nan, means[at])
-    return values
+    return exposures_of_points(values, compared.places)
 
 
 def _apply_given(pictures: list[_Exposure]) -> None:
@@ -315,6 +241,7 @@ def _say_how(
     files: NDArray[np.float64],
     scatter: float | None,
     lost: list[str],
+    significance: str,
     reporter: Reporter,
 ) -> None:
     """Where the gains come from."""
@@ -325,7 +252,7 @@ def _say_how(
     elif by_points:
         reporter.say(
             f"Gains: from points in common ({by_points} of {len(views)} views); the files do not state exposures. "
-            "Reflections and polarization mislead them by some percent."
+            f"{significance}"
         )
     elif by_files:
         reporter.say(f"Gains: exposures that the files state ({by_files} of {len(views)} views).")
@@ -334,6 +261,16 @@ def _say_how(
             f"The gains of {len(lost)} of {len(views)} views are not known ({listed(lost)}): their files state no "
             f"exposure, and fewer than {FEWEST} points tell it. They are taken for average; {TABLE} may say better."
         )
+
+
+def _significance(logs: Array, errors: Array) -> str:
+    """How many of the gains by points are applied."""
+    known = int(np.isfinite(logs).sum())
+    applied = int(np.count_nonzero(np.nan_to_num(logs)))
+    usual = float(np.median(errors))
+    if applied:
+        return f"{known - applied} of {known} are not significant (error {usual:.0%}) and not applied."
+    return f"They do not differ significantly (error {usual:.0%}): none is applied."
 
 
 def _warn(
@@ -356,7 +293,9 @@ def _warn(
 
 
 def _tell(pictures: list[_Exposure], reporter: Reporter) -> None:
-    """Print the table: all pictures, or the most unusual ones of many."""
+    """Print the table: all pictures, or the most unusual ones of many; nothing where all gains are 1."""
+    if all(picture.record["gain"] == 1 for picture in pictures):
+        return
     listing = pictures
     if len(pictures) > _LISTED:
         listing = sorted(

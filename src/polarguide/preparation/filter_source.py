@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from polarguide.capture.calibration import (
     LARGEST_IMBALANCE,
-    UNIDENTIFIED,
     UNIT_GAINS,
     balancing_gains,
     oriented,
@@ -27,7 +26,9 @@ from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.exposures import Angle, angle_text, turned
 from polarguide.capture.filter.camera_files import (
     ExposureData,
+    Lens,
     apply_orientation,
+    camera_groups,
     is_camera_raw,
     missing_tags,
     orientation,
@@ -87,6 +88,8 @@ class ShotsSource(Source):
     """Shots of an ordinary camera through a polarizing filter: what four a view and single ones have in common."""
 
     cameras = None
+    assumed: tuple[str, ...] = ()
+    """What was taken for granted, in sentences for the user."""
     _root: Path
 
     def __init__(self, paths: list[Path], views: dict[str, list[Path]], settings: PrepareSettings) -> None:
@@ -107,6 +110,10 @@ class ShotsSource(Source):
         if is_camera_raw(first):
             return Stored(*stored_frame(first))
         return Stored(stated_size(first), orientation(read_picture(first)))
+
+    def lenses(self) -> dict[str, Lens]:
+        """By the EXIF tags of each view's first shot."""
+        return camera_groups({view: paths[0] for view, paths in self._of_view.items()})
 
     def use_stored(self, views: Collection[str]) -> None:
         """Develop these views without turning them."""
@@ -215,11 +222,14 @@ class FilterSource(ShotsSource):
     kind = "filter"
     needs = ("transfer", "scale", "light")
 
-    def __init__(self, root: Path, settings: PrepareSettings) -> None:
+    def __init__(
+        self, root: Path, settings: PrepareSettings, shots: dict[str, dict[int, Path]] | None = None
+    ) -> None:
+        """Use the shots of a folder: as their names say, or as given by view and angle."""
         self._root = root
-        shots = find_shots(root, nested=True)
+        unused = [path.name for path in list_shots(root, nested=True)[1]] if shots is None else []
+        shots = find_shots(root, nested=True) if shots is None else shots
         require_four_shots(root, shots)
-        unused = [path.name for path in list_shots(root, nested=True)[1]]
         unused += [path.name for files in shots.values() for a, path in files.items() if a not in ANGLES]
         if unused:
             fault = f"{root} has pictures without an angle in their names, or at other angles than 0, 45, 90 and 135"
@@ -231,7 +241,7 @@ class FilterSource(ShotsSource):
         """The transfer of the capture, from a few views spread over it."""
         self._require_memory("four shots")
         settings = self._settings
-        gains, notes = settings.calibration.gains, []
+        gains, notes = settings.calibration.gains, [*self.assumed]
         levels, counted = levels_of_shots(self._shots, self._white, self._settings)
         decision = self._decided(levels)
         notes += [*counted, decision.note]
@@ -239,8 +249,6 @@ class FilterSource(ShotsSource):
         notes += [missing] if missing else exposure_notes(stated)
         # One scale for all shots, with room for the largest gain that is corrected.
         room = math.sqrt(1.0 - LARGEST_IMBALANCE)
-        if gains is None and settings.gains == "auto":
-            notes.append(UNIDENTIFIED)
         scale = min(1.0, *gains) if gains is not None else room if settings.gains == "auto" else 1.0
         scale /= settings.calibration.peak
         smallest = scale / (max(gains) if gains is not None else 1.0 / room)
@@ -339,7 +347,7 @@ class SinglesSource(ShotsSource):
         Raises:
             PolarguideError: one has no angle, or the settings do not fit the files.
         """
-        shots, tables = find_single_shots(root, settings.angles)
+        shots, tables = find_single_shots(root, settings.angles, settings.shots_per_view or 1)
         self._root = root
         self._singles: dict[str, list[SingleShot]] = {}
         for shot in shots:
@@ -352,7 +360,7 @@ class SinglesSource(ShotsSource):
         """The transfer, and what the files say about their exposure.
 
         Raises:
-            PolarguideError: the photographs are too large, or not of one camera and size.
+            PolarguideError: the photographs are too large, or not of one size.
         """
         self._require_memory("photographs of a view")
         sizes: dict[str, Path] = {}  # but for the side they were held on
@@ -368,15 +376,9 @@ class SinglesSource(ShotsSource):
         levels, counted = levels_of_shots(self._shots, self._white, self._settings)
         decision = self._decided(levels)
         every: dict[Path, ExposureData] = {}
-        cameras: dict[str, Path] = {}
         for number, view in enumerate(self.views, 1):
-            for path in self._of_view[view]:
-                every[path] = taken = read_exposure_data(path)
-                if taken.camera:
-                    cameras.setdefault(taken.camera, path)
+            every |= {path: read_exposure_data(path) for path in self._of_view[view]}
             advance(number)
-        remedy = "Prepare those of one camera; only one set of intrinsics is estimated."
-        self._require_one(cameras, "camera", remedy)
         missing, light = missing_tags(every), {}
         if not missing:
             light = {
@@ -389,7 +391,7 @@ class SinglesSource(ShotsSource):
             "rounding": self._rounding(decision.transfer, 1.0),
             "levels": None if levels is None else asdict(levels),
             "light": light,
-            "notes": [self._summary(), decision.note, *counted, missing or stating],
+            "notes": [*self.assumed, self._summary(), decision.note, *counted, missing or stating],
         }
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:

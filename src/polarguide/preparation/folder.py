@@ -11,7 +11,7 @@ import json
 import re
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,6 +23,7 @@ from polarguide.capture.colmap.poses import Geometry, Poses
 from polarguide.capture.colmap.sfm import reconstruct, tone_mapped
 from polarguide.capture.colmap.triangulate import add_points
 from polarguide.capture.exposures import Angle
+from polarguide.capture.filter.consecutive import chosen_matching
 from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.view import ANGLES, FULL_CODE, listed
 from polarguide.capture.write import (
@@ -166,6 +167,9 @@ class SceneFolder:
         for name in ("analyzers", "angles"):  # earlier journals do not know them
             before["settings"].setdefault(name, None)
         before["settings"].setdefault("poses_of", "auto")
+        before["settings"].setdefault("shots_per_view", None)
+        if before["settings"]["matching"] == "exhaustive" and now["settings"]["matching"] == "auto":
+            now["settings"]["matching"] = "exhaustive"  # the default of earlier journals
         self._follows_none = before["settings"]["poses"] == "none" != now["settings"]["poses"]
         if self._follows_none:
             for record in (before, now):
@@ -367,16 +371,18 @@ class Workshop:
             PolarguideError: too few views are registered.
         """
         sizes = {view: geometry.size for view, geometry in self._photographs(self._pictures.views).items()}
-        settings = self._settings
+        matching = chosen_matching(self._pictures.views, self._settings.matching, self._reporter)
+        settings = replace(self._settings, matching=matching)  # type: ignore[arg-type]
         return reconstruct(
             self._root,
             sizes,
-            matching=settings.matching,
+            matching=matching,
             seed=settings.seed,
             reporter=self._reporter,
             untried=_untried(settings, self._pictures.kind),
             intrinsics=None if settings.intrinsics is None else known_intrinsics(settings.intrinsics),
             refine=settings.refine_intrinsics,
+            lenses=self._pictures.lenses(),
         )
 
     def points(self, poses: Poses) -> tuple[Poses, dict[str, Any]]:
@@ -391,7 +397,7 @@ class Workshop:
             self._root,
             cameras,
             poses.folder,
-            matching=settings.matching,
+            matching=chosen_matching(poses.views, settings.matching, self._reporter),
             seed=settings.seed,
             reporter=self._reporter,
         )

@@ -14,10 +14,11 @@ from pathlib import Path
 from polarguide.capture.colmap.model import view_of_name
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
-from polarguide.capture.exposures import TABLE, angles_of_names, folders_of_angles
-from polarguide.capture.filter.camera_files import QUARTER_TURNS, TURNS
+from polarguide.capture.exposures import TABLE, angles_of_names, folders_of_angles, parse_angle
+from polarguide.capture.filter.camera_files import QUARTER_TURNS, TURNS, is_camera_raw
+from polarguide.capture.filter.consecutive import extract_frames, find_videos, shots_of_one_place
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
-from polarguide.capture.formats.pictures import SUFFIXES
+from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, read_picture
 from polarguide.capture.layout import angle_folders, describe_contents, index_files, list_files
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import read_pose_file
@@ -26,7 +27,8 @@ from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_folder
-from polarguide.preparation.filter_source import FilterSource, SinglesSource
+from polarguide.core.progress import Reporter
+from polarguide.preparation.filter_source import FilterSource, ShotsSource, SinglesSource
 from polarguide.preparation.mosaic_source import MosaicSource
 from polarguide.preparation.settings import PrepareSettings, check_format
 from polarguide.preparation.source import Source, StokesSource
@@ -77,16 +79,27 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
     remedy = "Give the folder that holds the raw mosaics, or the shots through the filter."
     require_folder(root, expected="a folder of camera files", remedy=remedy)
     kind: str = settings.format
-    if kind == "auto":
+    settings, shots, assumed = _consecutive(root, settings)
+    if shots is not None and kind == "auto":
+        kind = "filter"
+        settings = replace(settings, angles=None, shots_per_view=None)
+    elif kind == "auto":
         kind = detect_dataset(root) or ("singles" if are_single_shots(root, settings) else "filter")
         if kind == "filter" and not angle_folders(root):
             shots = find_shots(root, nested=settings.sensor is None)
             several = any(len(files) > 1 for files in shots.values())
             kind = "filter" if several else "mosaic"
             if kind == "mosaic" and settings.sensor is None:
-                raise _unknown_layout(root)
+                _require_photographs(root)
+                kind, settings = "singles", replace(settings, angles="none")
+                assumed = (_ORDINARY,)
     check_format(settings, kind)
-    source = _source(root, settings, kind)
+    if kind == "filter":
+        source: Source = FilterSource(root, settings, shots)
+    else:
+        source = _source(root, settings, kind)
+    if isinstance(source, ShotsSource):
+        source.assumed = assumed
     if not source.views:
         raise PolarguideError(
             root,
@@ -99,6 +112,123 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
     if settings.masks is not None:
         source.masks = _found_masks(settings.masks, source.views)
     return source
+
+
+_ORDINARY = (
+    "Nothing tells of a filter: the pictures are taken as ordinary photographs (--angles none). For shots through one: "
+    "--angles unknown, or name their angles."
+)
+Shots = dict[str, dict[int, Path]]
+
+
+def _consecutive(
+    root: Path, settings: PrepareSettings
+) -> tuple[PrepareSettings, Shots | None, tuple[str, ...]]:
+    """Which consecutive pictures are one view, as ``--shots-per-view`` says or as they show.
+
+    Returns:
+        The settings, with the number of shots where it was found; where they are the usual four angles, the shots by
+        view and angle; and what was taken for granted, for the user.
+
+    Raises:
+        PolarguideError: the pictures come in groups of another number than there are angles.
+    """
+    angles = settings.angles
+    if angles is None or angles == "none" or angles.lower().endswith(".csv"):
+        return settings, None, ()
+    stated = [parse_angle(part) for part in angles.split(",")]
+    files = list(index_files(root, SHOT_SUFFIXES).values())
+    said: tuple[str, ...] = ()
+    each = settings.shots_per_view
+    if each is None and (each := shots_of_one_place(files)) is not None:
+        if len(stated) not in (1, each):
+            raise PolarguideError(
+                "--angles",
+                expected=f"{each} angles, because {each} pictures each in a row show one place",
+                found=angles,
+                remedy="Correct them, or give --shots-per-view 1 if every picture is a view of its own.",
+            )
+        alone = "--shots-per-view 1 takes every picture alone"
+        said = (
+            f"{each} pictures each in a row show one place and are one view, called like the first ({alone}).",
+        )
+        settings = replace(settings, shots_per_view=each)
+    elif each is None and len(stated) > 1:
+        said = (
+            f"Every picture is a view of its own. If {len(stated)} in a row are one view: --shots-per-view "
+            f"{len(stated)}.",
+        )
+    usual = each == len(ANGLES) and sorted(stated, key=str) == sorted(map(float, ANGLES), key=str)
+    if not usual or len(files) % len(ANGLES):
+        return settings, None, said
+    shots: Shots = {}
+    for number, path in enumerate(files):
+        angle = stated[number % len(ANGLES)]
+        assert isinstance(angle, float)
+        shots.setdefault(files[number - number % len(ANGLES)].stem, {})[round(angle)] = path
+    return settings, shots, said
+
+
+def _require_photographs(root: Path) -> None:
+    """Refuse pictures without angles in their names that may be something else than ordinary photographs.
+
+    Raises:
+        PolarguideError: there are raw mosaics, gray pictures (which may be mosaics) or none; or pictures in a row show
+            one place, as shots through a filter do.
+    """
+    files = list(index_files(root, SHOT_SUFFIXES).values())
+    mosaics = index_files(root, tuple(set(RAW_SUFFIXES) - set(SHOT_SUFFIXES)))
+    if mosaics or not files or not all(map(_is_colored, {files[0], files[-1]})):
+        raise _unknown_layout(root)
+    each = shots_of_one_place(files)
+    if each is not None:
+        angles = ",".join(f"{180 * k / each:g}" for k in range(each))
+        raise PolarguideError(
+            root,
+            expected="the angles of shots through a filter",
+            found=f"{len(files)} pictures of which {each} each in a row show one place",
+            remedy=f"Give the angles in their order, such as --angles {angles} --shots-per-view {each}. Ordinary "
+            "photographs, without a filter: --angles none.",
+        )
+
+
+def _is_colored(path: Path) -> bool:
+    """Whether a picture has colors, which mosaics have not."""
+    if is_camera_raw(path):
+        return True
+    pixels = decode_picture(path, read_picture(path))
+    return bool((pixels[..., 0] != pixels[..., 1]).any())
+
+
+def frames_of_video(
+    root: Path, out: Path, settings: PrepareSettings, reporter: Reporter
+) -> tuple[Path, PrepareSettings]:
+    """The folder of pictures to prepare: of a video, or of a folder with nothing but one, that of its frames.
+
+    Frames are written beside ``out``. They are photographs as displayed (sRGB) unless the settings say otherwise.
+
+    Raises:
+        PolarguideError: there are several videos, or one cannot be read.
+    """
+    videos = find_videos(root)
+    if not videos:
+        return root, settings
+    names = listed([video.name for video in videos])
+    if root.is_dir() and any(path.is_dir() or path.suffix.lower() in SHOT_SUFFIXES + RAW_SUFFIXES
+                             for path in root.iterdir()):  # fmt: skip
+        reporter.say(
+            f"Not used: {names}. Frames of a video are taken with polarguide prepare VIDEO --out SCENE."
+        )
+        return root, settings
+    if len(videos) > 1:
+        raise PolarguideError(
+            root, expected="one video", found=names, remedy="Give the path of one: polarguide prepare VIDEO."
+        )
+    folder = out.resolve().with_name(f"{out.resolve().name}-frames")
+    count = extract_frames(videos[0], folder, reporter)
+    reporter.say(f"{count} frames of {names} are in {folder}: the sharpest of equal spans of time.")
+    transfer = "srgb" if settings.transfer == "auto" else settings.transfer
+    return folder, replace(settings, angles=settings.angles or "none", transfer=transfer)
 
 
 def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
@@ -181,8 +311,6 @@ def poses_beside(root: Path) -> list[str]:
 
 
 def _source(root: Path, settings: PrepareSettings, kind: str) -> Source:
-    if kind == "filter":
-        return FilterSource(root, settings)
     if kind == "singles":
         return SinglesSource(root, settings)
     if kind == "mosaic":

@@ -27,6 +27,7 @@ from polarguide.core.records import option_name
 from polarguide.preparation.exposure_table import write_exposure_table
 from polarguide.preparation.folder import PARTIAL, PHOTOGRAPHS, SCENE, SFM, SceneFolder, Workshop
 from polarguide.preparation.open_source import (
+    frames_of_video,
     known_poses,
     open_source,
     origin_of_poses,
@@ -73,7 +74,7 @@ def prepare_scene(
     is ever replaced.
 
     Args:
-        source: folder of raw mosaics, of filter shots, or of single shots.
+        source: folder of raw mosaics, of filter shots, or of single shots; or a video.
         out: scene folder: new, empty, or of the same request.
         settings: what to do.
         reporter: where messages and progress go.
@@ -85,6 +86,7 @@ def prepare_scene(
     settings, reporter = settings or PrepareSettings(), reporter or Reporter()
     root, target = Path(source), Path(out)
     settings = settings.checked()
+    root, settings = frames_of_video(root, target, settings, reporter)
     pictures = open_source(root, settings)
     settings = replace(settings, poses=origin_of_poses(pictures, settings.poses))
     if settings.poses != "sfm" and settings.intrinsics is not None:

@@ -34,7 +34,16 @@ _OPTIONS = {
     "mosaic": _MOSAIC_ONLY,
     "pisr": _MOSAIC_ONLY,
     "filter": ("transfer", "align", "white_balance", "precision", "bits", "saturation"),
-    "singles": ("transfer", "align", "white_balance", "precision", "bits", "saturation", "angles"),
+    "singles": (
+        "transfer",
+        "align",
+        "white_balance",
+        "precision",
+        "bits",
+        "saturation",
+        "angles",
+        "shots_per_view",
+    ),
     "gnerp": ("transfer",),
 }
 
@@ -61,6 +70,8 @@ class PrepareSettings(MosaicOptions):
         align: Estimate and correct small shifts between the four shots of a filter.
         angles: Polarizer angles of singles: unknown or none for all, numbers in the order of the files that repeat
             (such as 0,60,120), or the path of a table (.csv); without it angles.csv, folders or names say them.
+        shots_per_view: Consecutive photographs, by name, that are one view; --angles has as many angles, or a word.
+            Without it, groups that show one place are found.
         gains: auto corrects what the light tells of the gains of the angles, and estimates the exposure of every single
             shot; none leaves them. Gains of a calibration go first.
         calibration: gains, order, sense and zero of the angles.
@@ -71,7 +82,8 @@ class PrepareSettings(MosaicOptions):
             or cameras.npz (IDR); auto takes those of a dataset, else sfm.
         poses_of: Whether the poses of a path are of the pixels as stored, or of pictures as EXIF orientation displays
             them; auto decides by the sizes of the cameras, else stored.
-        matching: Pairs that SfM compares: all, or neighbors in the order of their names.
+        matching: Pairs that SfM compares: all, or neighbors in the order of their names; auto takes neighbors for
+            frames of videos and for more than 100 pictures with running numbers.
         sfm_pictures: What SfM finds features in: the photograph, or the minimum over the angles, which has less glare.
         intrinsics: fx,fy,cx,cy (and k1,k2,p1,p2) of all pictures as developed, for SfM; without it they are estimated.
         refine_intrinsics: Let SfM change the focal lengths and distortion given.
@@ -92,13 +104,14 @@ class PrepareSettings(MosaicOptions):
     transfer: Literal["auto", "linear", "srgb"] = "auto"
     align: bool = True
     angles: str | None = None
+    shots_per_view: Annotated[int, Meta(ge=1, le=72)] | None = None
     gains: Literal["auto", "none"] = "auto"
     calibration: Annotated[Calibration, tyro.conf.Suppress] = field(default_factory=Calibration)
     analyzers: Annotated[Path | None, tyro.conf.Suppress] = None
     precision: Literal["source", "full"] = "source"
     poses: str = "auto"
     poses_of: Literal["auto", "stored", "displayed"] = "auto"
-    matching: Literal["exhaustive", "sequential"] = "exhaustive"
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     sfm_pictures: Literal["photograph", "minimum"] = "photograph"
     intrinsics: str | None = None
     refine_intrinsics: bool = False
@@ -121,6 +134,13 @@ class PrepareSettings(MosaicOptions):
                 expected="none beside the analyzers of polarguide calibrate, which hold the gains of every pixel",
                 found=str(self.calibration.gains),
                 remedy="Leave one of them out.",
+            )
+        if self.shots_per_view is not None and self.angles is None:
+            raise PolarguideError(
+                "--shots-per-view",
+                expected="--angles beside it: those of the shots of a view in their order, or a word",
+                found="none",
+                remedy="Give both, such as --angles 0,45,90,135 --shots-per-view 4.",
             )
         if self.intrinsics is not None:
             known_intrinsics(self.intrinsics)

@@ -19,7 +19,7 @@ from polarguide.capture.colmap.files import PosedCamera
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.datasets.dataset import Dataset, not_as_published, read_mask, resized_mask
 from polarguide.capture.exposures import Angle
-from polarguide.capture.filter.camera_files import INVERSE, QUARTER_TURNS, apply_orientation
+from polarguide.capture.filter.camera_files import INVERSE, QUARTER_TURNS, Lens, apply_orientation
 from polarguide.capture.formats.pictures import stated_size
 from polarguide.capture.layout import require_memory_of_each
 from polarguide.capture.view import listed
@@ -107,6 +107,10 @@ class Source(Protocol):
 
     def stored(self, view: str) -> Stored:
         """Stored size and orientation of a view's pictures, by the header of its first file."""
+
+    def lenses(self) -> dict[str, Lens]:
+        """The lens of each view where the files state several; else an empty dictionary."""
+        return {}
 
     def use_stored(self, views: Collection[str]) -> None:
         """Develop these views as they are stored, whatever their orientation; before any of them is developed.

@@ -22,7 +22,7 @@ from torch.nn.functional import max_pool2d
 
 from polarguide.capture import View
 from polarguide.capture.exposures import analyzers
-from polarguide.capture.variants import black_pixels
+from polarguide.capture.variants import BLACK, black_pixels
 from polarguide.capture.view import listed
 from polarguide.core.files import write_text
 from polarguide.core.progress import Reporter
@@ -117,6 +117,8 @@ class Limits:
         brighter: times the brightest intensity that was measured anywhere. A filter hides more than half of the light
             only where more than half of it is polarized, and then in every view.
         burned: share of the pixels of a view that are brighter than that: a spot of 9 x 9 pixels of 320 x 240.
+        exposed: stops by which a view is brighter or darker than predicted, in any color, compared with other views:
+            half of the third of a stop by which cameras set exposures.
         fog: mean share of the light of a view that comes from where no surface can be: what one sees in dark places.
         bare: share of the pixels of a view that are holes: there is mostly nothing, and less than half of the light
             that was measured, which no filter explains.
@@ -127,6 +129,7 @@ class Limits:
     scattered: float = 3.0
     brighter: float = 2.0
     burned: float = 0.001
+    exposed: float = 0.17
     fog: float = 0.01
     bare: float = 0.01
     unseen: float = 0.1
@@ -145,6 +148,7 @@ class ViewHealth:
         burned: share of the pixels that are brighter than ``Limits.brighter`` times what was measured anywhere.
         fog: mean share of the light that comes from where no surface can be; None where no points tell that.
         bare: share of the pixels that are holes, see ``Limits.bare``.
+        stops: median of measured over predicted light in R, G and B; None where no pixel counts.
     """
 
     psnr: float | None
@@ -152,6 +156,7 @@ class ViewHealth:
     burned: Share
     fog: Share | None
     bare: Share
+    stops: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -291,7 +296,17 @@ def _look(
     if near > 0:
         depth = torch.full_like(result.alpha, near)
         fog = float((model.alpha_in_front(camera, depth) * result.alpha).mean().clamp(0, 1))
-    return ViewHealth(psnr, None, _share(burned), fog, _share(bare)), result.radii
+    stops = _stops(measured.mean(dim=0), predicted.mean(dim=0), counted)
+    return ViewHealth(psnr, None, _share(burned), fog, _share(bare), stops), result.radii
+
+
+def _stops(measured: Tensor, predicted: Tensor, counted: Tensor) -> tuple[float, float, float] | None:
+    """Medians of measured over predicted light [H, W, 3] by color, where neither is black; None where all is."""
+    lit = counted & (torch.minimum(measured, predicted).amin(dim=-1) > BLACK)
+    if not bool(lit.any()):
+        return None
+    red, green, blue = torch.log2(measured[lit] / predicted[lit]).median(dim=0).values.tolist()
+    return red, green, blue
 
 
 def _compared(view: View, final: Tensor, stokes: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -343,8 +358,10 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
             "was measured. Their pictures do not determine the light there: do not use this run; add pictures of "
             "these views at other angles, or without a filter, and train again."
         )
-    explained = burned.keys() | bare.keys()
-    if far := [name for name in _far_under(views, limits) if name not in explained]:
+    exposed = {name: stops for name, stops in _exposed(views, limits).items() if name not in burned | bare}
+    explained = burned | bare | exposed
+    far = [name for name in _far_under(views, limits) if name not in explained]
+    if far:
         worst = ", ".join(
             f"{name} ({views[name].psnr:.1f} dB, beside {views[name].beside:.1f})" for name in far[:4]
         )
@@ -353,6 +370,12 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
             f"training views far under those beside them: {worst}{more}. Pose, polarizer angle, exposure or focus of "
             f"these photographs may be wrong: compare them with polarguide render --views {','.join(far[:4])}, and "
             "correct them or leave them out."
+        )
+    if exposed:
+        told = listed([f"{name} {stops:+.2f}" for name, stops in exposed.items()])
+        warnings.append(
+            f"training views brighter or darker than the result predicts, or of other colors (stops: {told}): their "
+            "exposure or white balance differs and was not corrected. Leave them out, or prepare with --gains auto."
         )
     fog = {name: view.fog for name, view in views.items() if view.fog is not None and view.fog > limits.fog}
     if fog:
@@ -372,6 +395,19 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
             "looked at: nothing is known of them. Keep them out of exports with a crop box (polarguide present --crop)."
         )
     return warnings
+
+
+def _exposed(views: Mapping[str, ViewHealth], limits: Limits) -> dict[str, float]:
+    """Stops by which views are exposed otherwise than the others, the strongest first."""
+    known = {name: torch.tensor(view.stops) for name, view in views.items() if view.stops is not None}
+    if len(known) <= NEIGHBORS:
+        return {}
+    stops = torch.stack(list(known.values()))
+    off = stops - stops.median(dim=0).values
+    least = max(limits.exposed, limits.scattered * 1.4826 * float(off.abs().median()))
+    strongest = {name: max(row.tolist(), key=abs) for name, row in zip(known, off, strict=True)}
+    order = sorted(strongest, key=lambda name: -abs(strongest[name]))
+    return {name: strongest[name] for name in order if abs(strongest[name]) > least}
 
 
 def _far_under(views: Mapping[str, ViewHealth], limits: Limits) -> list[str]:

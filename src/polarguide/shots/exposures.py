@@ -10,6 +10,7 @@ from pathlib import Path
 
 from polarguide.capture.exposures import TABLE
 from polarguide.capture.filter import shots as filter_shots
+from polarguide.capture.filter.consecutive import VIDEO_SUFFIXES
 from polarguide.capture.layout import (
     Layout,
     angle_folders,
@@ -24,7 +25,7 @@ from polarguide.capture.view import ANGLES
 from polarguide.core.errors import PolarguideError
 from polarguide.shots import sets
 from polarguide.shots.options import ShotOptions
-from polarguide.shots.sets import VIDEO_SUFFIXES, ExposureSet, known_places
+from polarguide.shots.sets import ExposureSet, known_places
 
 _EXPECTED = "raw mosaics with --sensor, or shots with angles in their names"
 _REMEDY = (

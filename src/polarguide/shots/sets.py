@@ -29,6 +29,7 @@ from polarguide.capture.exposures import (
     read_rows,
     read_table,
 )
+from polarguide.capture.filter.consecutive import VIDEO_SUFFIXES
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, group_files
 from polarguide.capture.layout import ambiguous, list_files
 from polarguide.capture.view import ANGLES, listed
@@ -319,7 +320,6 @@ def _video(path: Path) -> ExposureSet:
     return _exposure_set(path.stem, pictures, table)
 
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 _COLUMNS = ["frame", "angle"]
 _REMEDY = "Write a line for each frame to use: its number, counted from 0, and its angle in degrees."
 

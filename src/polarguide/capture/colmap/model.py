@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from polarguide.capture.colmap.files import check_model_files
@@ -103,6 +104,7 @@ class ColmapModel:
     _images: dict[str, list[Any]] = field(repr=False)
     _cameras: dict[int, Any] = field(repr=False)
     _tracks: tuple[tuple[int, ...], ...] = field(repr=False, default=())
+    _rows: dict[int, int] = field(repr=False, default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -126,6 +128,17 @@ class ColmapModel:
                 remedy="Register the view in COLMAP under this name, or leave out its pictures.",
             )
         return _camera_of(self.folder, images[0], self._cameras[images[0].camera_id])
+
+    def correspondences(self, view: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where a view observes points, in pixels at the size the model states [N, 2], and the points [N, 3]."""
+        seen = [
+            (point.xy, self._rows[point.point3D_id])
+            for image in self._images.get(view, [])[:1]
+            for point in image.points2D
+            if point.has_point3D() and point.point3D_id in self._rows
+        ]
+        pixels = np.array([place for place, _ in seen], np.float64).reshape(-1, 2)
+        return pixels, self.points.double().numpy()[[row for _, row in seen]]
 
     def observations(self, views: Sequence[str]) -> Tensor:
         """Which of the views observe each point, [M, V] bool; all False where no tracks are stored."""
@@ -152,7 +165,8 @@ def read_model(root: Path) -> ColmapModel:
     files = tuple(path for path in (folder / (name + kind) for name in MODEL_FILES) if path.exists())
     model = load_model(folder, kind)
     images = posed_images(model)
-    points, colors, tracks, dropped = _points_of(model)
+    points, colors, tracks, numbers = _points_of(model)
+    dropped = len(model.points3D) - len(points)
     if len(points) == 0:
         raise PolarguideError(
             folder / ("points3D" + kind),
@@ -163,7 +177,8 @@ def read_model(root: Path) -> ColmapModel:
     beyond = f"not finite, or farther than {FARTHEST:g}, and were left out."
     warning = f"{dropped} of {dropped + len(points)} 3D points are {beyond}"
     warnings = (warning,) if dropped else ()
-    return ColmapModel(folder, files, points, colors, warnings, images, dict(model.cameras), tracks)
+    rows = {number: row for row, number in enumerate(numbers)}
+    return ColmapModel(folder, files, points, colors, warnings, images, dict(model.cameras), tracks, rows)
 
 
 def fit_camera(camera: Camera, width: int, height: int, *, folder: Path, view: str) -> Camera:
@@ -350,18 +365,22 @@ def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
     return Camera(int(camera.width), int(camera.height), fx, fy, cx, cy, rotation, translation)
 
 
-def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...], int]:
-    """Finite points, their colors and the numbers of the images that see them; how many points are not finite."""
-    points = [point for _, point in sorted(model.points3D.items())]
+def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...], list[int]]:
+    """Finite points, their colors, the numbers of the images that see them, and their own numbers."""
+    numbered = sorted(model.points3D.items())
+    points = [point for _, point in numbered]
     with np.errstate(over="ignore"):
         places = np.array([point.xyz for point in points]).reshape(-1, 3).astype(np.float32)
     colors = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
     finite = (np.abs(places) <= FARTHEST).all(axis=1)
-    tracks = tuple(
-        tuple(element.image_id for element in point.track.elements)
-        for point in (points[place] for place in np.flatnonzero(finite))
-    )
-    return torch.from_numpy(places[finite]), torch.from_numpy(colors[finite]), tracks, int((~finite).sum())
+    seen = {number: {element.image_id for element in point.track.elements} for number, point in numbered}
+    for number, image in model.images.items():  # exported models may have tracks there alone
+        for observed in image.points2D:
+            if observed.has_point3D() and observed.point3D_id in seen:
+                seen[observed.point3D_id].add(number)
+    kept = [numbered[place][0] for place in np.flatnonzero(finite)]
+    tracks = tuple(tuple(sorted(seen[number])) for number in kept)
+    return torch.from_numpy(places[finite]), torch.from_numpy(colors[finite]), tracks, kept
 
 
 _SAMPLES = 2000

@@ -4,20 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import json
 import math
 import shutil
+import sqlite3
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from polarguide.capture.colmap import steps
 from polarguide.capture.colmap.files import PosedCamera, colmap_camera
+from polarguide.capture.colmap.model import load_model
+from polarguide.capture.filter.camera_files import Lens
+from polarguide.capture.view import listed
 from polarguide.capture.write import write_png
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, writing
@@ -25,21 +33,7 @@ from polarguide.core.progress import Reporter
 from polarguide.optics.color import srgb_encode_array
 
 _POLL_SECONDS = 0.5
-# COLMAP logs every picture and pair; what fails comes as an exception.
-_FATAL = 3
-_COUNT_ROWS = """
-import pathlib, sqlite3, sys, time
-link = pathlib.Path(sys.argv[1]).absolute().as_uri() + "?mode=ro"
-while True:
-    try:
-        database = sqlite3.connect(link, uri=True, timeout=0.1)
-        count = database.execute("SELECT COUNT(*) FROM " + sys.argv[2]).fetchone()[0]
-        database.close()
-        print(count, flush=True)
-    except sqlite3.Error:
-        print(0, flush=True)
-    time.sleep(1)
-"""
+_PROGRAM = Path(steps.__file__)
 
 
 def match_features(
@@ -51,6 +45,7 @@ def match_features(
     seed: int,
     reporter: Reporter,
     cameras: Mapping[str, PosedCamera] | None = None,
+    lenses: Mapping[str, Lens] | None = None,
     masks: Path | None = None,
 ) -> dict[str, tuple[int, int]]:
     """Extract features, match them, and write features, matches and two-view geometries into the database.
@@ -63,6 +58,7 @@ def match_features(
         seed: seed of all random draws.
         reporter: for progress.
         cameras: intrinsics by view, where they are known.
+        lenses: by view, as the files state them; views of one share their intrinsics.
         masks: folder of ``<view>.png``; features are extracted in white parts only. Views without a file have no mask.
 
     Returns:
@@ -71,32 +67,26 @@ def match_features(
     Raises:
         PolarguideError: COLMAP failed; the database is removed because it may be the cause.
     """
-    groups = _sharing_a_camera(sizes, cameras)
+    groups = _sharing_a_camera(sizes, cameras, lenses)
     count = len(sizes)
-    verify = pycolmap.TwoViewGeometryOptions()
-    set_seed(verify.ransac, seed)
-    compare = pycolmap.match_exhaustive if matching == "exhaustive" else pycolmap.match_sequential
     pairs = count * (count - 1) // 2 if matching == "exhaustive" else None
-    reading: dict[str, Any] = {}
-    if masks is not None and masks.is_dir() and any(masks.iterdir()):
-        reading["reader_options"] = pycolmap.ImageReaderOptions()
-        reading["reader_options"].mask_path = str(_named_for_colmap(masks, sizes))
+    where = {"database": str(database), "images": str(images)}
+    masked = masks is not None and masks.is_dir() and any(masks.iterdir())
+    extracted = {
+        "groups": [[f"{view}.png" for view in group] for group in groups],
+        "masks": str(_named_for_colmap(masks, sizes)) if masked and masks is not None else None,
+    }
+    numbers: dict[str, tuple[int, int]] = {}
     try:
-        with _counted_rows(database, "keypoints") as rows:
-            run_step(
-                lambda: _extract(database, images, groups, reading),
-                seed, reporter, "extracting features", count, rows,
-            )  # fmt: skip
-        numbers: dict[str, tuple[int, int]] = {}
+        done = functools.partial(_rows, database, "keypoints")
+        run_step("extract", where | extracted, seed, reporter, "extracting features", count, done)
         if cameras is not None:
-            numbers = run_step(
-                lambda: _write_intrinsics(database, cameras), seed, reporter, "setting intrinsics"
-            )
-        with _counted_rows(database, "two_view_geometries") as rows:
-            run_step(
-                lambda: compare(database, verification_options=verify),
-                seed, reporter, "matching pairs", pairs, rows,
-            )  # fmt: skip
+            numbers = _write_intrinsics(database, cameras)
+        elif len(groups) > 1 and lenses:
+            _begin_with_focal_lengths(database, groups, lenses)
+        done = functools.partial(_rows, database, "two_view_geometries")
+        matched = {"database": str(database), "matching": matching}
+        run_step("match", matched, seed, reporter, "matching pairs", pairs, done)
     except PolarguideError:
         for path in database.parent.glob(f"{database.name}*"):
             with contextlib.suppress(OSError):
@@ -106,26 +96,39 @@ def match_features(
 
 
 def _sharing_a_camera(
-    sizes: Mapping[str, tuple[int, int]], cameras: Mapping[str, PosedCamera] | None
+    sizes: Mapping[str, tuple[int, int]],
+    cameras: Mapping[str, PosedCamera] | None,
+    lenses: Mapping[str, Lens] | None = None,
 ) -> list[list[str]]:
-    """The views, in groups that share their intrinsics: those of one size, as where a camera was held upright or not.
+    """The views, in groups that share their intrinsics: those of one lens and size, as where a camera was held upright
+    or not.
 
     Known intrinsics that differ are each view's own.
     """
     if cameras is not None and len({camera.intrinsics for camera in cameras.values()}) > 1:
         return [[view] for view in sizes]
-    return [[view for view in sizes if sizes[view] == size] for size in dict.fromkeys(sizes.values())]
+    groups: dict[Any, list[str]] = {}
+    for view, size in sizes.items():
+        groups.setdefault((size, (lenses or {}).get(view)), []).append(view)
+    return list(groups.values())
 
 
-def _extract(database: Path, images: Path, groups: Sequence[Sequence[str]], reading: dict[str, Any]) -> None:
-    """Features of all pictures, with one camera for each group of views."""
-    mode = pycolmap.CameraMode.SINGLE
-    if all(len(group) == 1 for group in groups):
-        pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.PER_IMAGE, **reading)
-        return
-    for group in groups:
-        names = [f"{view}.png" for view in group]
-        pycolmap.extract_features(database, images, image_names=names, camera_mode=mode, **reading)
+def _begin_with_focal_lengths(
+    database: Path, groups: Sequence[Sequence[str]], lenses: Mapping[str, Lens]
+) -> None:
+    """Begin with focal lengths in the ratio that the files state, around the one that COLMAP begins with."""
+    stated = [lens.focal if (lens := lenses.get(group[0])) is not None else None for group in groups]
+    known = [focal for focal in stated if focal]
+    with pycolmap.Database.open(database) as link:
+        for group, focal in zip(groups, stated, strict=True):
+            if focal:
+                image = link.read_image_with_name(f"{group[0]}.png")
+                assert image is not None
+                camera = link.read_camera(image.camera_id)
+                params: Any = np.array(camera.params)
+                params[list(camera.focal_length_idxs())] *= focal / median(known)
+                camera.params = params
+                link.update_camera(camera)
 
 
 def _named_for_colmap(masks: Path, sizes: Mapping[str, tuple[int, int]]) -> Path:
@@ -155,95 +158,77 @@ def _write_intrinsics(database: Path, cameras: Mapping[str, PosedCamera]) -> dic
 
 
 def run_step(
-    work: Callable[[], Any],
+    step: str,
+    arguments: Mapping[str, Any],
     seed: int,
     reporter: Reporter,
     label: str,
     total: int | None = None,
-    done: Callable[[], int] = lambda: 0,
+    done: Callable[[], int] | None = None,
 ) -> Any:
-    """Run a step of COLMAP in a thread, so that progress is shown and Ctrl-C ends the program at once.
+    """Run a step of COLMAP in a process of its own, which is ended where this call is left early.
 
     Args:
-        work: the step. seed: of COLMAP's generators.
+        step, arguments: one of ``steps.STEPS``. seed: of COLMAP's generators.
         reporter: for progress, under the name ``label``.
         total: number of units of work; None if it is unknown.
-        done: returns the number of finished units.
+        done: returns the number of finished units; None: the step says it itself.
+
+    Returns:
+        The value that the step returns.
 
     Raises:
         PolarguideError: the step failed.
     """
-    outcome: dict[str, Any] = {}
+    answers: list[Any] = []
 
-    def target() -> None:
-        level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, _FATAL
-        try:
-            pycolmap.set_random_seed(seed)  # each thread has its own generator
-            outcome["value"] = work()
-        except Exception as error:  # whatever C++ threw
-            outcome["error"] = error
-        finally:
-            pycolmap.logging.minloglevel = level
+    def listen(lines: Iterable[str]) -> None:
+        answers.extend(json.loads(line) for line in lines)
 
-    thread = threading.Thread(target=target, daemon=True)
-    with reporter.track(label, total) as advance:
-        thread.start()
-        while thread.is_alive():
-            thread.join(_POLL_SECONDS)
-            advance(done())
-    if "error" in outcome:
-        message = str(outcome["error"]).strip().splitlines() or [type(outcome["error"]).__name__]
+    process = subprocess.Popen(
+        [sys.executable, str(_PROGRAM)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL, text=True, start_new_session=True,
+    )  # fmt: skip
+    assert process.stdin is not None
+    assert process.stdout is not None
+    listener = threading.Thread(target=listen, args=(process.stdout,), daemon=True)
+    try:
+        with reporter.track(label, total) as advance:
+            request = {"step": step, "seed": seed, "arguments": dict(arguments)}
+            with contextlib.suppress(BrokenPipeError):  # what ended it is told below
+                process.stdin.write(json.dumps(request) + "\n")
+                process.stdin.flush()
+            listener.start()
+            while listener.is_alive():
+                listener.join(_POLL_SECONDS)
+                counts = [answer for answer in answers if isinstance(answer, int)]
+                advance(counts[-1] if counts and done is None else done() if done is not None else 0)
+            process.wait()
+    finally:
+        process.kill()
+        process.wait()
+        process.stdin.close()
+        process.stdout.close()
+    last = answers[-1] if answers and isinstance(answers[-1], dict) else {}
+    if "value" not in last:
         raise PolarguideError(
             label,
             expected="COLMAP to succeed",
-            found=message[0].rstrip("."),
+            found=last.get("error", f"its process ended with status {process.returncode}"),
             remedy="Repeat the command, or bring a model with --poses PATH.",
-        ) from outcome["error"]
-    return outcome["value"]
+        )
+    return last["value"]
 
 
-def set_seed(options: Any, seed: int) -> None:
-    """Set the seed of COLMAP's options, if this version of COLMAP has one."""
-    if hasattr(options, "random_seed"):
-        options.random_seed = seed
-
-
-def pipeline_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
-    """The options of mapping and triangulation, with all of their seeds."""
-    options = pycolmap.IncrementalPipelineOptions()
-    for part in (options, options.mapper, options.triangulation):
-        set_seed(part, seed)
-    return options
-
-
-@contextlib.contextmanager
-def _counted_rows(database: Path, table: str) -> Iterator[Callable[[], int]]:
-    """Counts the rows of a table from a process of its own; yields a function that returns the latest count.
-
-    COLMAP brings its own copy of SQLite. Two copies in one process undo each other's file locks (those of POSIX
-    belong to processes), and the database is destroyed: it must never be opened, nor even closed, from here.
-    """
-    rows = 0
-    command = [sys.executable, "-I", "-S", "-c", _COUNT_ROWS, str(database), table]
-
-    def listen(lines: Iterable[str]) -> None:
-        nonlocal rows
-        for line in lines:
-            rows = max(rows, int(line))
-
-    try:
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-    except OSError:  # without a second process there is no progress, but all else
-        yield lambda: 0
-        return
-    with process:
-        listener = threading.Thread(target=listen, args=(process.stdout,), daemon=True)
-        listener.start()
-        try:
-            yield lambda: rows
-        finally:
-            process.kill()
-            listener.join()
+def _rows(database: Path, table: str) -> int:
+    """How many rows a table of the database has; 0 where another process keeps it to itself."""
+    link = f"{database.absolute().as_uri()}?mode=ro"
+    with (
+        contextlib.suppress(sqlite3.Error),
+        contextlib.closing(sqlite3.connect(link, uri=True, timeout=0.1)) as opened,
+    ):
+        return int(opened.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+    return 0
 
 
 SAMPLE = 7
@@ -293,8 +278,7 @@ def connected_views(database: Path, sizes: Mapping[str, tuple[int, int]]) -> int
 _FEW_SHARE = 0.8
 # With a smaller share of the views, mapping is tried again with fewer matches.
 _ENOUGH_SHARE = 0.9
-_WEAK_PAIR, _WEAK_START, _WEAK_POSE = 10, 50, 15
-LEAST_VIEWS = 3
+LEAST_VIEWS = steps.LEAST_VIEWS
 ADVICE = (
     "Take more pictures between those that are left out and their neighbors (15 degrees or less apart), put a textured "
     "ground under the object, and remove blurred pictures."
@@ -328,6 +312,7 @@ def reconstruct(
     untried: str,
     intrinsics: tuple[str, tuple[float, ...]] | None = None,
     refine: bool = True,
+    lenses: Mapping[str, Lens] | None = None,
 ) -> Path:
     """Estimate poses, intrinsics and points from ``folder/images/<view>.png``.
 
@@ -344,9 +329,11 @@ def reconstruct(
         untried: the options that may connect more views, for messages.
         intrinsics: model and parameters of all pictures, where they are known.
         refine: whether to refine known intrinsics.
+        lenses: by view, as the files state them.
 
     Returns:
-        The folder of the model, with one camera for pictures of one size: of the model given, or SIMPLE_RADIAL.
+        The folder of the model, with one camera for pictures of one lens and size: of the model given, or
+        SIMPLE_RADIAL.
 
     Raises:
         NotConnectedError: fewer than three views were registered, or than matches connect better than by chance.
@@ -356,13 +343,18 @@ def reconstruct(
     if model.is_dir():
         return model
     database, images, trial = folder / "database.db", folder / "images", folder / "models"
+    if lenses:
+        reporter.say(
+            _several_lenses(lenses, "each has its own" if intrinsics is None else "all are as given")
+        )
     cameras = None
     if intrinsics is not None:
         still = np.eye(3), np.zeros(3)
         cameras = {view: PosedCamera(*size, *intrinsics, *still) for view, size in sizes.items()}
     match_features(
         database, images, sizes,
-        matching=matching, seed=seed, reporter=reporter, cameras=cameras, masks=folder / "masks",
+        matching=matching, seed=seed, reporter=reporter, cameras=cameras, lenses=lenses,
+        masks=folder / "masks",
     )  # fmt: skip
     free = intrinsics is None or refine
     models = _map(database, images, trial, len(sizes), seed, reporter, free, weak=False)
@@ -372,7 +364,7 @@ def reconstruct(
         )
         others = _map(database, images, trial, len(sizes), seed, reporter, free, weak=True)
         models = max(models, others, key=_registered)
-    best = max(models.values(), key=lambda candidate: candidate.num_reg_images(), default=None)
+    best = max(models, key=lambda candidate: candidate.num_reg_images(), default=None)
     registered = _registered(models)
     by_chance = best is not None and connected_views(database, sizes) < LEAST_VIEWS
     if best is None or registered < LEAST_VIEWS or by_chance:
@@ -398,9 +390,16 @@ def reconstruct(
     return model
 
 
-def _registered(models: dict[int, Any]) -> int:
+def _several_lenses(lenses: Mapping[str, Lens], intrinsics: str) -> str:
+    """That the pictures are of several lenses, for the user."""
+    counts = Counter(lenses.values())
+    words = [f"{lens.camera} {lens.focal or ''}: {count} views" for lens, count in counts.items()]
+    return f"EXIF states {len(counts)} cameras or focal lengths ({listed(words)}); intrinsics: {intrinsics}."
+
+
+def _registered(models: Sequence[Any]) -> int:
     """Views of the largest model."""
-    return max((model.num_reg_images() for model in models.values()), default=0)
+    return max((model.num_reg_images() for model in models), default=0)
 
 
 def _map(
@@ -413,24 +412,16 @@ def _map(
     free: bool,
     *,
     weak: bool,
-) -> dict[int, Any]:
-    """Incremental mapping: pycolmap's models, by number; ``free`` intrinsics are estimated.
-
-    ``weak`` asks for half as many matches as COLMAP usually does: small pictures have few, and fewer still where
-    reflections change from shot to shot behind a filter.
-    """
+) -> list[Any]:
+    """Incremental mapping, see ``steps.place``: pycolmap's models."""
     shutil.rmtree(trial, ignore_errors=True)
     make_folder(trial)
-    options = pipeline_options(seed)
-    options.min_model_size = LEAST_VIEWS
-    if weak:
-        options.min_num_matches, options.mapper.init_min_num_inliers = _WEAK_PAIR, _WEAK_START
-        options.mapper.abs_pose_min_num_inliers = _WEAK_POSE
-    options.ba_refine_focal_length = options.ba_refine_extra_params = free
-    placed: list[None] = []
-    step = functools.partial(placed.append, None)
-    models: dict[int, Any] = run_step(
-        lambda: pycolmap.incremental_mapping(database, images, trial, options, next_image_callback=step),
-        seed, reporter, "registering images", count, lambda: len(placed) + 2 if placed else 0,
-    )  # fmt: skip
-    return models
+    arguments = {
+        "database": str(database),
+        "images": str(images),
+        "models": str(trial),
+        "free": free,
+        "weak": weak,
+    }
+    numbers = run_step("place", arguments, seed, reporter, "registering images", count)
+    return [load_model(trial / str(number), ".bin") for number in numbers]

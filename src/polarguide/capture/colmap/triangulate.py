@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.colmap.files import PosedCamera, colmap_camera, write_cameras
 from polarguide.capture.colmap.model import load_model
-from polarguide.capture.colmap.sfm import match_features, pipeline_options, run_step
+from polarguide.capture.colmap.sfm import match_features, run_step
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_picture
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, write_whole, writing
@@ -190,18 +190,13 @@ def _triangulated(
         )
         with writing(start):
             write_cameras(start, cameras, numbers)
-        model = load_model(start, ".bin")
-        options = pipeline_options(seed)
-        for name in ("focal_length", "principal_point", "extra_params"):
-            setattr(options, f"ba_refine_{name}", False)
-        made = run_step(
-            lambda: pycolmap.triangulate_points(model, database, images, trial, options=options),
-            seed, reporter, "triangulating",
-        )  # fmt: skip
+        arguments = {"database": database, "images": images, "start": start, "out": trial}
+        words = {name: str(path) for name, path in arguments.items()}
+        run_step("triangulate", words, seed, reporter, "triangulating")
     except PolarguideError as error:
         reporter.warn(f"Triangulation failed ({error.found}).")
         return 0, None
-    made.write_binary(str(trial))
+    made = load_model(trial, ".bin")
     count = len(made.points3D)
     return count, float(made.compute_mean_reprojection_error()) if count else None
 

@@ -245,6 +245,19 @@ def tags_of(data: bytes) -> dict[int, Any]:
 
 _MAKER, _MODEL, _DIRECTORY = 271, 272, 34665
 _TIME, _F_NUMBER, _ISO = 33434, 33437, 34855
+_FOCAL_LENGTH, _FOCAL_LENGTH_OF_FILM, _SERIAL_NUMBER, _LENS = 37386, 41989, 42033, 42036
+
+
+@dataclass(frozen=True)
+class Lens:
+    """The camera and the lens of a picture, as far as its file states them.
+
+    Attributes:
+        camera: in words. focal: focal length, in a unit that pictures of one ``camera`` share; None: not known.
+    """
+
+    camera: str
+    focal: float | None = None
 
 
 @dataclass(frozen=True)
@@ -253,10 +266,12 @@ class ExposureData:
 
     Attributes:
         camera: maker and model; empty where it does not say.
+        lens: body and lens, with the focal length in mm of the 35 mm film, else as it is.
         seconds, iso, f_number: of the exposure.
     """
 
     camera: str = ""
+    lens: Lens = Lens("")
     seconds: float | None = None
     iso: float | None = None
     f_number: float | None = None
@@ -302,7 +317,7 @@ def read_exposure_data(path: Path) -> ExposureData:
     # LibRaw's errors: whoever develops the file says what is wrong with it.
     with contextlib.suppress(Exception), libraw.imread(io.BytesIO(data)) as opened:
         other = opened.other  # which some versions of rawpy do not have
-        return _plausible("", other.shutter, other.iso_speed, other.aperture)
+        return _plausible("", Lens(""), other.shutter, other.iso_speed, other.aperture)
     return exposure
 
 
@@ -310,15 +325,52 @@ def exif_data(data: bytes) -> ExposureData:
     """Exposure data in the EXIF tags of a picture file; damaged tags count as missing."""
     tags = tags_of(data)
     names = (str(tags.get(tag, "")).partition("\0")[0].strip() for tag in (_MAKER, _MODEL))
-    return _plausible(
-        " ".join(filter(None, names)), *(number_of(tags.get(tag)) for tag in (_TIME, _ISO, _F_NUMBER))
-    )
+    camera = " ".join(filter(None, names))
+    exposure = (number_of(tags.get(tag)) for tag in (_TIME, _ISO, _F_NUMBER))
+    return _plausible(camera, _lens(camera, tags), *exposure)
 
 
-def _plausible(camera: str, seconds: float | None, iso: float | None, f_number: float | None) -> ExposureData:
+def _lens(camera: str, tags: dict[int, Any]) -> Lens:
+    """Bodies and lenses count as one where their focal lengths are stated: then these tell cameras apart."""
+    focal, of_film = (number_of(tags.get(tag)) for tag in (_FOCAL_LENGTH, _FOCAL_LENGTH_OF_FILM))
+    stated = [(unit, value) for unit, value in (("film", of_film), ("lens", focal)) if value and value > 0]
+    if stated:
+        return Lens(f"{camera} ({stated[0][0]})", stated[0][1])
+    more = (str(tags.get(tag, "")).partition("\0")[0].strip() for tag in (_SERIAL_NUMBER, _LENS))
+    return Lens(" ".join(filter(None, (camera, *more))))
+
+
+_FOCAL_AGREES = 0.01
+"""Relative difference of focal lengths that are one: tags are rounded, and lenses breathe with focus."""
+
+
+def camera_groups(paths: Mapping[str, Path]) -> dict[str, Lens]:
+    """The lens of each view, by its first file; focal lengths that agree become one. Empty where all have one lens.
+
+    Raises:
+        PolarguideError: a file cannot be read.
+    """
+    lenses = {view: read_exposure_data(path).lens for view, path in paths.items()}
+    alike: list[Lens] = []
+    groups: dict[str, Lens] = {}
+    for view in sorted(lenses, key=lambda view: (lenses[view].camera, lenses[view].focal or 0.0, view)):
+        lens, last = lenses[view], alike[-1] if alike else None
+        same = last is not None and lens.camera == last.camera
+        if same and last is not None and lens.focal and last.focal:
+            same = lens.focal < (1 + _FOCAL_AGREES) * last.focal
+        if not same:
+            alike.append(lens)
+        groups[view] = alike[-1]
+    return groups if len(alike) > 1 else {}
+
+
+def _plausible(
+    camera: str, lens: Lens, seconds: float | None, iso: float | None, f_number: float | None
+) -> ExposureData:
     """Exposure data without numbers that no camera has, such as the 0 of a lens that states no aperture."""
     return ExposureData(
         camera,
+        lens,
         seconds if seconds is not None and 0 < seconds < 1e5 else None,
         iso if iso is not None and 0 < iso < 1e8 else None,
         f_number if f_number is not None and 0.1 < f_number < 1000 else None,

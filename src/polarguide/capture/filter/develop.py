@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.formats.pictures import linear_codes
-from polarguide.capture.view import ANGLES, FULL_CODE
+from polarguide.capture.view import FULL_CODE
 from polarguide.capture.write import Rounding, rounding_of
+from polarguide.geometry.polarizer import ANGLES
 from polarguide.optics.color import srgb_decode_array
 
 SMALLEST = 0.2
@@ -47,6 +48,10 @@ class Shift:
         return self.trusted and (self.warp is not None or max(abs(self.x), abs(self.y)) >= SMALLEST)
 
 
+AGREEING = 0.05
+"""Mean |I0 + I90 - I45 - I135| / S0 up to which shots lie on one another; ``inspect`` calls more inconsistent."""
+
+
 def estimate_shifts(linear: NDArray[np.float32]) -> list[Shift]:
     """Estimate the shifts of the four shots relative to the first.
 
@@ -72,6 +77,8 @@ def estimate_shifts(linear: NDArray[np.float32]) -> list[Shift]:
     turned = [shifts[0], *(_turn(detail[0], detail[k], shifts[k]) for k in (1, 2, 3))]
     if turned != shifts and _disagreement(*align_shots(linear, whole, turned)) < _BETTER * least:
         return turned
+    if least < AGREEING:  # nothing moved, whatever the details say
+        return [shift if shift.trusted else Shift(0.0, 0.0, True) for shift in shifts]
     return shifts
 
 
@@ -132,12 +139,15 @@ def moved_shots(shifts: Sequence[Shift]) -> list[str]:
 
 
 def shift_notes(view: str, shifts: Sequence[Shift]) -> list[str]:
-    """Notes about shots that were shifted, and about shots without a reliable estimate."""
+    """Notes about shots that were moved back, and about shots that seem to have moved without a reliable estimate."""
     moved = moved_shots(shifts)
     doubtful = [str(angle) for angle, shift in zip(ANGLES, shifts, strict=True) if not shift.trusted]
     notes = [f"{view}: shots moved, in pixels: {', '.join(moved)}."] if moved else []
     if doubtful:
-        notes.append(f"{view}: no reliable shift of the shots at {', '.join(doubtful)}; used as they are.")
+        notes.append(
+            f"{view}: I0 + I90 and I45 + I135 differ, and no shift of the shots at {', '.join(doubtful)} explains it; "
+            "they are used as they are."
+        )
     return notes
 
 

@@ -281,7 +281,9 @@ class SingleShot:
     gain: float | None = None
 
 
-def find_single_shots(root: Path, angles: str | None = None) -> tuple[list[SingleShot], list[Path]]:
+def find_single_shots(
+    root: Path, angles: str | None = None, each: int = 1
+) -> tuple[list[SingleShot], list[Path]]:
     """The photographs of a folder, sorted by view, and the tables that were read.
 
     The angle of each comes from the option, else from ``angles.csv`` in the folder, else from the folders in it
@@ -292,6 +294,7 @@ def find_single_shots(root: Path, angles: str | None = None) -> tuple[list[Singl
         root: the folder.
         angles: "unknown" or "none" for all, angles in the order of the names such as 0,60,120 that repeat, or the path
             of a table.
+        each: consecutive photographs that are one view, called like the first, where the option says the angles.
 
     Raises:
         PolarguideError: a photograph has no angle or two, a file of the table does not exist, two photographs are one
@@ -306,7 +309,7 @@ def find_single_shots(root: Path, angles: str | None = None) -> tuple[list[Singl
             remedy="Leave out the option, or move the table away.",
         )
     if angles is not None and not angles.lower().endswith(".csv"):
-        shots = _all_alike(root, angles)
+        shots = _all_alike(root, angles, each)
         return _checked(root, shots), []
     if angles is not None or table.exists():
         table = Path(angles) if angles is not None else table
@@ -338,8 +341,8 @@ def find_single_shots(root: Path, angles: str | None = None) -> tuple[list[Singl
     return _checked(root, shots), []
 
 
-def _all_alike(root: Path, angles: str) -> list[SingleShot]:
-    """Photographs whose angles an option says: one word for all, or numbers that repeat."""
+def _all_alike(root: Path, angles: str, each: int) -> list[SingleShot]:
+    """Photographs whose angles an option says: one word for all, or numbers that repeat; ``each`` to a view."""
     repeating = [parse_angle(part) for part in angles.split(",")]
     if any(angle is None for angle in repeating):
         raise PolarguideError(
@@ -349,17 +352,18 @@ def _all_alike(root: Path, angles: str) -> list[SingleShot]:
             remedy="Give one of these four.",
         )
     files = list(index_files(root, SHOT_SUFFIXES).values())
-    if len(files) % len(repeating):
+    period = max(each, len(repeating))
+    if len(files) % period or len(repeating) not in (1, period):
         raise PolarguideError(
             "--angles",
-            expected=f"a number of photographs divisible by {len(repeating)}, because these angles repeat",
-            found=f"{len(files)} in {root}",
+            expected=f"a number of photographs divisible by {period}, and one angle or {period} of them, which repeat",
+            found=f"{len(files)} in {root} and {len(repeating)} angles",
             remedy=f"Add or remove photographs, or list the angle of each in {TABLE}.",
         )
     repeated = [repeating[number % len(repeating)] for number in range(len(files))]
     return [
-        SingleShot(path, path.stem, angle)
-        for path, angle in zip(files, repeated, strict=True)
+        SingleShot(path, files[number - number % each].stem, angle)
+        for number, (path, angle) in enumerate(zip(files, repeated, strict=True))
         if angle is not None
     ]
 

@@ -1,0 +1,170 @@
+"""Pictures that follow one another: shots of one place through a filter, and frames of a video."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.filter.camera_files import is_camera_raw, read_camera_raw
+from polarguide.capture.formats.pictures import decode_picture, read_picture
+from polarguide.capture.write import write_png
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import make_folder, write_text
+from polarguide.core.progress import Reporter
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+MOST_SHOTS = 12
+"""Shots of one place that are looked for: every 15 degrees of half a turn."""
+_SAMPLED = 24
+_SIDE = 96
+_BLUR = 4.0
+_APART = 2.0
+"""Times by which pictures of two places differ more than those of one, at least."""
+
+
+def shots_of_one_place(paths: Sequence[Path]) -> int | None:
+    """How many consecutive pictures show one place, by what they show; None where they do not come in such groups.
+
+    A filter that is turned changes reflections, but no edge moves. So pictures that follow one another are compared
+    without what is smooth in them, and groups are those inside which they differ much less than from group to group.
+    Only the first pictures are looked at.
+
+    Raises:
+        PolarguideError: one cannot be read.
+    """
+    count = len(paths)
+    sizes = [size for size in range(2, MOST_SHOTS + 1) if count % size == 0 and count // size >= 3]
+    if not sizes:
+        return None
+    pictures = [_edges(path) for path in paths[: max(_SAMPLED, 3 * max(sizes))]]
+    steps = np.array([_difference(a, b) for a, b in itertools.pairwise(pictures)])
+    places = np.arange(1, len(steps) + 1)
+    for size in sizes:
+        between = places % size == 0
+        if np.percentile(steps[between], 10) > _APART * np.percentile(steps[~between], 90):
+            return size
+    return None
+
+
+def _edges(path: Path) -> NDArray[np.float32]:
+    """A small gray picture without what is smooth, of deviation 1."""
+    raw = is_camera_raw(path)
+    pixels = read_camera_raw(path, (1.0, 1.0, 1.0))[0] if raw else decode_picture(path, read_picture(path))
+    gray = np.sqrt(pixels.mean(axis=2, dtype=np.float32))
+    small = cv2.resize(gray, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
+    fine = small - cv2.GaussianBlur(small, (0, 0), _BLUR)
+    return np.asarray(fine / max(float(fine.std()), 1e-6), np.float32)
+
+
+def _difference(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
+    """One minus the correlation."""
+    return 1.0 - float((first * second).mean())
+
+
+FRAMES_A_SECOND = 2.0
+"""Frames that are taken of a video: walking around a subject within a minute, the camera turns by 3 degrees."""
+LEAST_FRAMES, MOST_FRAMES = 24, 120
+_RECORD = "video.txt"
+
+
+def find_videos(root: Path) -> list[Path]:
+    """The videos in a folder, or the file itself if it is one."""
+    files = [root] if root.is_file() else sorted(root.iterdir()) if root.is_dir() else []
+    return [path for path in files if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES]
+
+
+def extract_frames(video: Path, folder: Path, reporter: Reporter) -> int:
+    """Write frames of a video as PNG, upright: of equal spans of time the sharpest each; returns how many.
+
+    Frames that an earlier call has written of the same video are kept.
+
+    Raises:
+        PolarguideError: OpenCV cannot read the video, or it has too few frames.
+    """
+    status = video.stat()
+    record = f"{video.resolve()} {status.st_size} {status.st_mtime_ns}\n"
+    done = folder / _RECORD
+    if done.is_file() and done.read_text() == record:
+        return len(list(folder.glob("frame_*.png")))
+    if folder.exists() and any(folder.iterdir()) and not done.is_file():
+        raise PolarguideError(
+            folder, expected="a new folder for the frames of the video", found="other files",
+            remedy="Choose another --out: the frames go into a folder beside it.",
+        )  # fmt: skip
+    reader = cv2.VideoCapture(str(video))
+    total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
+    rate = reader.get(cv2.CAP_PROP_FPS) or 25.0
+    wanted = int(np.clip(FRAMES_A_SECOND * total / rate, LEAST_FRAMES, MOST_FRAMES))
+    if total < 3:
+        raise PolarguideError(
+            video, expected="a video that OpenCV reads", found=f"{max(total, 0)} frames",
+            remedy="Convert it to H.264 in .mp4, or save its frames as pictures.",
+        )  # fmt: skip
+    make_folder(folder)
+    write_text(done, "unfinished\n")
+    for old in folder.glob("frame_*.png"):
+        old.unlink()
+    best: tuple[int, float, NDArray[np.uint8]] | None = None
+    written = 0
+    with reporter.track("taking frames", total) as advance:
+        for number in range(total):
+            read, picture = reader.read()
+            if not read:
+                break
+            span = number * wanted // total
+            if best is not None and best[0] != span:
+                written += _write(folder, written, best[2])
+                best = None
+            sharpness = float(cv2.Laplacian(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), cv2.CV_32F).var())
+            if best is None or sharpness > best[1]:
+                best = span, sharpness, np.asarray(picture, np.uint8)
+            advance(number + 1)
+    reader.release()
+    written += 0 if best is None else _write(folder, written, best[2])
+    write_text(done, record)
+    return written
+
+
+def _write(folder: Path, number: int, picture: NDArray[np.uint8]) -> int:
+    write_png(folder / f"frame_{number:04d}.png", np.ascontiguousarray(picture[..., ::-1]))
+    return 1
+
+
+_MANY = 100
+"""Pictures of which all pairs are compared, 4950, whatever their names."""
+_NUMBERED = re.compile(r"(?P<name>.*?)(?P<number>\d+)")
+_NEIGHBORS = 20
+"""Pictures that COLMAP compares each with: the next ten, and some at distances of powers of two."""
+
+
+def chosen_matching(views: Sequence[str], matching: str, reporter: Reporter) -> str:
+    """ "exhaustive" or "sequential", with a line for the user where ``auto`` decides for neighbors, or could save much.
+
+    Args:
+        views: names in their order. matching: as asked for. reporter: for the line.
+    """
+    if matching != "auto":
+        return matching
+    names = [_NUMBERED.fullmatch(view) for view in views]
+    numbers = [int(name["number"]) for name in names if name is not None]
+    running = len(numbers) == len(views) and len({name["name"] for name in names if name is not None}) == 1
+    running = running and numbers[-1] - numbers[0] < 2 * len(numbers)
+    frames = running and views[0].lower().startswith("frame")
+    pairs = len(views) * (len(views) - 1) // 2
+    few = _NEIGHBORS * len(views)
+    if pairs > few and (frames or (running and len(views) > _MANY)):
+        kind = "frames of a video" if frames else "running numbers"
+        reporter.say(
+            f"Matching: about {few} pairs of neighbors ({kind}); --matching exhaustive compares all {pairs}."
+        )
+        return "sequential"
+    if pairs > 2 * few or (running and pairs > few):
+        ordered = "If pictures that follow one another by name overlap, --matching sequential compares about"
+        reporter.say(f"Matching: all {pairs} pairs. {ordered} {few}.")
+    return "exhaustive"

@@ -1,0 +1,133 @@
+"""Checks that compare views with one another at the points of the model: their exposures, and their focal lengths."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from polarguide.capture.colmap.model import ColmapModel
+from polarguide.capture.point_exposures import significant
+from polarguide.capture.view import listed
+from polarguide.inspection.capture import Capture
+from polarguide.inspection.settings import Check, Verdict
+
+FEWEST = 50
+"""Points from which on a focal length is estimated."""
+FOCAL_DIFFERS, FOCAL_WRONG = 0.01, 0.05
+"""Differences of the logarithm of a focal length: 1 % turns a ray at 30 degrees by 0.25 degrees."""
+TO_DEVIATION = 1.4826
+STEP = 1 / 3
+"""Stops by which cameras set exposures: with a larger error, equal exposures are not confirmed."""
+
+
+def view_exposure_check(capture: Capture) -> Check:
+    """Check whether the views were exposed and white-balanced alike."""
+    key, title = "view_exposure", "Equal exposure of the views"
+    exposures = capture.exposures
+    if exposures is None or not np.isfinite(exposures.logs).any():
+        return Check(key, title, "n/a", "No points that views have in common are stored in the model.")
+    logs = exposures.significant / math.log(2)
+    known = np.isfinite(logs).all(axis=1)
+    size = np.where(known, np.abs(logs).max(axis=1), 0.0)
+    strongest = [int(k) for k in np.argsort(-size) if size[k] > 0]
+    names = [view.name for view in capture.views]
+    errors = [float(np.median(e[known])) / math.log(2) for e in (exposures.errors, exposures.color_errors)]
+    figures = {
+        "stops": {names[k]: [float(value) for value in logs[k]] for k in np.flatnonzero(known)},
+        "error_stops": errors[0],
+        "color_error_stops": errors[1],
+        "unknown": int((~known).sum()),
+    }
+    precision = f"to {errors[0]:.2f} stops, colors to {errors[1]:.2f}"
+    if not strongest and errors[0] > STEP:
+        finding = (
+            f"The points that views have in common are too few to compare their exposures ({precision})."
+        )
+        return Check(
+            key, title, "not verified", finding, "Add views between those there are.", figures=figures
+        )
+    if not strongest:
+        finding = f"The points that views have in common are equally bright in all of them ({precision})."
+        return Check(key, title, "ok", finding, figures=figures)
+    told = [f"{names[k]} {logs[k][np.abs(logs[k]).argmax()]:+.2f}" for k in strongest]
+    remedy = (
+        "prepare --gains none left them. Prepare without it, and training divides each color of a view by its gain."
+        if capture.keeps_gains
+        else "Training and evaluation divide each color of these views by its gain."
+    )
+    return Check(
+        key, title, "warning",
+        f"{len(strongest)} of {len(names)} views were exposed or white-balanced otherwise than the mean, by points in "
+        f"common ({precision}). Stops: {listed(told)}.",
+        f"{remedy} Next time, fix exposure and white balance.",
+        tuple(names[k] for k in strongest), figures,
+    )  # fmt: skip
+
+
+def lens_check(capture: Capture) -> Check:
+    """Check whether each view alone agrees with the focal length that the model has for it."""
+    key, title = "focal_lengths", "Focal lengths"
+    if capture.model is None:
+        return Check(key, title, "n/a", "There are no poses.")
+    found = {
+        view.name: alone
+        for view in capture.posed
+        if (alone := _focal_length_alone(capture.model, view.name)) is not None
+    }
+    if len(found) < 3:
+        why = f"Fewer than 3 views have {FEWEST} points with their places in the pictures."
+        return Check(key, title, "n/a", why)
+    names = list(found)
+    logs, errors = np.array(list(found.values())).T
+    off = significant(np.abs(logs), errors) & (np.abs(logs) > FOCAL_DIFFERS)
+    usual = float(np.sqrt(np.mean(logs**2)))
+    figures = {"rms": usual, "views": dict(zip(names, (np.exp(logs) - 1).tolist(), strict=True))}
+    finding = (
+        f"Where the points hold and a view alone is free, its focal length changes by {usual:.1%} (rms)."
+    )
+    if not off.any():
+        return Check(key, title, "ok", finding, figures=figures)
+    order = [int(k) for k in np.argsort(-np.abs(logs)) if off[k]]
+    told = listed([f"{names[k]} {math.expm1(logs[k]):+.1%}" for k in order])
+    verdict: Verdict = "wrong" if np.abs(logs[off]).max() > FOCAL_WRONG else "warning"
+    return Check(
+        key, title, verdict, f"{finding} It contradicts the model in {len(order)} views ({told}).",
+        "Poses are wrong where several cameras were taken for one: a telephone that changed its lens, a zoom, a crop. "
+        "Prepare the original files, whose EXIF tells them apart, or bring a model with a camera for each.",
+        tuple(names[k] for k in order), figures,
+    )  # fmt: skip
+
+
+def _focal_length_alone(model: ColmapModel, view: str) -> tuple[float, float] | None:
+    """Logarithm of a view's own focal length over the model's, and its standard error; None with too few points.
+
+    The points hold; pose and focal length minimize the distances in the picture. The error assumes independent
+    distances of the deviation that they have.
+    """
+    pixels, places = model.correspondences(view)
+    if len(pixels) < FEWEST:
+        return None
+    camera = model.camera(view)
+    local = places @ camera.rotation.numpy().T + camera.translation.numpy()
+    if not (local[:, 2] > 0).all():
+        return None
+    middle, depth = local.mean(axis=0), float(np.median(local[:, 2]))
+    focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+
+    def distances(change: NDArray[np.float64]) -> NDArray[Any]:
+        turned = (local - middle) @ Rotation.from_rotvec(change[:3]).as_matrix().T
+        moved = turned + middle + depth * change[3:6]
+        seen = moved[:, :2] / moved[:, 2:] * np.exp(change[6]) * focal + center
+        return np.asarray((seen - pixels).ravel())
+
+    fitted = least_squares(distances, np.zeros(7), loss="soft_l1")
+    deviation = TO_DEVIATION * float(np.median(np.abs(fitted.fun)))
+    normal = fitted.jac.T @ fitted.jac
+    if np.linalg.cond(normal) > 1e12:
+        return None
+    return float(fitted.x[6]), deviation * math.sqrt(float(np.linalg.inv(normal)[6, 6]))
