@@ -364,6 +364,7 @@ def save_to_run(run: OpenedRun, chosen: Presentation) -> str:
         fields[name] = None if value == inherited else value
         if value is None and inherited is not None:
             unchanged.append(name)
+    fields["whole"] = own.whole and chosen.crop is None
     write_presentation(run.folder, msgspec.structs.replace(own, **fields))
     if unchanged:
         return f"Saved; the scene's own {', '.join(unchanged)} still counts"
