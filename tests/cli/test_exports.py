@@ -21,11 +21,13 @@ from scipy.spatial import cKDTree
 import polarguide
 from polarguide.cli.app import run
 from polarguide.core import errors
-from polarguide.core.errors import install_package
+from polarguide.core.errors import PolarguideWarning, install_package
 from polarguide.gaussians.ply import read_ply
 from polarguide.geometry.camera import seen_at
 from polarguide.geometry.trajectory import camera_record
 from polarguide.results.export import mesh
+from polarguide.results.rendering.film import path_cameras
+from polarguide.results.rendering.subject import subject_of
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
 
 ONE = ("--threads", "1")
@@ -176,6 +178,13 @@ def test_cameras_are_read_by_pycolmap_and_as_opengl_poses(trained: Path, tmp_pat
         np.testing.assert_allclose(pose[:3, 1], -camera.rotation[1].numpy())  # y is up
 
 
+def frames_of(video: Path) -> list[np.ndarray]:
+    film, pictures = cv2.VideoCapture(str(video)), []
+    while (read := film.read())[0]:
+        pictures.append(read[1])
+    return pictures
+
+
 def test_a_video_of_an_orbit_and_pictures_of_a_file(trained: Path, tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     video = tmp_path / "orbit.mp4"
@@ -183,9 +192,7 @@ def test_a_video_of_an_orbit_and_pictures_of_a_file(trained: Path, tmp_path: Pat
     assert (
         run(["render", str(trained), "--path", "orbit", "--frames", "5", "--video", str(video), *flags]) == 0
     )
-    film, pictures = cv2.VideoCapture(str(video)), []
-    while (read := film.read())[0]:
-        pictures.append(read[1])
+    pictures = frames_of(video)
     camera = next(iter(polarguide.open_run(trained).cameras.values()))
     assert {picture.shape for picture in pictures} == {(camera.height // 2 * 2, 3 * camera.width // 2 * 2, 3)}
     assert len(pictures) == 5
@@ -194,6 +201,70 @@ def test_a_video_of_an_orbit_and_pictures_of_a_file(trained: Path, tmp_path: Pat
     path.write_text(json.dumps({"cameras": [camera_record(camera)] * 2}))
     assert run(["render", str(trained), "--path", str(path), "--out", str(tmp_path / "out"), *flags]) == 0
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["path_00000.png", "path_00001.png"]
+
+
+def test_a_film_has_the_size_that_was_asked_for_and_names_its_layers(trained: Path, tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    path = ("--path", "turntable", "--frames", "2", "--size", "401x240")
+    film, alone = tmp_path / "film.mp4", tmp_path / "alone.mp4"
+    assert run(["render", str(trained), *path, "--layers", "alpha,final", "--video", str(film), *ONE]) == 0
+    assert run(["render", str(trained), *path, "--layers", "alpha", "--video", str(alone), *ONE]) == 0
+    pictures = frames_of(film)
+    assert [picture.shape for picture in pictures] == [(240, 400, 3)] * 2, "H.264 takes even sides"
+    corner = pictures[0][:20, 200:260].astype(int)
+    assert corner.max() > 200, "a name in white"
+    assert frames_of(alone)[0][:20, :60].max() < 250, "one layer needs no name"
+
+
+def test_a_turntable_holds_the_subject_from_all_sides(trained: Path) -> None:
+    opened = polarguide.open_run(trained)
+    means = opened.gaussians["means"]
+    inner = means[subject_of(opened).holds(means)].double()
+    cameras, _ = path_cameras(opened, "turntable", 5, (160, 90))
+    for camera in cameras:
+        assert (camera.width, camera.height) == (160, 90)
+        assert float(seen_at(inner - camera.center, camera)[2].double().mean()) > 0.85
+    heights = [float((camera.center - opened.frame.center) @ opened.frame.up) for camera in cameras]
+    np.testing.assert_allclose(heights, heights[0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--size", "wide", "--path", "orbit"], ["--size", "64x48"], ["--size", "64x48", "--path", "FILE"]],
+)
+def test_sizes_that_do_not_fit_are_refused(words: list[str], trained: Path, refused, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    camera = next(iter(polarguide.open_run(trained).cameras.values()))
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps({"cameras": [camera_record(camera)]}))
+    words = [str(file) if word == "FILE" else word for word in words]
+    assert "size" in refused("render", trained, *words, "--video", tmp_path / "x.mp4", *ONE)
+
+
+def test_a_scene_that_was_moved(copy: Path, demo_scene: Path, refused, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    """The error says that the run names the place; the command that it names points the run to the new one."""
+    edit(copy, scene=str(tmp_path / "was here"))
+    remedy = f"polarguide present {copy} --scene NEWPLACE"
+    for verb in ("eval", "view", "render", "share"):
+        line = refused(verb, copy, *ONE)
+        assert f"expected the scene of {copy}, whose run.json names this place, found nothing" in line
+        assert remedy in line
+    with pytest.warns(PolarguideWarning, match="--scene NEWPLACE"):
+        polarguide.open_run(copy).export("ply", tmp_path / "out")
+    moved = shutil.copytree(demo_scene, tmp_path / "new place")
+    assert run(["present", str(copy), "--scene", str(moved)]) == 0
+    assert run(["share", str(copy), *ONE]) == 0
+    assert json.loads((copy / CONFIGURATION).read_text())["scene"] == str(moved)
+
+
+def test_another_scene_is_not_taken_for_a_moved_one(
+    copy: Path, demo_scene: Path, refused, tmp_path: Path
+) -> None:  # type: ignore[no-untyped-def]
+    other = Path(shutil.copytree(demo_scene, tmp_path / "other"))
+    first, second = sorted((other / "polar").iterdir())[:2]
+    shutil.copy(second, first)
+    before = (copy / CONFIGURATION).read_text()
+    assert "another, or one that has changed" in refused("present", copy, "--scene", other)
+    assert (copy / CONFIGURATION).read_text() == before
 
 
 @pytest.mark.parametrize(

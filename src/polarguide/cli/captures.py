@@ -218,6 +218,8 @@ def present(
         device=compute.device,
         reporter=ConsoleReporter(),
     )
+    if scene is not None:
+        say(f"the scene of {folder} is {scene}")
     for line in presenting.described(presented):
         say(line)
 

@@ -122,6 +122,8 @@ def print_scores(record: dict[str, Any], title: str) -> None:
     for label, text in metrics.shown_metrics(record):
         table.add_row(label, Text(printable(text)))
     console.print(table)
+    for line in metrics.explained(record):
+        say(line)
     if absent := metrics.absent_metrics(record):
         say(f"no ground truth, or no such layer, for: {', '.join(absent)}")
     if record["objects"]:

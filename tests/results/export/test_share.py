@@ -23,7 +23,14 @@ REFLECTING = ["final", "diffuse", "specular", "base", "strength", "normal"]
 LAYERS = {
     "plain": ["final", "normal"],
     "reflection": REFLECTING,
-    "local": [*REFLECTING, "roughness"],
+    "local": [
+        "final",
+        "diffuse",
+        "specular",
+        "strength",
+        "normal",
+        "roughness",
+    ],  # its base is the diffuse layer
     "directional": ["final", "diffuse", "specular", "base", "normal"],
 }
 TEXELS = {"plain": 6, "reflection": 6, "local": 10, "directional": 4}

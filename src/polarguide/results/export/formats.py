@@ -1,4 +1,4 @@
-"""A run as the files of other programs, and as a web page."""
+"""A run as the files of other programs."""
 
 from __future__ import annotations
 
@@ -33,8 +33,6 @@ from polarguide.core.options import (
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.fields.model import FieldModel
 from polarguide.optics.color import srgb_encode
-from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
-from polarguide.results.evaluation.table import shown_metrics
 from polarguide.results.export.cameras import write_cameras
 from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
 from polarguide.results.export.model.build import BASE_COLORS, Charted, charted_subject, textured_model
@@ -49,7 +47,6 @@ from polarguide.results.export.placement import (
     rewrite_splats,
 )
 from polarguide.results.export.presented import Presented
-from polarguide.results.export.share import share_page
 from polarguide.results.export.splat_glb import COLOR_SPACES, Encoding, write_splat_glb
 from polarguide.results.export.splats import write_sog, write_spz
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
@@ -140,64 +137,6 @@ def export(
     make_folder(folder)
     with reporter.track(f"writing {format}", None):
         return writers[format]()
-
-
-def share(
-    run: OpenedRun,
-    path: PathLike | None = None,
-    *,
-    title: str = "",
-    caption: str = "",
-    reporter: Reporter = SILENT,
-) -> Path:
-    """Write a run as one web page that renders it with its reflections, and needs nothing beside itself.
-
-    The photographs' poses are its views; the first test view is where it begins.
-
-    Args:
-        run: the run; its scene is read.
-        path: file to write, ending in .html; ``share.html`` in the run's folder by default.
-        title: heading of the page; that of the presentation, or the scene's name, by default.
-        caption: text below it; the recipe and its steps by default. The word about polarization follows.
-        reporter: receives a line about what is cut.
-
-    Returns:
-        The file's path.
-
-    Raises:
-        PolarguideError: a name that ends in something else, or scores that cannot be read.
-    """
-    path = run.folder / "share.html" if path is None else Path(path)
-    if path.suffix.lower() not in (".html", ".htm"):
-        raise PolarguideError(
-            "out", expected="a name that ends in .html", found=str(path), remedy="Choose such a name."
-        )
-    model = run.gaussian_model("share")
-    presented = Presented(run, reporter=reporter)
-    assert presented.gaussians is not None
-    views = run.scene.test_views + run.scene.train_views
-    scored = (run.folder / METRICS_FILE).exists()
-    scores = shown_metrics(read_metrics(run.folder), scores_only=True) if scored else []
-    health = run.health
-    page = share_page(
-        presented.gaussians,
-        model.light,
-        model.shading,
-        {view.name: view.camera for view in views},
-        first=views[0].name,
-        title=title or presented.presentation.title or run.scene.name,
-        caption=f"{caption or f'{run.recipe.name}, {run.steps:,} steps'} · polarization: {run.polarization}",
-        metrics=[
-            *((f"{label}, test views", text) for label, text in scores),
-            ("Gaussians", f"{len(presented.gaussians['means']):,}"),
-        ],
-        notes=[f"Warning: {warning}" for warning in health.warnings] if health is not None else [],
-        presentation=presented.presentation,
-        footprints=presented.footprints,
-    )
-    make_folder(path.parent)
-    write_text(path, page)
-    return path
 
 
 def _plys(run: OpenedRun, presented: Presented, folder: Path, fields: PlyFields) -> list[Path]:

@@ -186,6 +186,9 @@ def write_film(
     require_memory(Path(path), RENDERED * width * height, f"pictures of {width}x{height}", remedy=remedy)
     named = out.suffix.lower() == ".mp4" and len(names) > 1
     pictures = _pictures(run, names, cameras, reporter, named=named)
+    if size is not None:  # a width that the layers do not share evenly ends with black columns
+        rest = size[0] % len(names)
+        pictures = (np.pad(picture, ((0, 0), (0, rest), (0, 0))) for picture in pictures)
     if out.suffix.lower() == ".mp4":
         make_folder(out.parent)
         count = write_video(out, pictures, frames_per_second=speed)
