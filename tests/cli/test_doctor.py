@@ -1,11 +1,14 @@
 """``polarguide doctor``: what is installed and what is missing, for people and as JSON."""
 
 import json
+import shutil
 import sys
 from importlib import metadata
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 
 from polarguide import _native
 from polarguide.cli.app import run
@@ -97,6 +100,36 @@ def test_the_text_names_what_is_missing_and_the_command(
     text = " ".join(capsys.readouterr().out.split())
     assert install_extra("synth") in text
     assert _native.simd() in text
+
+
+class Distribution:
+    """An installed one, of one file."""
+
+    def __init__(self, name: str, size: int) -> None:
+        self.metadata, self.files = {"Name": name}, [SimpleNamespace(size=size)]
+
+
+def test_a_build_for_cuda_without_a_gpu_is_named_with_its_size(
+    installation: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    installed = [
+        Distribution("nvidia-cublas", 3 * 10**9),
+        Distribution("triton", 10**9),
+        Distribution("numpy", 10**9),
+    ]
+    monkeypatch.setattr(metadata, "distributions", lambda: installed)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    monkeypatch.setattr(torch.version, "cuda", None)
+    assert doctor(capsys, 0)["notes"] == []
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    (note,) = doctor(capsys, 0)["notes"]
+    assert "built for CUDA 13.0, and there is no GPU here: its libraries take 4.0 GB" in note
+    assert "pip uninstall -y torch nvidia-cublas triton; " in note
+    assert "uv pip install --torch-backend=cpu torch" in note
+    monkeypatch.setattr(shutil, "which", lambda _: "/usr/bin/nvidia-smi")
+    (note,) = doctor(capsys, 0)["notes"]
+    assert "There is an NVIDIA driver" in note
 
 
 def test_without_metadata_it_says_so(

@@ -14,7 +14,7 @@ import pytest
 from polarguide.core import errors
 from polarguide.core.errors import install_extra, install_package
 from polarguide.core.progress import SILENT
-from polarguide.core.text import decimal
+from polarguide.core.text import command, decimal
 
 REQUIRES = ["viser==1.1.*", "scikit-image>=0.22", "flip-evaluator>=1.6; python_version < '3.14'",
             'mitsuba==3.9.*; extra == "synth"', "torchmetrics>=1.4; extra == 'lpips'",
@@ -48,6 +48,11 @@ def test_an_extra_is_named_by_its_packages(installed) -> None:
     installed()
     assert install_extra("synth") == "pip install 'mitsuba==3.9.*'"
     assert install_extra("lpips") == "pip install 'torchmetrics>=1.4'"
+
+
+def test_printed_commands_can_be_pasted() -> None:
+    assert command("eval", Path("runs/my run")) == "polarguide eval 'runs/my run'"
+    assert command("train", "s", "--out", "it's") == """polarguide train s --out 'it'"'"'s'"""
 
 
 def test_packages_have_the_versions_that_are_required(installed) -> None:

@@ -428,8 +428,11 @@ def _summary(results: Results) -> str:
 
 def _without_folders(command: str) -> str:
     """A command with the names of files and folders alone: where they lie on a machine is nobody's business."""
-    words = [Path(word).name if "/" in word else word for word in shlex.split(command)]
-    return shlex.join(words)
+    try:
+        words = shlex.split(command)
+    except ValueError:  # of a record that somebody has edited
+        return command
+    return shlex.join(Path(word).name if "/" in word else word for word in words)
 
 
 def _facts(results: Results) -> dict[str, str]:
