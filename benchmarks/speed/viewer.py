@@ -25,7 +25,6 @@ from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.trajectory import orbit
 from polarguide.shading.result import LAYERS
 from polarguide.viewer import run_scenery
-from polarguide.viewer.cameras import letterbox
 from polarguide.viewer.scenery import Appearance, Painter
 from polarguide.viewer.session import JPEG_QUALITY
 
@@ -50,7 +49,7 @@ def main() -> None:
     rows = {name: shown.gaussians[name].detach()[chosen] for name in shown.gaussians.names}
     shown = replace(shown, gaussians=Gaussians(rows, opened.recipe.rates))
     cameras = list(opened.cameras.values())
-    path = [letterbox(c, (width, height)).camera(c) for c in orbit(cameras, arguments.pictures + SKIPPED)]
+    path = [c.extended(width, height) for c in orbit(cameras, arguments.pictures + SKIPPED)]
     print(
         f"{shown.status}; {len(shown.gaussians):,} of them, {width} x {height}, {torch.get_num_threads()} threads"
     )

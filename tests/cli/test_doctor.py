@@ -1,17 +1,18 @@
 """``polarguide doctor``: what is installed and what is missing, for people and as JSON."""
 
 import json
+import shutil
 import sys
 from importlib import metadata
-from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 
 from polarguide import _native
 from polarguide.cli.app import run
 from polarguide.cli.doctor import EXTRAS
-from polarguide.core import errors
 from polarguide.core.errors import install_extra
 
 METADATA = [
@@ -22,7 +23,6 @@ METADATA = [
     "numpy; extra == 'lpips'",
     "no-such-package==1.*; python_version >= '3' and extra == 'synth'",
     "pillow-heif>=0.18; extra == 'heic'",
-    "xatlas; extra == 'model'",
     "usd-core; extra == 'usd'",
     "dask-jobqueue>=0.9; extra == 'cluster'",
     "furo; extra == 'docs'",
@@ -96,11 +96,40 @@ def test_the_text_names_what_is_missing_and_the_command(
     installation: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """On a terminal of 80 columns, where lines are wrapped; with brackets, which are no markup."""
-    monkeypatch.setattr(errors, "_source_folder", Path.cwd)
     assert run(["doctor"]) == 0
     text = " ".join(capsys.readouterr().out.split())
-    assert "'.[synth]'" in text
+    assert install_extra("synth") in text
     assert _native.simd() in text
+
+
+class Distribution:
+    """An installed one, of one file."""
+
+    def __init__(self, name: str, size: int) -> None:
+        self.metadata, self.files = {"Name": name}, [SimpleNamespace(size=size)]
+
+
+def test_a_build_for_cuda_without_a_gpu_is_named_with_its_size(
+    installation: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    installed = [
+        Distribution("nvidia-cublas", 3 * 10**9),
+        Distribution("triton", 10**9),
+        Distribution("numpy", 10**9),
+    ]
+    monkeypatch.setattr(metadata, "distributions", lambda: installed)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    monkeypatch.setattr(torch.version, "cuda", None)
+    assert doctor(capsys, 0)["notes"] == []
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    (note,) = doctor(capsys, 0)["notes"]
+    assert "built for CUDA 13.0, and there is no GPU here: its libraries take 4.0 GB" in note
+    assert "pip uninstall -y torch nvidia-cublas triton; " in note
+    assert "uv pip install --torch-backend=cpu torch" in note
+    monkeypatch.setattr(shutil, "which", lambda _: "/usr/bin/nvidia-smi")
+    (note,) = doctor(capsys, 0)["notes"]
+    assert "There is an NVIDIA driver" in note
 
 
 def test_without_metadata_it_says_so(

@@ -98,10 +98,11 @@ def test_it_is_rendered(earlier: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kernels", instruction_sets())
 def test_it_is_exported_as_then(earlier: Path, tmp_path: Path, kernels: str) -> None:
-    words = ["export", str(earlier), "--format", "ply", "--out", str(tmp_path), "--threads", "1"]
+    polarguide.present(earlier, crop="all")
+    words = ["--format", "ply", "--fields", "all", "--axes", "scene", "--out", str(tmp_path), "--threads", "1"]
     with selected(kernels):
-        assert command(words) == 0
-    paths = earlier / "point_cloud.ply", tmp_path / "splats.ply"
+        assert command(["export", str(earlier), *words]) == 0
+    paths = earlier / "point_cloud.ply", tmp_path / "polarguide.ply"
     then, now = (PlyData.read(path)["vertex"].data for path in paths)
     assert then.dtype == now.dtype
     assert len(then) == 122

@@ -103,7 +103,8 @@ def test_scale_from_two_points(copy: Path, scene: Path, monkeypatch: pytest.Monk
 
 def test_exports_are_cropped_upright_in_meters_and_say_whose_they_are(copy: Path, tmp_path: Path) -> None:
     trained = polarguide.open_run(copy, device="cpu")
-    plain = trained.export("ply", tmp_path / "plain")[0]
+    present(copy, "--crop", "all")
+    plain = trained.export("ply", tmp_path / "plain", axes="scene")[0]
     axis = (0.0, 1.0, 0.0)
     options = [
         "--up-axis",
@@ -153,23 +154,27 @@ def test_the_mesh_says_its_units_and_whose_it_is(
     trimesh = pytest.importorskip("trimesh")
     monkeypatch.setattr("polarguide.results.rendering.mesh.OPAQUE", 0.05)  # nothing is opaque yet
     trained = polarguide.open_run(copy, device="cpu")
-    trained.export("mesh", tmp_path / "plain", resolution=24)
+    trained.export("mesh", tmp_path / "plain", resolution=24, axes="scene")
     present(copy, "--meters-per-unit", "0.5", "--author", "Zoë", "--license", "CC-BY-4.0", "--title", "Cup")
-    trained.export("mesh", tmp_path / "half", resolution=24)
+    trained.export("mesh", tmp_path / "half", resolution=24, axes="scene")
     sizes = {}
     for name in ("mesh.ply", "mesh.glb"):
         plain, half = (trimesh.load(tmp_path / folder / name, force="mesh") for folder in ("plain", "half"))
         sizes[name] = half.extents
         np.testing.assert_allclose(half.extents, 0.5 * plain.extents, rtol=1e-5)
     data = (tmp_path / "half" / "mesh.glb").read_bytes()
-    asset = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])["asset"]
+    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    (material,) = tree["materials"]
+    assert material["pbrMetallicRoughness"] == {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    assert tree["meshes"][0]["primitives"][0]["material"] == 0
+    asset = tree["asset"]
     assert asset["copyright"] == "Zoë, CC-BY-4.0"
     assert asset["extras"].items() >= {"author": "Zoë", "title": "Cup", "units": "meters"}.items()
     assert {"author Zoe", "units meters"} <= set(
         PlyData.read(tmp_path / "half" / "mesh.ply")["vertex"].comments
     ) | set(PlyData.read(tmp_path / "half" / "mesh.ply").comments)
     present(copy, "--crop=-30,30,-30,30,-30,30")
-    trained.export("mesh", tmp_path / "cropped", resolution=24)
+    trained.export("mesh", tmp_path / "cropped", resolution=24, axes="scene")
     cropped = trimesh.load(tmp_path / "cropped" / "mesh.ply", force="mesh")
     inside = read_presentation(copy).crop.inside(torch.tensor(cropped.vertices) / 0.5, trained.camera_frame)
     assert bool(inside.all())

@@ -40,7 +40,7 @@ def test_the_command_writes_it_once(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.parametrize("words", [["bench", "--render-only"], ["synth", "proof"]])
-def test_without_mitsuba_the_extra_is_named(
+def test_without_mitsuba_its_wheel_is_named(
     words: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "mitsuba", None)

@@ -1,5 +1,6 @@
 """``polarguide view`` and ``train --viewer`` as a user starts and stops them."""
 
+import re
 import signal
 import socket
 import subprocess
@@ -12,6 +13,7 @@ import pytest
 from safetensors.torch import load_file
 
 from polarguide.cli.app import run
+from polarguide.core.system import network_address
 from polarguide.runs.folder import CHECKPOINT, LOG
 
 PATIENCE = 120.0
@@ -63,6 +65,9 @@ def test_view_warns_where_others_can_look_and_takes_a_free_port(trained: Path, p
     stop(process, signal.SIGTERM)
     assert "there is no password" in said
     assert "viewer: http://127.0.0.1:" in said
+    (tunnel,) = re.findall(r"ssh -L (\d+):127.0.0.1:\1 ", said)
+    if (address := network_address()) is not None:
+        assert f"from other machines: http://{address}:{tunnel}" in said
     assert f":{port}\n" not in said
 
 

@@ -1,7 +1,6 @@
 """Errors, texts and reports: what a user reads."""
 
 import importlib.metadata
-import json
 import math
 import shlex
 import shutil
@@ -15,7 +14,7 @@ import pytest
 from polarguide.core import errors
 from polarguide.core.errors import install_extra, install_package
 from polarguide.core.progress import SILENT
-from polarguide.core.text import decimal
+from polarguide.core.text import command, decimal
 
 REQUIRES = ["viser==1.1.*", "scikit-image>=0.22", "flip-evaluator>=1.6; python_version < '3.14'",
             'mitsuba==3.9.*; extra == "synth"', "torchmetrics>=1.4; extra == 'lpips'",
@@ -24,13 +23,10 @@ REQUIRES = ["viser==1.1.*", "scikit-image>=0.22", "flip-evaluator>=1.6; python_v
 
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Pretends that the package lies in an environment, with a ``direct_url.json`` as given (None: no such file)."""
-    monkeypatch.setattr(
-        errors, "__file__", str(tmp_path / "lib" / "python" / "polarguide" / "core" / "errors.py")
-    )
+    """Pretends that the package lies in an environment."""
     monkeypatch.setattr(shutil, "which", lambda name: str(Path(sys.executable).with_name(name)))
 
-    def pretend(url: str | None) -> None:
+    def pretend() -> None:
         folder = tmp_path / "lib" / "polarguide-1.dist-info"
         folder.mkdir(parents=True)
         lines = [
@@ -39,8 +35,6 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             *(f"Requires-Dist: {line}" for line in REQUIRES),
         ]
         (folder / "METADATA").write_text("\n".join(lines))
-        if url is not None:
-            (folder / "direct_url.json").write_text(json.dumps({"url": url, "dir_info": {}}))
         monkeypatch.setattr(importlib.metadata.Distribution, "discover", classmethod(discover))
 
     def discover(*_: object, **__: object) -> Iterator[importlib.metadata.Distribution]:
@@ -49,32 +43,20 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     return pretend
 
 
-def sources(folder: Path) -> Path:
-    (folder / "src" / "polarguide").mkdir(parents=True)
-    (folder / "pyproject.toml").touch()
-    return folder
-
-
-def test_from_a_source_folder_the_folder_is_named(
-    installed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = sources(tmp_path / "my sources")
-    installed(folder.as_uri())
-    assert shlex.split(install_extra("synth")) == ["pip", "install", f"{folder}[synth]"]
-    monkeypatch.chdir(folder)
-    assert install_extra("synth") == "pip install '.[synth]'"
-    assert install_extra("cuda") == "pip install '.[cuda]'"
-
-
-@pytest.mark.parametrize("url", [None, "file:///removed", "https://example.org/polarguide.whl"])
-def test_without_one_the_packages_are_named(installed, url: str | None) -> None:
-    installed(url)
+def test_an_extra_is_named_by_its_packages(installed) -> None:
+    """Never by itself: from a source folder that would compile polarguide once more."""
+    installed()
     assert install_extra("synth") == "pip install 'mitsuba==3.9.*'"
     assert install_extra("lpips") == "pip install 'torchmetrics>=1.4'"
 
 
+def test_printed_commands_can_be_pasted() -> None:
+    assert command("eval", Path("runs/my run")) == "polarguide eval 'runs/my run'"
+    assert command("train", "s", "--out", "it's") == """polarguide train s --out 'it'"'"'s'"""
+
+
 def test_packages_have_the_versions_that_are_required(installed) -> None:
-    installed(None)
+    installed()
     assert (
         install_package("viser")
         == install_package("websockets.asyncio.server")
@@ -86,15 +68,9 @@ def test_packages_have_the_versions_that_are_required(installed) -> None:
 
 
 def test_the_pip_of_another_python_is_not_used(installed, monkeypatch: pytest.MonkeyPatch) -> None:
-    installed(None)
+    installed()
     monkeypatch.setattr(shutil, "which", lambda name: f"/elsewhere/bin/{name}")
     assert shlex.split(install_package("viser")) == [sys.executable, "-m", "pip", "install", "viser==1.1.*"]
-
-
-def test_a_checkout_that_was_never_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = sources(tmp_path / "checkout")
-    monkeypatch.setattr(errors, "__file__", str(folder / "src" / "polarguide" / "core" / "errors.py"))
-    assert shlex.split(install_extra("synth"))[-1] == f"{folder}[synth]"
 
 
 @pytest.mark.parametrize(

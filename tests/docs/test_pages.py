@@ -26,6 +26,7 @@ MODULE_FILE = re.compile(r"`([a-z_]+(?:/[a-z_]+)+\.py)`")
 # Options of other programs that pages show, too.
 FOREIGN_OPTIONS = {
     *(
+        "torch-backend",
         "nproc-per-node",
         "no-python",
         "no-register",

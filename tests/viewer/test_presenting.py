@@ -21,7 +21,6 @@ from polarguide.capture.presentation import (
 )
 from polarguide.results.rendering.picking import gains_of, gray_world, surface_at
 from polarguide.shading.result import LAYERS
-from polarguide.viewer.cameras import letterbox
 from polarguide.viewer.messages import Refused, checked
 from polarguide.viewer.panel import PanelOptions
 from polarguide.viewer.server import save_to_run
@@ -58,9 +57,7 @@ class Visit:
     @property
     def camera(self):  # type: ignore[no-untyped-def]
         """With which the window, twice the photograph's size, is drawn."""
-        return letterbox(self.photographs["v0"].view.camera, (128, 96)).camera(
-            self.photographs["v0"].view.camera
-        )
+        return self.photographs["v0"].view.camera.extended(128, 96)
 
     def draw(self) -> np.ndarray:
         self.session.draw(self.seen, "sharp")

@@ -124,7 +124,7 @@ def test_at_a_photograph_the_pose_is_the_photographs():
     seen = shown()
     view = photograph("v2", CAMERAS["v2"], seen).view
     picture = paint(seen, view=view, camera=replace(CAMERA, width=200, height=90))
-    expected = letterbox(view.camera, (200, 90)).camera(view.camera)
+    expected = view.camera.extended(200, 90)
     assert np.array_equal(picture, paint(seen, camera=expected))
 
 
@@ -295,7 +295,7 @@ def test_a_free_camera_takes_the_pose_of_its_quaternion_and_the_fov_from_top_to_
 @pytest.mark.parametrize("size", [(640, 480), (1000, 300), (200, 900), (64, 48), (31, 17)])
 def test_a_photograph_fits_into_a_window_and_its_camera_with_it(size):
     placement = letterbox(LENS, size)
-    camera = placement.camera(LENS)
+    camera = LENS.extended(*size)
     assert (camera.width, camera.height) == size
     corners = np.array([(0, 0), (LENS.width, LENS.height)])
     inside = corners * placement.scale + (placement.left, placement.top)

@@ -9,7 +9,6 @@ from fake_browser import FakeClient
 from viewer_scenes import frame_of_scene, photographs, shown
 
 from polarguide.shading.result import LAYERS
-from polarguide.viewer.cameras import letterbox
 from polarguide.viewer.panel import FREE_VIEW, PanelOptions
 from polarguide.viewer.session import (
     BUDGET,
@@ -82,7 +81,7 @@ def psnr(a, b):
 def test_a_session_begins_at_the_first_photograph_and_sees_what_render_gives(viewing):
     view = viewing.at("v0")
     # The window is twice the photograph's size.
-    expected = rendered(viewing.seen, letterbox(view.camera, (128, 96)).camera(view.camera))
+    expected = rendered(viewing.seen, view.camera.extended(128, 96))
     assert psnr(viewing.rest(), expected) > 60
     assert viewing.client.control("Go to").value == "v0"
 

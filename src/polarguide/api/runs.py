@@ -19,7 +19,7 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.results.evaluation import evaluate
 from polarguide.results.evaluation.record import read_metrics
 from polarguide.results.evaluation.table import shown_metrics
-from polarguide.results.export import formats
+from polarguide.results.export import formats, web_page
 from polarguide.results.rendering import film, pictures, relight
 from polarguide.runs import train as training
 from polarguide.runs.opened import OpenedRun
@@ -46,7 +46,7 @@ class Run(OpenedRun):
     evaluate = evaluate.evaluate
     export = formats.export
     relight = relight.relight
-    share = formats.share
+    share = web_page.share
     view = server.view_run
     write_film = film.write_film
     write_pictures = pictures.write_pictures

@@ -127,7 +127,8 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         exposure: stops by which radiance is shown brighter, -8 to 8.
         up_axis: [3] direction in the scene's axes, of any length; without it, up is as the cameras say.
         meters_per_unit: how long one unit of the scene is.
-        crop: what is shown and exported of the scene.
+        crop: what is shown and exported of the scene. whole: all of it is, in place of a crop box; there cannot be
+            both.
         title: what is shown. author: whom the capture is owed to. license: a name, such as CC-BY-4.0.
         provenance: where, when and with what it was captured, or a number of an inventory.
     """
@@ -138,6 +139,7 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     up_axis: Vector | None = None
     meters_per_unit: Annotated[float, Meta(ge=LEAST_METERS, le=MOST_METERS)] | None = None
     crop: Crop | None = None
+    whole: bool = False
     title: Text = ""
     author: Text = ""
     license: Text = ""
@@ -148,6 +150,9 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         if self.white_balance is not None and self.chart is not None:
             found = "both"
             raise PolarguideError("white_balance", expected="it, or a chart", found=found, remedy=REMEDY)
+        if self.crop is not None and self.whole:
+            found = "both"
+            raise PolarguideError("crop", expected="a box, or the whole scene", found=found, remedy=REMEDY)
         for name in CREDITS:
             text = getattr(self, name)
             if not text.isprintable():
@@ -175,10 +180,11 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         return matrix * 2.0 ** (self.exposure or 0.0)
 
     def over(self, other: Presentation) -> Presentation:
-        """This, with another's fields where this one has none; white balance and chart are one of them."""
+        """This, with another's fields where this one has none; those of ``EITHER`` are one of them."""
         own, above = _given(self), _given(other)
-        if not own.keys().isdisjoint(WHITE):
-            above = {name: value for name, value in above.items() if name not in WHITE}
+        for names in EITHER:
+            if not own.keys().isdisjoint(names):
+                above = {name: value for name, value in above.items() if name not in names}
         return Presentation(**{**above, **own})
 
     def upright(self, around: SceneFrame) -> SceneFrame:
@@ -191,13 +197,13 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         return record
 
 
-WHITE = ("white_balance", "chart")
+EITHER = (("white_balance", "chart"), ("crop", "whole"))
 """Fields of which one takes the place of the other."""
 
 
 def _given(presentation: Presentation) -> Mapping[str, Any]:
     fields = {name: getattr(presentation, name) for name in presentation.__struct_fields__}
-    return {name: value for name, value in fields.items() if value not in (None, "")}
+    return {name: value for name, value in fields.items() if value not in (None, "", False)}
 
 
 def _upright(around: SceneFrame, up: Vector) -> SceneFrame:

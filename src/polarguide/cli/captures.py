@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import tyro
 from polarguide.cli.console import ConsoleReporter, console, say, use_threads
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import ComputeOptions, ThreadOptions
+from polarguide.core.text import command
 from polarguide.inspection.settings import InspectSettings
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 from polarguide.synth.settings import LONG_SECONDS, Overrides, SynthSettings, find_scene, rough_time
@@ -43,12 +45,12 @@ def prepare(
     without = f", {len(prepared.left_out)} left out" if prepared.left_out else ""
     say(f"scene: {prepared.folder} ({len(prepared.views)} views{without})")
     if prepared.posed:
-        say(f"next: polarguide inspect {prepared.folder}")
-        say(f"then: polarguide train {prepared.folder} --out runs/{prepared.folder.name}")
+        say(f"next: {command('inspect', prepared.folder)}")
+        say(f"then: {command('train', prepared.folder, '--out', f'runs/{prepared.folder.name}')}")
     else:
         say("it has no poses: repeat the command with --poses sfm or --poses PATH")
         say(
-            f"each view alone: polarguide priors {prepared.folder} --out {prepared.folder.name}-priors",
+            f"each view alone: {command('priors', prepared.folder, '--out', f'{prepared.folder.name}-priors')}"
         )
 
 
@@ -167,6 +169,7 @@ def present(
     author: str = "",
     license: str = "",
     provenance: str = "",
+    scene: Path | None = None,
     compute: ComputeOptions = ComputeOptions(),
 ) -> None:
     """Set how a scene or a run is shown and exported: color, up, scale, crop box, credit. Data and scores stay.
@@ -187,11 +190,13 @@ def present(
         points: Two points of known distance: X,Y,Z in the scene, VIEW,X,Y on a surface, or VIEW for a camera's place.
         distance: Of the two points, such as 85mm.
         meters_per_unit: How long a unit of the scene is, in place of points and distance.
-        crop: Box as --crop=left,right,down,up,front,back in percent of the cameras' distance.
+        crop: Box as --crop=left,right,down,up,front,back in percent of the cameras' distance; all: the whole scene.
+            Without it, what the scene's masks show, or the region that most of the cameras have in their pictures.
         title: One line.
         author: Whom the capture is owed to.
         license: Such as CC-BY-4.0.
         provenance: Where, when and with what it was captured, or its number in an inventory.
+        scene: Where the scene of a run lies now, if it was moved or is on another machine.
     """
     use_threads(compute.threads)
     presenting = importlib.import_module("polarguide.results.rendering.present")
@@ -209,9 +214,12 @@ def present(
         author=author or None,
         license=license or None,
         provenance=provenance or None,
+        scene=scene,
         device=compute.device,
         reporter=ConsoleReporter(),
     )
+    if scene is not None:
+        say(f"the scene of {folder} is {scene}")
     for line in presenting.described(presented):
         say(line)
 
@@ -248,22 +256,22 @@ def synth(
         folders = render.sweep_scenes(
             spec, out, settings, overrides, family, reporter, threads=compute.threads
         )
-        say(f"scenes: {' '.join(str(folder) for folder in folders)}")
+        say(f"scenes: {shlex.join(map(str, folders))}")
         return
     plan = render.Plan(overrides.apply(spec), settings, out)
     _confirm(render.expected_time([plan], reporter, threads=compute.threads), yes)
     folder = importlib.import_module("polarguide.synth.folder")
     rendered = render.synthesize(plan.spec, out, settings, reporter, threads=compute.threads)
     say(f"scene: {rendered}   SHA-256 of its {folder.MANIFEST}: {folder.scene_digest(rendered)}")
+    prepared = ("prepare", rendered / "raw", "--out", f"{rendered}-prepared", "--poses", rendered)
     if settings.sensor == "ideal":
-        say(f"next: polarguide train {rendered} --out runs/{rendered.name}")
+        say(f"next: {command('train', rendered, '--out', f'runs/{rendered.name}')}")
     elif settings.sensor == "filter":
-        say(f"next: polarguide prepare {rendered / 'raw'} --out {rendered}-prepared --poses {rendered}")
+        say(f"next: {command(*prepared)}")
     else:
-        say(
-            f"next: polarguide prepare {rendered / 'raw'} --out {rendered}-prepared --sensor {settings.sensor.upper()} "
-            f"--bits 12 --black-level 64 --calibration {rendered / 'calibration.json'} --poses {rendered}",
-        )
+        calibration = rendered / "calibration.json"
+        sensor = ("--sensor", settings.sensor.upper(), "--bits", 12, "--black-level", 64)
+        say(f"next: {command(*prepared, *sensor, '--calibration', calibration)}")
 
 
 def _confirm(seconds: float, yes: bool) -> None:

@@ -6,6 +6,8 @@ import importlib
 import json as json_text
 import os
 import platform
+import re
+import shlex
 import shutil
 import sys
 from importlib import metadata
@@ -23,12 +25,13 @@ EXTRAS = {
     "cuda": "train and render on an NVIDIA GPU",
     "lpips": "the metric lpips",
     "heic": "HEIC photographs",
-    "model": "textured models (export --format glb, obj, usdz, stl, all)",
     "usd": "USDZ packages (export --format usdz, splat-usdz)",
     "cluster": "compare, ablate, bench and batch on SLURM or PBS",
     "synth": "synth and bench: scenes with ground truth",
 }
 """The extras that users need, and what for; docs and test are for those who change polarguide."""
+_CUDA_LIBRARY = re.compile(r"(nvidia|cuda)[-_]|triton$")
+"""Names of the distributions that PyTorch for CUDA brings along."""
 GIB = float(1 << 30)
 
 
@@ -150,10 +153,27 @@ def _notes(torch: dict[str, Any], extras: dict[str, Any]) -> list[str]:
         return ["polarguide is not installed here, so that its packages cannot be checked: pip install ."]
     if torch.get("gpus") and extras["cuda"]["missing"]:
         return [f"There is a GPU, but trainings run on the CPU without gsplat: {extras['cuda']['command']}"]
-    if not torch.get("gpus") and shutil.which("nvidia-smi") is not None:
+    if torch.get("gpus"):
+        return []
+    if shutil.which("nvidia-smi") is not None:
         built = torch.get("cuda") or "no CUDA"
         return [f"There is an NVIDIA driver, but PyTorch (built for {built}) can use no GPU."]
-    return []
+    return [_useless_cuda(torch["cuda"])] if torch.get("cuda") else []
+
+
+def _useless_cuda(version: str) -> str:
+    """A line about a PyTorch for CUDA where there is no GPU, its size, and the commands that replace it."""
+    libraries = {
+        name: sum((file.size or 0) for file in each.files or ())
+        for each in metadata.distributions()
+        if _CUDA_LIBRARY.match(name := each.metadata["Name"])
+    }
+    remove = shlex.join(["pip", "uninstall", "-y", "torch", *sorted(libraries)])
+    return (
+        f"PyTorch is built for CUDA {version}, and there is no GPU here: its libraries take "
+        f"{sum(libraries.values()) / 1e9:.1f} GB beside PyTorch's own. The build for processors is enough: {remove}; "
+        "pip install uv; uv pip install --torch-backend=cpu torch"
+    )
 
 
 def _print(report: dict[str, Any]) -> None:

@@ -14,21 +14,23 @@ import polarguide
 from polarguide.cli.console import ConsoleReporter, RunFolder, console, opened, say, size_text, warn
 from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.options import (
-    EXPORT_EXTRAS,
     EXPORT_PACKAGES,
     LOOPBACK,
+    Axes,
     ComputeOptions,
     ExportFormat,
     ModelOptions,
     PictureFormat,
+    PlyFields,
     SceneOptions,
     SessionOptions,
     ThreadOptions,
     VisitorOptions,
     check_finite,
+    picture_size,
 )
 from polarguide.core.system import StopSignals
-from polarguide.core.text import printable
+from polarguide.core.text import command, printable
 from polarguide.training.settings import TrainSettings
 
 
@@ -75,7 +77,7 @@ def train(
             if str(stopped):  # it was asked to stop, and says after which step it did
                 say(f"{stopped}; go on with the same command and --resume")
             raise
-    say(f"trained: {out}   next: polarguide eval {out}   polarguide view {out}")
+    say(f"trained: {out}   next: {command('eval', out)}   {command('view', out)}")
 
 
 _MOST_OBJECTS = 100
@@ -120,6 +122,8 @@ def print_scores(record: dict[str, Any], title: str) -> None:
     for label, text in metrics.shown_metrics(record):
         table.add_row(label, Text(printable(text)))
     console.print(table)
+    for line in metrics.explained(record):
+        say(line)
     if absent := metrics.absent_metrics(record):
         say(f"no ground truth, or no such layer, for: {', '.join(absent)}")
     if record["objects"]:
@@ -159,6 +163,7 @@ def _errors(record: dict[str, Any], columns: list[Any]) -> Table:
 
 
 FRAMES = 120
+LAYERS = "final,base,reflection,specular,diffuse,strength,roughness,metalness,normal,depth,dolp,aolp"
 
 
 def render(
@@ -166,9 +171,10 @@ def render(
     /,
     *,
     views: str = "test",
-    layers: str = "final,base,reflection,specular,diffuse,strength,roughness,metalness,normal,depth,dolp,aolp",
+    layers: str = "",
     path: str = "",
     frames: int = FRAMES,
+    size: str = "",
     video: Path | None = None,
     format: PictureFormat = "png",
     transparent: bool = False,
@@ -186,10 +192,12 @@ def render(
         run: Run folder.
         views: test, train, all, or names separated by commas.
         layers: Any of final, base, reflection, specular, diffuse, strength, roughness, metalness, normal, depth,
-            alpha, and the predicted polarization: stokes, dolp, aolp.
-        path: In place of views: orbit, spiral, interpolate (through the photographs), or a JSON file of cameras.
+            alpha, and the predicted polarization: stokes, dolp, aolp. By default most of them, along a path final.
+        path: In place of views: orbit, turntable (so near that the subject fills the picture), spiral, interpolate
+            (through the photographs), or a JSON file of cameras.
         frames: Pictures along the path (a file has its own).
-        video: MP4 file to write of the path, layers side by side; PNG files if not given.
+        size: Of the pictures along the path, such as 1920x1080, all layers together.
+        video: MP4 file to write of the path, layers side by side with their names; PNG files if not given.
         format: Of the layers of views: png as a display shows them, or exr and npy with the linear numbers, whose units
             layers.json states. The contact sheet is PNG.
         transparent: PNG files of views are transparent where nothing is, without a dark rim around the subject.
@@ -204,9 +212,9 @@ def render(
             found=f"{video} and {path or 'no path'}",
             remedy="Write for example --path orbit --video film.mp4.",
         )
-    if not path and frames != FRAMES:
+    if not path and (frames != FRAMES or size):
         raise PolarguideError(
-            "frames",
+            "size" if size else "frames",
             expected="a --path",
             found="none",
             remedy="Give for example --path orbit, or leave it out.",
@@ -229,12 +237,19 @@ def render(
             found=f"--path {path}" if path else f"--format {format}",
             remedy="Leave one of the two out.",
         )
+    pixels = picture_size(size) if size else None
+    layers = layers or ("final" if path else LAYERS)
     names = [name.strip() for name in layers.split(",") if name.strip()]
     trained, reporter = opened(run, compute)
     trained.relight(environment, rotate_environment, reporter=reporter)
     if path:
         trained.write_film(
-            video or out or run / "render", path=path, layers=names, frames=frames, reporter=reporter
+            video or out or run / "render",
+            path=path,
+            layers=names,
+            frames=frames,
+            size=pixels,
+            reporter=reporter,
         )
         return
     sheet = trained.write_pictures(
@@ -277,7 +292,7 @@ def demo(
         f"then at {out / 'render' / 'contact_sheet.png'}: rows are views, columns are layers, each beside the true "
         "one if it is known"
     )
-    say(f"look around: polarguide view {out}")
+    say(f"look around: {command('view', out)}")
 
 
 def _first_picture(out: Path) -> Path:
@@ -317,7 +332,7 @@ def view(
             run,
             expected="a run folder: what train wrote under --out, with run.json in it",
             found=f"a file ({run.suffix or 'without a suffix'})",
-            remedy=f"polarguide view {run.parent} if it lies in one. Files of Gaussians alone, without the light that "
+            remedy=f"{command('view', run.parent)} if it lies in one. Files of Gaussians alone, without the light that "
             "they reflect, are for other viewers (SuperSplat).",
         )
     require_package("viser", "the viewer")
@@ -343,8 +358,8 @@ def share(
         title: Heading of the page; the scene's name by default.
         caption: Text below it; the recipe and its steps by default.
     """
-    trained, _ = opened(run, machine)
-    path = trained.share(out, title=title, caption=caption)
+    trained, reporter = opened(run, machine)
+    path = trained.share(out, title=title, caption=caption, reporter=reporter)
     say(f"page: {path} ({size_text(path.stat().st_size)})")
 
 
@@ -356,6 +371,8 @@ def export(
     out: Path | None = None,
     resolution: int = 192,
     spz_version: Literal[3, 4] = 3,
+    fields: PlyFields = "release",
+    axes: Axes = "upright",
     model: Annotated[ModelOptions, tyro.conf.arg(name="")] = ModelOptions(),
     machine: ThreadOptions = ThreadOptions(),
 ) -> None:
@@ -373,12 +390,22 @@ def export(
         out: Folder to write; RUN/export by default.
         resolution: Voxels of the mesh along its longest side.
         spz_version: Version of the SPZ file; readers are split between the two.
+        fields: Of ply: release is what every reader of 3DGS files takes; all adds polarguide.ply, with linear colors,
+            strength, roughness and more, for programs that read fields by name.
+        axes: Upright (+y in GLB and USD, -y elsewhere); or the scene's own, in all but GLB and USD.
     """
     for package in EXPORT_PACKAGES.get(format, ()):
-        require_package(package, f"--format {format}", extra=EXPORT_EXTRAS.get(package, ""))
+        require_package(package, f"--format {format}")
     trained, reporter = opened(run, machine)
     for path in trained.export(
-        format, out, resolution=resolution, spz_version=spz_version, model=model, reporter=reporter
+        format,
+        out,
+        resolution=resolution,
+        spz_version=spz_version,
+        fields=fields,
+        axes=axes,
+        model=model,
+        reporter=reporter,
     ):
         size = f" ({size_text(path.stat().st_size)})" if path.is_file() else ""
         say(f"{format}: {path}{size}")

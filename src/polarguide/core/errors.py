@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import json
 import os
 import re
 import shlex
@@ -13,7 +12,6 @@ import signal
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import urlsplit
 
 
 class PolarguideError(Exception):
@@ -49,15 +47,12 @@ _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
 
 
 def install_extra(extra: str) -> str:
-    """The command that adds an extra to this installation.
+    """The command that adds the packages of an extra.
 
-    Where there is no source folder, as after the installation of a wheel, the packages of the extra are named.
+    It names them, and not the extra: from a source folder that would compile polarguide once more.
     """
-    source = _source_folder()
     packages = [requirement.text for requirement in requirements() if requirement.extra == extra]
-    if source is None and packages:
-        return _pip(*packages)
-    return _pip(f"{'.' if source in (None, Path.cwd()) else source}[{extra}]")
+    return _pip(*(packages or [f"polarguide[{extra}]"]))
 
 
 def install_package(module: str) -> str:
@@ -78,28 +73,6 @@ def _pip(*packages: str) -> str:
     executable = shutil.which("pip")
     ours = executable is not None and Path(executable).parent == Path(sys.executable).parent
     return shlex.join([*(["pip"] if ours else [sys.executable, "-m", "pip"]), "install", *packages])
-
-
-def _source_folder() -> Path | None:
-    """The folder of sources that this copy runs or was installed from (PEP 610); None where there is no such folder."""
-    metadata = importlib.import_module("importlib.metadata")
-    here = Path(__file__).resolve().parents[3]
-    if _holds_project(here):
-        return here
-    try:
-        record = metadata.distribution("polarguide").read_text("direct_url.json")
-        url = json.loads(record or "{}").get("url", "")
-    except (metadata.PackageNotFoundError, ValueError):
-        return None
-    # It loads the web's protocols, and most processes refuse nothing.
-    path = importlib.import_module("urllib.request").url2pathname(urlsplit(url).path)
-    folder = Path(path)
-    return folder if url.startswith("file:") and _holds_project(folder) else None
-
-
-def _holds_project(folder: Path) -> bool:
-    """Whether a folder is polarguide's own checkout or source archive."""
-    return (folder / "src" / "polarguide").is_dir() and (folder / "pyproject.toml").is_file()
 
 
 class Requirement(NamedTuple):
@@ -132,7 +105,7 @@ def requirements() -> list[Requirement]:
     return listed
 
 
-def require_package(module: str, what: str, *, extra: str = "") -> None:
+def require_package(module: str, what: str) -> None:
     """Check that a package is there, without loading it: before work begins, not after. See ``optional_import``.
 
     Raises:
@@ -143,17 +116,16 @@ def require_package(module: str, what: str, *, extra: str = "") -> None:
     except (ImportError, ValueError):  # a package whose own metadata is broken
         there = False
     if not there:
-        raise _missing(module, what, extra)
+        raise _missing(module, what)
 
 
-def optional_import(module: str, what: str, *, extra: str = "") -> Any:
+def optional_import(module: str, what: str) -> Any:
     """Import a library that most verbs do without: then it costs them no time, and may be missing.
 
     Ctrl-C does what it did: dask_jobqueue, for one, would make every later one end the process at once.
 
     Args:
-        module: its name. what: what it is needed for, as the message says. extra: the extra of polarguide that
-            brings it; empty: it comes with polarguide.
+        module: its name. what: what it is needed for, as the message says.
 
     Raises:
         PolarguideError: the package is not installed.
@@ -162,17 +134,16 @@ def optional_import(module: str, what: str, *, extra: str = "") -> Any:
     try:
         return importlib.import_module(module)
     except ImportError:
-        raise _missing(module, what, extra) from None
+        raise _missing(module, what) from None
     finally:
         if before is not None and signal.getsignal(signal.SIGINT) is not before:
             signal.signal(signal.SIGINT, before)
 
 
-def _missing(module: str, what: str, extra: str = "") -> PolarguideError:
-    command = install_extra(extra) if extra else install_package(module)
+def _missing(module: str, what: str) -> PolarguideError:
     return PolarguideError(
         what,
         expected=f"the Python package {module.partition('.')[0]}",
         found="that it is not installed",
-        remedy=f"Install it with {command} and repeat the command.",
+        remedy=f"Install it with {install_package(module)} and repeat the command.",
     )

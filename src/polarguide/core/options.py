@@ -36,20 +36,21 @@ ExportFormat = Literal[
     "cameras",
     "all",
 ]
+Axes = Literal["upright", "scene"]
+PlyFields = Literal["release", "all"]
 BaseColor = Literal["delit", "diffuse", "photographs", "picture"]
 PictureFormat = Literal["png", "exr", "npy"]
 EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
     "spz": ("gaussforge",),
     "mesh": ("skimage", "trimesh"),
-    **dict.fromkeys(("glb", "obj", "all"), ("skimage", "xatlas", "fast_simplification")),
+    **dict.fromkeys(("glb", "obj"), ("skimage", "xatlas", "fast_simplification")),
+    "all": ("gaussforge", "skimage", "xatlas", "fast_simplification"),
     "usdz": ("pxr", "skimage", "xatlas", "fast_simplification"),
     "splat-usdz": ("pxr",),
     "stl": ("skimage", "fast_simplification"),
     "environment": ("OpenEXR",),
 }
 """The packages that formats need: looked for before a run is loaded."""
-EXPORT_EXTRAS = {"xatlas": "model", "fast_simplification": "model", "pxr": "usd"}
-"""The extras that bring packages of formats; others come with polarguide."""
 PathLike = str | os.PathLike[str]
 INDEX = 1.5
 """Refractive index of glass, plastic and glaze, for scenes that name none."""
@@ -99,6 +100,27 @@ def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
     if value not in allowed:
         expected = "one of " + ", ".join(allowed)
         raise PolarguideError(name, expected=expected, found=value, remedy="Correct the name.")
+
+
+def picture_size(size: str) -> tuple[int, int]:
+    """Width and height from text such as 1920x1080.
+
+    Raises:
+        PolarguideError: the text is something else, or a side is not from 16 to 8192.
+    """
+    try:
+        width, height = (int(part) for part in size.lower().split("x"))
+        right = min(width, height) >= 16 and max(width, height) <= 8192
+    except ValueError:
+        right = False
+    if not right:
+        raise PolarguideError(
+            "--size",
+            expected="width and height from 16 to 8192 such as 256x192",
+            found=repr(size),
+            remedy="Give whole numbers.",
+        )
+    return width, height
 
 
 _UNITS = {"k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}

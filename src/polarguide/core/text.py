@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import shlex
 from collections.abc import Iterable
 
 
@@ -34,6 +35,15 @@ def decimals(text: str) -> tuple[float, ...]:
         return tuple(decimal(part) for part in text.split(","))
     except ValueError:
         return ()
+
+
+def command(*words: object) -> str:
+    """A command line of polarguide that a shell takes as it is printed, whatever blanks names have.
+
+    Args:
+        words: the verb and what follows it; capital letters alone, such as SCENE, are for people to replace.
+    """
+    return shlex.join(["polarguide", *map(str, words)])
 
 
 def printable(text: str, *, lines: bool = False) -> str:

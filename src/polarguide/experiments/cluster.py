@@ -145,7 +145,7 @@ def _queued(manager: str, count: int, threads: int, memory: int) -> Iterator[Any
     submit = {"slurm": "sbatch", "pbs": "qsub"}[manager]
     if shutil.which(submit) is None:
         raise _no_cluster(manager, f"no command {submit}")
-    jobqueue = optional_import("dask_jobqueue", f"--{manager}", extra="cluster")
+    jobqueue = optional_import("dask_jobqueue", f"--{manager}")
     of = f"jobqueue.{manager}"
     extra: dict[str, dict[str, Any]] = {
         "slurm": {"job_cpu": threads},

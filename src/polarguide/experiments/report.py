@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -425,12 +426,22 @@ def _summary(results: Results) -> str:
     return f"{counts}, {record.settings.steps:,} steps a run{own}"
 
 
+def _without_folders(command: str) -> str:
+    """A command with the names of files and folders alone: where they lie on a machine is nobody's business."""
+    try:
+        words = shlex.split(command)
+    except ValueError:  # of a record that somebody has edited
+        return command
+    return shlex.join(Path(word).name if "/" in word else word for word in words)
+
+
 def _facts(results: Results) -> dict[str, str]:
     """The facts at the end of the report, by heading."""
     record = results.record
     facts = msgspec.to_builtins(record.provenance) | msgspec.to_builtins(record.settings)
     if facts["refractive_index"] is None:
         facts["refractive_index"] = "that of each scene"
+    facts["command"] = _without_folders(facts["command"])
     stated = {key.replace("_", " "): "unknown" if v is None else str(v) for key, v in facts.items()}
     for scene in record.scenes:
         index = (

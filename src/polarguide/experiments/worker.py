@@ -45,7 +45,7 @@ from polarguide.preparation.prepare import prepare_scene
 from polarguide.raster import choose_backend, use_threads
 from polarguide.results.evaluation.evaluate import evaluate
 from polarguide.results.evaluation.record import code_digest
-from polarguide.results.export import formats
+from polarguide.results.export import formats, web_page
 from polarguide.runs.folder import CONFIGURATION, writing_to
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import train
@@ -166,7 +166,7 @@ class _Work:
         }
 
     def _share(self) -> dict[str, Any]:
-        formats.share(self._opened(), self.folder / SHARE, title=self.task.name)
+        web_page.share(self._opened(), self.folder / SHARE, title=self.task.name)
         return {}
 
     def _export(self) -> dict[str, Any]:

@@ -141,6 +141,10 @@ class Gaussians(Trained):
         """Names of all tensors."""
         return tuple(self._tensors)
 
+    def only(self, mask: Tensor) -> dict[str, Tensor]:
+        """All tensors of some Gaussians, [N] bool, detached."""
+        return {name: t.detach()[mask] for name, t in self._tensors.items()}
+
     def snapshot(self) -> dict[str, Tensor]:
         """Detached copies of all tensors."""
         return {name: t.detach().clone() for name, t in self._tensors.items()}

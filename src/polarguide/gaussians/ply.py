@@ -1,9 +1,9 @@
 """PLY files of Gaussians as the 3DGS release writes them, so that ordinary viewers open them.
 
 One ``vertex`` per Gaussian, float32 binary little-endian: position, normal (where the release has zero),
-spherical harmonics of the display color, opacity (logit), scales (log), rotation (w, x, y, z). Our own
-fields follow in the same vertex. Viewers that read fields by name ignore them; the SIBR viewer of the release
-reads records of a fixed size and opens only files without extra fields.
+spherical harmonics of the display color, opacity (logit), scales (log), rotation (w, x, y, z). These are
+62 floats. Readers such as the SIBR viewer of the release take records of this size whatever the header says.
+Further fields make a file for readers that take fields by name.
 """
 
 from __future__ import annotations

@@ -172,6 +172,14 @@ class Camera:
         inner = {name: factor * getattr(self, name) for name in ("fx", "fy", "cx", "cy")}
         return replace(self, width=width, height=height, **inner)
 
+    def extended(self, width: int, height: int) -> Camera:
+        """The camera of a picture of another aspect ratio that holds this view as large as possible, in its middle."""
+        factor = min(width / self.width, height / self.height)
+        scaled = self.scaled(factor, width, height)
+        left = 0.5 * (width - factor * self.width)
+        top = 0.5 * (height - factor * self.height)
+        return replace(scaled, cx=scaled.cx + left, cy=scaled.cy + top)
+
     def downscaled(self, factor: int) -> Camera:
         """The camera of the same view averaged over ``factor`` x ``factor`` pixel boxes (remainders are cut)."""
         inner = {name: getattr(self, name) / factor for name in ("fx", "fy", "cx", "cy")}

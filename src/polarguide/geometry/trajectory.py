@@ -28,12 +28,17 @@ from polarguide.geometry.vectors import dot, unit
 
 LARGEST_SIDE = 8192
 MOST_FRAMES = 100_000
-REMEDY = "Give orbit, spiral, interpolate, or a JSON file with cameras as docs/how-to/export.md shows it."
+REMEDY = "Give orbit, spiral, turntable, interpolate, or a JSON file with cameras as docs/how-to/export.md shows it."
 Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE)]
 
 
 def orbit(
-    cameras: Sequence[Camera], frames: int, *, swing: float = 0.0, around: SceneFrame | None = None
+    cameras: Sequence[Camera],
+    frames: int,
+    *,
+    swing: float = 0.0,
+    around: SceneFrame | None = None,
+    distance: float | None = None,
 ) -> list[Camera]:
     """Once around the scene at the cameras' median height and distance, beginning at the first camera's side.
 
@@ -41,6 +46,7 @@ def orbit(
         cameras: cameras of the scene, at least one; the first one's lens is used.
         frames: pictures, the last a step before the first. swing: up and down by this share of the distance, twice.
         around: the scene's frame; that of the cameras if None.
+        distance: of the path from the frame's center, at the same elevation; that of the cameras if None.
     """
     around = around or scene_frame(cameras)
     ahead, side = _level_axes(around, cameras[0].center)
@@ -48,6 +54,9 @@ def orbit(
     height = float((offsets @ around.up).median())
     level = offsets - (offsets @ around.up)[:, None] * around.up
     radius = max(float(level.norm(dim=1).median()), 1e-6 * around.distance)
+    if distance is not None:
+        nearer = distance / math.hypot(radius, height)
+        radius, height = nearer * radius, nearer * height
     path = []
     for k in range(frames):
         angle = 2 * math.pi * k / frames

@@ -17,6 +17,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import write_text
 from polarguide.core.progress import Reporter
 from polarguide.core.system import MemoryBound
+from polarguide.core.text import command
 from polarguide.fields.model import FieldModel
 from polarguide.fields.recipe import NeuralRecipe
 from polarguide.fields.trainer import FieldTrainer
@@ -102,13 +103,13 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
         reporter.say(
             f"known angles were not checked: the model predicts polarization too poorly (pictures look "
             f"{specified[0].usual:.0f} degrees off in the median). "
-            f"polarguide inspect {scene.root} checks them by itself."
+            f"{command('inspect', scene.root)} checks them by itself."
         )
     if wrong := [judgment for judgment in judgments if judgment.contradicts]:
         first = wrong[0]
         reporter.warn(
             f"{named(wrong)} contradict their angles: {_name(names, first)} is specified at "
-            f"{first.specified.words} degrees and looks as if at {first.angle:.0f}. polarguide inspect {scene.root} "
+            f"{first.specified.words} degrees and looks as if at {first.angle:.0f}. {command('inspect', scene.root)} "
             "compares all angles by themselves; correct the names of the files or angles.csv where it agrees."
         )
 

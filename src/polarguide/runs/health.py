@@ -27,6 +27,7 @@ from polarguide.capture.view import listed
 from polarguide.core.files import write_text
 from polarguide.core.progress import Reporter
 from polarguide.core.records import read_record
+from polarguide.core.text import command
 from polarguide.gaussians.densify import Densification, free_space
 from polarguide.optics.color import srgb_encode
 from polarguide.runs.model import Model
@@ -368,8 +369,8 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
         more = f" and {len(far) - 4} more" if len(far) > 4 else ""
         warnings.append(
             f"training views far under those beside them: {worst}{more}. Pose, polarizer angle, exposure or focus of "
-            f"these photographs may be wrong: compare them with polarguide render --views {','.join(far[:4])}, and "
-            "correct them or leave them out."
+            f"these photographs may be wrong: {command('render', 'RUN', '--views', ','.join(far[:4]))} compares them "
+            "with the run; correct them or leave them out."
         )
     if exposed:
         told = listed([f"{name} {stops:+.2f}" for name, stops in exposed.items()])

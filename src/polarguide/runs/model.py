@@ -1,6 +1,7 @@
 """The model of a run, which renders layers, and its PLY.
 
-The PLY holds display values that ordinary 3DGS viewers show right, and our linear fields beside them.
+The PLY holds display values that ordinary 3DGS viewers show right, in the fields of the 3DGS release alone: readers
+with a fixed layout would take further fields for the next Gaussian. Our linear fields are written where asked for.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 from polarguide.capture.presentation import colored
-from polarguide.fields.model import FieldModel
+from polarguide.fields.model import FieldModel, Within
 from polarguide.gaussians.gaussians import CORE_SHAPES
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import refit_sh, write_ply
@@ -76,22 +77,35 @@ class GaussianModel:
 
     @torch.no_grad()
     def render(
-        self, camera: Camera, *, normals: bool = True, depth: bool = False, surface: bool = False
+        self,
+        camera: Camera,
+        *,
+        normals: bool = True,
+        depth: bool = False,
+        surface: bool = False,
+        within: Within | None = None,
     ) -> RenderResult:
         """All layers.
 
         Args:
             camera: any. normals: also where the model can do without them. depth: whether to render it.
             surface: normals and depth are those of the surface at the pixel's median depth, see ``raster.surface``.
+            within: which places [N, 3] of the scene are shown, [N] bool; None: all.
         """
+        gaussians: Parameters = self.state.gaussians
+        footprints = self.state.footprints
+        if within is not None:
+            inside = within(gaussians["means"].detach())
+            gaussians = self.state.gaussians.only(inside)
+            footprints = None if footprints is None else footprints[inside]
         return render(
-            self.state.gaussians,
+            gaussians,
             camera,
             self.backend.rasterize,
             RenderRequest(normals=normals, depth=depth, at_median_depth=surface),
             shading=self.shading,
             light=self.light,
-            footprints=self.state.footprints,
+            footprints=footprints,
         )
 
     @torch.no_grad()
@@ -202,6 +216,7 @@ def write_run_ply(
     *,
     color: Tensor | None = None,
     linear: bool = False,
+    own_fields: bool = False,
 ) -> None:
     """Write the trained Gaussians; see the module's text, and ``learned_normals`` for the centers of the cameras.
 
@@ -209,6 +224,7 @@ def write_run_ply(
         path: the file. state, shading: those of the run. centers: [M, 3] of the cameras.
         color: [3, 3] of a presentation; it holds for the harmonics that other programs show, never for our own fields.
         linear: whether the harmonics are of linear colors, for readers that want them.
+        own_fields: whether our linear fields follow those of the release.
     """
     gaussians = state.gaussians
 
@@ -222,5 +238,6 @@ def write_run_ply(
         for name in ("means", "log_scales", "quaternions", "opacity_logits")
     }
     plain["quaternions"] = torch.nn.functional.normalize(plain["quaternions"], dim=-1)
-    extra = {name: field.detach().cpu() for name, field in shading.fields(gaussians).items()}
+    own = shading.fields(gaussians) if own_fields else {}
+    extra = {name: field.detach().cpu() for name, field in own.items()}
     write_ply(path, **plain, sh_dc=dc, sh_rest=rest, normals=learned_normals(gaussians, centers), extra=extra)

@@ -19,12 +19,14 @@ from polarguide.capture.variants import mask_background, select_exposures
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.options import DeviceName, PathLike, SceneOptions, check_choice
 from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.text import command
+from polarguide.fields.model import Within
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame, scene_frame
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.runs.families import family_of
-from polarguide.runs.folder import RunConfiguration, load_checkpoint
+from polarguide.runs.folder import CONFIGURATION, RunConfiguration, load_checkpoint, writing_to
 from polarguide.runs.health import Health
 from polarguide.runs.model import GaussianModel, Model
 from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
@@ -199,6 +201,38 @@ class OpenedRun:
         return source.root if isinstance(source, Scene) else Path(source or self.configuration.scene)
 
     @property
+    def scene_is_there(self) -> bool:
+        """Whether the scene is at hand, or in its folder."""
+        return self._holds_scene or self.scene_folder.is_dir()
+
+    @property
+    def new_place(self) -> str:
+        """What to do where the scene was moved, for people."""
+        return f"If it was moved, say where it is: {command('present', self.folder, '--scene', 'NEWPLACE')}."
+
+    def point_to(self, scene: PathLike) -> None:
+        """Record in ``run.json`` where the scene of the run lies now.
+
+        Raises:
+            PolarguideError: there is no scene, or another than that of the training.
+        """
+        moved = OpenedRun(self.folder, self.configuration, self.recipe, self.model, scene=scene)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PolarguideWarning)  # of a scene that has changed: an error here
+            digest = moved.scene.digest
+        if digest != self.configuration.scene_digest:
+            raise PolarguideError(
+                scene,
+                expected=f"the scene that {self.folder} was trained on",
+                found="another, or one that has changed since",
+                remedy="Give the folder to which it was moved, as it was.",
+            )
+        self.configuration = replace(self.configuration, scene=str(Path(scene).resolve()))
+        with writing_to(self.folder):
+            self.configuration.save(self.folder)
+        self._scene_source = None
+
+    @property
     def presentation(self) -> Presentation:
         """How the run is presented: its own ``presentation.json`` over that of its scene, as they are now.
 
@@ -214,19 +248,50 @@ class OpenedRun:
         Raises:
             PolarguideError: the scene is not there any more, or has no such poses.
         """
-        if "scene" in self.__dict__ or isinstance(self._scene_source, Scene):
-            return scene_frame(list(self.cameras.values()))
+        return scene_frame([*self.poses.values()])
+
+    @cached_property
+    def poses(self) -> dict[str, Camera]:
+        """Cameras of the scene's views by name, of stored or of read pictures; reads no pictures itself.
+
+        Raises:
+            PolarguideError: the scene is not there any more, or has no such poses.
+        """
+        if self._holds_scene:
+            return self.cameras
         folder = self._folder_to_read()
         model = read_model(folder)
-        return scene_frame([model.camera(name) for name in find_layout(folder).names])
+        return {name: model.camera(name) for name in find_layout(folder).names}
+
+    @property
+    def has_masks(self) -> bool:
+        """Whether the scene has masks of the foreground.
+
+        Raises:
+            PolarguideError: the scene is not there any more.
+        """
+        if self._holds_scene:
+            return any(view.mask is not None for view in self.scene.views)
+        return bool(find_layout(self._folder_to_read()).masks)
+
+    @property
+    def _holds_scene(self) -> bool:
+        return "scene" in self.__dict__ or isinstance(self._scene_source, Scene)
 
     def _folder_to_read(self) -> Path:
         """``scene_folder``, for what is read from it.
 
         Raises:
-            PolarguideError: the scene was one of arrays, and has no folder.
+            PolarguideError: the scene was one of arrays, and has no folder; or it is not there any more.
         """
         folder = self.scene_folder
+        if self._scene_source is None and folder != IN_MEMORY and not folder.exists():
+            raise PolarguideError(
+                folder,
+                expected=f"the scene of {self.folder}, whose {CONFIGURATION} names this place",
+                found="nothing",
+                remedy=self.new_place,
+            )
         if folder == IN_MEMORY:
             raise PolarguideError(
                 "scene",
@@ -259,6 +324,7 @@ class OpenedRun:
         depth: bool = True,
         surface: bool = True,
         polarized: bool = False,
+        within: Within | None = None,
     ) -> RenderResult:
         """Everything that can be rendered, as one typed record on the run's device.
 
@@ -268,9 +334,10 @@ class OpenedRun:
             surface: whether they are those of the surface at the pixel's median depth; otherwise blended, which is
                 faster.
             polarized: whether to predict Stokes vectors, where the model can.
+            within: which places [N, 3] of the scene are shown, [N] bool; None: all.
         """
         chosen = self.scene.view(camera).camera if isinstance(camera, str) else camera
-        result = self.model.render(chosen, normals=normals, depth=depth, surface=surface)
+        result = self.model.render(chosen, normals=normals, depth=depth, surface=surface, within=within)
         return replace(result, predicted=self.model.stokes(result, chosen)) if polarized else result
 
     def render(self, camera: Camera | str, layers: Iterable[str] = ("final",)) -> dict[str, Tensor]:

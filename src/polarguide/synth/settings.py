@@ -15,6 +15,7 @@ from msgspec import Meta
 
 from polarguide.capture.sensor.pattern import SENSORS, Sensor, any_case, sensor_named
 from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.options import picture_size
 from polarguide.core.records import check_options
 from polarguide.synth.schema import SceneSpec, parse_scene, read_scene_file
 
@@ -34,7 +35,7 @@ class _Library:
         self._module = module
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(optional_import(self._module, "synth", extra="synth"), name)
+        return getattr(optional_import(self._module, "synth"), name)
 
 
 dr: Any = _Library("drjit")
@@ -172,12 +173,12 @@ class SynthSettings:
     @property
     def width(self) -> int:
         """Of the pictures."""
-        return _pixels(self.size)[0]
+        return picture_size(self.size)[0]
 
     @property
     def height(self) -> int:
         """Of the pictures."""
-        return _pixels(self.size)[1]
+        return picture_size(self.size)[1]
 
     def data(self) -> dict[str, Any]:
         """As JSON."""
@@ -191,24 +192,7 @@ class SynthSettings:
     def check(self) -> None:
         """Raises PolarguideError where a value makes no sense."""
         check_options(self)
-        _pixels(self.size)
-
-
-def _pixels(size: str) -> tuple[int, int]:
-    """Width and height from text such as 256x192."""
-    try:
-        width, height = (int(part) for part in size.lower().split("x"))
-        right = min(width, height) >= 16 and max(width, height) <= 8192
-    except ValueError:
-        right = False
-    if not right:
-        raise PolarguideError(
-            "--size",
-            expected="width and height from 16 to 8192 such as 256x192",
-            found=repr(size),
-            remedy="Give whole numbers.",
-        )
-    return width, height
+        picture_size(self.size)
 
 
 @dataclass(frozen=True)

@@ -53,11 +53,6 @@ class Letterbox:
     top: float
     frame_size: tuple[int, int]
 
-    def camera(self, photograph: Camera) -> Camera:
-        """The photograph's camera, extended to the window."""
-        scaled = photograph.scaled(self.scale, *self.frame_size)
-        return replace(scaled, cx=scaled.cx + self.left, cy=scaled.cy + self.top)
-
     def apply(self, picture: Picture) -> Picture:
         """A picture of the photograph's size, resampled into the window with gray borders."""
         matrix = np.array([[self.scale, 0, self.left], [0, self.scale, self.top]])
@@ -80,7 +75,7 @@ def drawn_camera(camera: Camera, view: View | None) -> Camera:
     """The camera of a window's picture: a free one, or that of a view's pose in a window of this size."""
     if view is None:
         return camera
-    return letterbox(view.camera, (camera.width, camera.height)).camera(view.camera)
+    return view.camera.extended(camera.width, camera.height)
 
 
 def window_fov(photograph: Camera, aspect: float) -> float:

@@ -103,7 +103,7 @@ class GaussianScenery:
         footprints = self.footprints
         if within is not None:
             inside = within(self.gaussians["means"].detach())
-            gaussians = {name: self.gaussians[name].detach()[inside] for name in self.gaussians.names}
+            gaussians = self.gaussians.only(inside)
             footprints = None if footprints is None else footprints[inside]
         return render(
             gaussians,

@@ -6,6 +6,8 @@ import asyncio
 import contextlib
 import functools
 import io
+import platform
+import shlex
 import socket
 import threading
 import time
@@ -28,6 +30,7 @@ from polarguide.capture.presentation import (
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.options import LOOPBACK, VisitorOptions
 from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.system import network_address
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.results.rendering.picking import gray_world
 from polarguide.runs.families import AnyTrainer
@@ -48,6 +51,10 @@ REFRESH = 1.0  # least seconds between two pictures of a training,
 SHARE = 10.0  # which are also at least this multiple of the time that the last one took
 TICK = 0.02
 REACH = 1e4  # how far a camera goes from the scene, as a multiple of the cameras' distance
+
+
+EVERYWHERE = ("0.0.0.0", "::")
+"""What stands for all addresses of the machine."""
 
 
 def viewing_address(host: str, port: int) -> str:
@@ -125,7 +132,8 @@ class Viewer:
             stack.pop_all()
         self._server.scene.set_up_direction(tuple(presentation.upright(around).up.tolist()))
         self._server.scene.world_axes.visible = False
-        self.address = viewing_address(host, self._server.get_port())
+        self.port: int = self._server.get_port()
+        self.address = viewing_address(host, self.port)
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._disconnected)
 
@@ -364,6 +372,7 @@ def save_to_run(run: OpenedRun, chosen: Presentation) -> str:
         fields[name] = None if value == inherited else value
         if value is None and inherited is not None:
             unchanged.append(name)
+    fields["whole"] = own.whole and chosen.crop is None
     write_presentation(run.folder, msgspec.structs.replace(own, **fields))
     if unchanged:
         return f"Saved; the scene's own {', '.join(unchanged)} still counts"
@@ -424,5 +433,15 @@ def _opened(
     with closing(viewer):
         if host not in LOOPBACK:
             reporter.warn(f"whoever reaches {host} over the network can look: there is no password")
+            for line in from_elsewhere(host, viewer.port):
+                reporter.say(line)
         reporter.say(f"viewer: {viewer.address}")
         yield viewer
+
+
+def from_elsewhere(host: str, port: int) -> list[str]:
+    """Lines for people at other machines: the address, and the way that opens it to nobody else."""
+    here = network_address() if host in EVERYWHERE else host
+    lines = [] if here is None else [f"from other machines: {viewing_address(here, port)}"]
+    tunnel = shlex.join(["ssh", "-L", f"{port}:127.0.0.1:{port}", here or platform.node()])
+    return [*lines, f"for you alone, without --host: {tunnel}   and there http://127.0.0.1:{port}"]

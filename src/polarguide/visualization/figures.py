@@ -333,6 +333,17 @@ def with_key(picture: Picture, key: Picture, width: int) -> Picture:
     return drawn
 
 
+def with_name(picture: Picture, name: str) -> Picture:
+    """A picture with a name in its upper left corner, white on a dark rim, a thirtieth of its shorter side high."""
+    drawn = picture.copy()
+    size = min(picture.shape[:2])
+    scale = size / 30 / cv2.getTextSize("x", FONT, 1.0, 1)[0][1]
+    thick = max(1, round(size / 400))
+    for color, width in (((0, 0, 0), 3 * thick), ((255, 255, 255), thick)):
+        cv2.putText(drawn, name, (size // 40, size // 16), FONT, scale, color, width, cv2.LINE_AA)
+    return drawn
+
+
 def color_patch(color: int, text: str) -> Picture:
     """A patch of a gray from 0 to 255, and below it what it means: uint8 RGB [44, 256, 3]."""
     return _bar(np.full((22, 256, 3), color, np.uint8), text)

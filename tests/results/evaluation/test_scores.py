@@ -279,7 +279,9 @@ def test_shown_metrics_are_those_of_the_tables(views):
     assert shown["PSNR"] == f"{means['psnr']:.3f} dB"
     assert shown["normals within 11.25 deg"] == "25.000 %"
     assert (shown["Gaussians"], shown["training"]) == ("1,000", "n/a (the log is gone)")
-    assert shown["LPIPS"] == (f"n/a ({means['lpips_reason']})" if means["lpips"] is None else shown["LPIPS"])
+    lacking = means | {"lpips": None, "lpips_reason": "not installed: its weights are missing"}
+    assert dict(table.shown_metrics(lacking))["LPIPS"] == "n/a (not installed)"
+    assert table.explained(lacking) == ["LPIPS: its weights are missing"]
     assert shown["FLIP"] == f"{means['flip']:.3f}"
     only_scores = dict(table.shown_metrics(means | {"ssim": None}, scores_only=True))
     assert not {"SSIM", "Gaussians", "FPS", "specular PSNR aligned"} & set(only_scores)

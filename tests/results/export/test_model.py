@@ -20,7 +20,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from torch import Tensor
 
 from polarguide.capture.presentation import Crop, Presentation
-from polarguide.core.errors import install_extra, require_package
+from polarguide.core.errors import install_package, require_package
 from polarguide.core.options import ModelOptions
 from polarguide.core.progress import SILENT
 from polarguide.geometry.camera import Camera
@@ -37,6 +37,7 @@ from polarguide.results.export.model.unwrap import Unwrapped, unwrap
 from polarguide.results.export.placement import IN_PLACE
 from polarguide.results.rendering.mesh import ColoredMesh, Surface
 from polarguide.results.rendering.relight import mirrored_light
+from polarguide.results.rendering.subject import subject_of
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.result import RenderResult
 
@@ -261,7 +262,9 @@ def model_of(
     folder.mkdir(exist_ok=True)
     chosen = ModelOptions(triangles=3000, texture=512, **options)
     run = ball_run(light)
-    subject = charted_subject(run, ball_view, presentation, chosen, 64, folder, SILENT)
+    run.presentation, run.has_masks, run.poses = presentation, False, CAMERAS
+    inside = subject_of(run).inside
+    subject = charted_subject(run, ball_view, inside, chosen, 64, folder, SILENT)
     return textured_model(run, subject, presentation, IN_PLACE, chosen, SILENT)
 
 
@@ -365,9 +368,9 @@ def test_faults_are_named_before_work_begins(tmp_path: Path, monkeypatch: pytest
     Fault(where="triangles", expected="100 or more").raised_by(ModelOptions, triangles=5)
     Fault(where="texture", expected="16384").raised_by(ModelOptions, texture=99_999)
     Fault(where="albedo_scale").raised_by(ModelOptions, albedo_scale=float("nan"))
-    extra = {"what": "--format glb", "extra": "model"}
-    Fault(where="--format glb", expected="no_such", remedy=install_extra("model")).raised_by(
-        require_package, "no_such", **extra
+    remedy = install_package("no_such")
+    Fault(where="--format glb", expected="no_such", remedy=remedy).raised_by(
+        require_package, "no_such", "--format glb"
     )
     monkeypatch.setattr(build, "free_memory", lambda: 10**9)
     Fault(where="--texture", found="8192 x 8192").raised_by(require_room, 8192)

@@ -26,8 +26,8 @@ from polarguide.geometry.scene_frame import scene_frame
 from polarguide.optics.color import srgb_decode_array, srgb_encode_array
 from polarguide.results.export.model import build
 from polarguide.results.export.model.gltf import Textured
-from polarguide.results.export.model.subject import subject_of
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
+from polarguide.results.rendering.subject import subject_of
 from polarguide.runs.model import write_run_ply
 
 trimesh = pytest.importorskip("trimesh")
@@ -165,9 +165,9 @@ def test_a_package_tells_of_itself(credited: Path, tmp_path: Path, monkeypatch: 
     once.assert_called_once()
     record = json.loads((out / "model.json").read_text())
     assert {*record["files"], "model.json"} == {path.name for path in out.iterdir()}
-    assert {"model.glb", "model-unlit.glb", "splats-srgb.glb", "environment.hdr", "preview.png"} <= {
-        *record["files"]
-    }
+    assert {"model.glb", "model-unlit.glb", "splats-srgb.glb", "environment.hdr", "preview.png"} | {
+        f"splats.{kind}" for kind in ("ply", "spz", "sog")
+    } <= {*record["files"]}
     about = (record["title"], record["author"], record["license"], record["units"], record["scale_of_scene"])
     assert about == ("A thing", "Somebody", "CC0", "meters", 0.5)
     assert record["color"] is None
@@ -208,11 +208,29 @@ def test_masks_choose_the_subject() -> None:
     mask = torch.zeros(72, 96, dtype=torch.bool)
     mask[:36] = True  # the upper half
     views = [SimpleNamespace(camera=camera, mask=mask) for camera in cameras.values()]
-    opened: Any = SimpleNamespace(scene=SimpleNamespace(views=views), camera_frame=frame)
-    inside = subject_of(opened, None, masked=True)
+    plain = Presentation()
+    opened: Any = SimpleNamespace(
+        scene=SimpleNamespace(views=views), has_masks=True, camera_frame=frame, presentation=plain
+    )
+    inside = subject_of(opened).inside
     assert inside is not None
     places = (frame.center + torch.tensor([[0.3], [-0.3]]) * frame.distance * up).numpy()
     assert inside(places).tolist() == [True, False]
-    assert subject_of(opened, None, masked=False) is None
-    bare: Any = SimpleNamespace(scene=SimpleNamespace(views=[SimpleNamespace(mask=None)]))
-    Fault(where="--masked", found="none").raised_by(subject_of, bare, None, masked=True)
+    opened.presentation = Presentation(whole=True)
+    assert subject_of(opened).inside is None
+    opened.has_masks = False
+    Fault(where="--masked", found="none").raised_by(subject_of, opened, masked=True)
+
+
+def test_without_masks_it_is_what_most_cameras_look_at() -> None:
+    """A ring of cameras: their center, and not what lies behind it, which a few of them see, nor behind their backs."""
+    cameras = ring(12, width=96, height=72)
+    frame = scene_frame(list(cameras.values()))
+    opened: Any = SimpleNamespace(presentation=Presentation(), has_masks=False, poses=cameras)
+    subject = subject_of(opened)
+    across = frame.panorama_axes()[:, 0]
+    places = frame.center + torch.tensor([[0.0], [0.2], [1.0], [3.0]]) * frame.distance * across
+    assert subject.holds(places).tolist() == [True, True, False, False]
+    opened.folder = Path("my run")
+    assert "polarguide present 'my run' --crop all" in subject.told(2, 4, opened)
+    assert subject.told(4, 4, opened) == ""

@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from random_runs import KINDS, random_state, ring
 
 from polarguide.capture.presentation import Presentation
 from polarguide.gaussians.harmonics import evaluate_sh
+from polarguide.results.export import web_page
 from polarguide.results.export.share import BAKED, baked_page, harmonics_steps, records, share_page
 from polarguide.runs.model import gaussian_colors
 from polarguide.shading.deferred import DeferredShading
@@ -23,7 +25,14 @@ REFLECTING = ["final", "diffuse", "specular", "base", "strength", "normal"]
 LAYERS = {
     "plain": ["final", "normal"],
     "reflection": REFLECTING,
-    "local": [*REFLECTING, "roughness"],
+    "local": [
+        "final",
+        "diffuse",
+        "specular",
+        "strength",
+        "normal",
+        "roughness",
+    ],  # its base is the diffuse layer
     "directional": ["final", "diffuse", "specular", "base", "normal"],
 }
 TEXELS = {"plain": 6, "reflection": 6, "local": 10, "directional": 4}
@@ -141,6 +150,34 @@ def test_baked_harmonics_are_near_the_colors_that_they_stand_for() -> None:
     )
     # Of degree 3 but for the cut at black, which harmonics only come near to.
     assert float((found + 0.5 - expected).abs().mean()) < 0.02
+
+
+def test_every_layer_has_words_and_scores_are_behind_a_switch() -> None:
+    reader = Reader(page("polarguide-stokes"))
+    scene = json.loads(reader.scripts["scene"])
+    assert scene["words"].keys() == set(scene["layers"])
+    assert all(words["label"] and words["sentence"] for words in scene["words"].values())
+    assert scene["words"]["roughness"]["high"] == "matte"
+    assert tuple(tag for tag in reader.tags if tag in ("details", "summary", "table")) == (
+        "details",
+        "summary",
+        "table",
+    )
+    assert "open" not in [key for key, _ in reader.attributes]
+
+
+def test_it_begins_at_the_best_view_and_brightens_dark_gloss() -> None:
+    views = [SimpleNamespace(name=name) for name in ("a", "b", "c")]
+    scores = {"views": {"a": {"psnr": 20.0}, "b": {"psnr": 30.0}}}
+    assert web_page._best_view(views, scores, None).name == "b"
+    health = SimpleNamespace(views={"c": SimpleNamespace(psnr=25.0), "a": SimpleNamespace(psnr=None)})
+    assert web_page._best_view(views, None, health).name == "c"
+    assert web_page._best_view(views, None, None).name == "a"
+    alpha = torch.ones(10, 10)
+    for brightest, times in ((0.2, 4.0), (1.5, 1.0), (1e-4, 16.0)):
+        result = SimpleNamespace(specular=torch.full((10, 10, 3), brightest), alpha=alpha)
+        assert web_page._gloss(result) == times
+    assert web_page._gloss(SimpleNamespace(specular=None, alpha=alpha)) == 1.0
 
 
 def test_the_same_run_gives_the_same_page() -> None:

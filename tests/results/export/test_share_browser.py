@@ -68,7 +68,10 @@ class Opened:
         self.until("!polarguide.waiting && !polarguide.drawing && !polarguide.moving")
 
     def shot(self) -> np.ndarray:
-        self.page.evaluate("document.activeElement.blur()")  # no frame around the picture
+        """The picture without what is written over it, and without a frame around it."""
+        self.page.evaluate("document.activeElement.blur()")
+        for name in ("legend", "drag", "left", "right"):
+            self.page.evaluate(f"document.getElementById('{name}').hidden = true")
         self.settled()
         return decoded(self.page.locator("#stage").screenshot())
 
@@ -183,6 +186,23 @@ def test_layer_buttons_and_keys(fresh: Opened) -> None:
         fresh.page.focus("#picture")
         fresh.page.keyboard.press(str(key))
         assert (fresh.shot() == chosen).all()
+
+
+def test_a_layer_is_explained_and_the_hint_goes_when_it_was_followed(fresh: Opened) -> None:
+    fresh.page.click("button[data-layer=roughness]")
+    said = [fresh.page.inner_text(f"#{part}") for part in ("sentence", "low", "high")]
+    assert said == ["roughness: how blurred mirror images are", "mirror", "matte"]
+    fresh.page.click("#compare")
+    assert [fresh.page.inner_text(f"#{side}") for side in ("left", "right")] == ["without gloss", "roughness"]
+    fresh.page.click("#reset")
+    assert not fresh.page.is_visible("#ends")
+    assert fresh.page.is_visible("summary")
+    assert not fresh.page.is_visible("table")
+    fresh.page.evaluate("document.getElementById('drag').className = ''")
+    fresh.page.focus("#picture")
+    fresh.page.keyboard.press("ArrowLeft")
+    fresh.settled()
+    assert fresh.page.get_attribute("#drag", "class") == "done"
 
 
 def test_mouse_turns_shifts_and_zooms(fresh: Opened) -> None:

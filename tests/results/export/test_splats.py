@@ -46,6 +46,8 @@ FIELDS = {
 def test_the_file_holds_display_colors_and_the_fields_of_the_model(name: str, tmp_path: Path) -> None:
     state, shading = random_state(name, COUNT)
     write_run_ply(tmp_path / "run.ply", state, shading)
+    assert read_ply(tmp_path / "run.ply")["extra"] == {}
+    write_run_ply(tmp_path / "run.ply", state, shading, own_fields=True)
     read = read_ply(tmp_path / "run.ply")
     assert set(read["extra"]) == FIELDS[name]
     assert all(bool(torch.isfinite(t).all()) for t in (read["sh_dc"], read["sh_rest"]))
@@ -241,7 +243,8 @@ TURNED = Presentation(up_axis=UP, meters_per_unit=0.2)
 
 
 def placed(presentation: Presentation) -> Placement:
-    return Placement.of(presentation, presentation.upright(AROUND))
+    """In the scene's own axes where no up axis was chosen."""
+    return Placement.of(presentation, presentation.upright(AROUND) if presentation.up_axis else None)
 
 
 def picture(ply: Path, camera, field: str = "") -> torch.Tensor:  # type: ignore[no-untyped-def]
@@ -270,7 +273,7 @@ def picture(ply: Path, camera, field: str = "") -> torch.Tensor:  # type: ignore
 def test_the_same_picture_from_the_same_place(presentation: Presentation, tmp_path: Path) -> None:
     state, shading = random_state("polarguide-stokes")
     whole, moved, placement = tmp_path / "whole.ply", tmp_path / "moved.ply", placed(presentation)
-    write_run_ply(whole, state, shading)
+    write_run_ply(whole, state, shading, own_fields=True)
     rewrite_splats(moved, whole, placement, None, [])
     camera = CAMERAS["v2"]
     for field in ("", "linear"):

@@ -147,8 +147,6 @@ def plain_damage(data: bytes) -> str | None:
     return None
 
 
-EXTRA = "heic"
-"""The extra that brings pillow-heif."""
 _BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif", b"avis")
 _AVIF = (b"avif", b"avis")
 _ORIENTATION_OF_TURNS = (1, 8, 3, 6)
@@ -280,7 +278,7 @@ def heif_pixels(path: Path, data: bytes) -> NDArray[Any]:
         ValueError: the file is of a kind that is not read; the text is a noun phrase that says why.
         Exception: of several kinds, where the file is damaged.
     """
-    library, head = optional_import("pillow_heif", str(path), extra=EXTRA), heif_head(data)
+    library, head = optional_import("pillow_heif", str(path)), heif_head(data)
     assert head is not None
     opened = library.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False, bgr_mode=True)
     if len(opened) > 1:

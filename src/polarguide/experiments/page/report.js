@@ -189,7 +189,33 @@
     }
   }
 
+  /* A choice of the columns of a section's tables, which have the same: a table is wider than many windows. */
+  function setUpColumns() {
+    for (const section of document.querySelectorAll("section")) {
+      const tables = [...section.querySelectorAll(".scroll > table:not(.facts)")];
+      if (!tables.length) continue;
+      const labels = Number(tables[0].className.match(/labels(\d)/)[1]);
+      const heads = [...tables[0].tHead.rows[0].cells].slice(labels);
+      if (heads.length < 5) continue;
+      const choice = make("details", "columns");
+      choice.append(make("summary", "", `columns (${heads.length})`));
+      heads.forEach((head, place) => {
+        const label = make("label"), box = make("input");
+        box.type = "checkbox";
+        box.checked = true;
+        box.onchange = () => {
+          for (const table of tables)
+            for (const row of table.rows) row.cells[labels + place].hidden = !box.checked;
+        };
+        label.append(box, head.textContent);
+        choice.append(label);
+      });
+      section.querySelector("h2").after(choice);
+    }
+  }
+
   setUpCurves();
+  setUpColumns();
   if (views.length) {
     setUpChoices();
     setUpPointer();

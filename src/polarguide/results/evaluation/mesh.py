@@ -61,14 +61,12 @@ def mesh_scores(surface: Callable[[], Surface], views: Sequence[View]) -> Mappin
 
 
 def missing_package() -> str | None:
-    """Which package that makes a mesh is not installed, and how to install it; None where all are."""
+    """Which package that makes a mesh is not installed; None where all are."""
     for module in EXPORT_PACKAGES["mesh"]:
         try:
             require_package(module, MESH_LABEL)
         except PolarguideError as error:
-            return (
-                f"{error.expected} is not installed; {error.remedy[0].lower()}{error.remedy[1:].rstrip('.')}"
-            )
+            return f"not installed: {error.expected}; polarguide doctor has the command that adds it"
     return None
 
 

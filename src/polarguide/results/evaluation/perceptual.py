@@ -24,7 +24,7 @@ FOLDER = "POLARGUIDE_LPIPS"
 """Variable of the environment: a folder with the two files of weights."""
 NETWORK, CHANNELS = "vgg16-397923af.pth", "vgg.pth"
 """Names of the files: of the network's convolutions, as torch's hub calls it, and of the weights of channels."""
-FETCH_COMMAND = f"python -c \"import torch; torch.hub.load_state_dict_from_url('https://download.pytorch.org/models/{NETWORK}')\""
+HELP = "docs/reference/metrics.md, LPIPS, has the commands that add them"
 _STAGES = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
 """Numbers of the convolutions between two halvings, as the file of the network counts its layers."""
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
@@ -96,12 +96,11 @@ def places(name: str) -> list[Path]:
 def load_lpips() -> tuple[Lpips | None, str | None]:
     """The distance, loaded once per process and place of its files: (distance, None), or (None, reason)."""
     files = []
-    for name, fetched in ((NETWORK, f"fetch it: {FETCH_COMMAND}"), (CHANNELS, "the extra lpips brings it")):
+    for name in (NETWORK, CHANNELS):
         there = [path for path in places(name) if path.is_file()]
         if not there:
-            searched = " or ".join(str(path.parent) for path in places(name))
-            remedy = fetched if not os.environ.get(FOLDER) else f"{FOLDER} names this folder"
-            return None, f"its weights {name} are not in {searched} ({remedy})"
+            where = f"not in the folder that {FOLDER} names" if os.environ.get(FOLDER) else "missing"
+            return None, f"not installed: its weights {name} are {where}; {HELP}"
         files.append(there[0])
     return _loaded(*files)
 
@@ -114,7 +113,7 @@ def _loaded(network: Path, channels: Path) -> tuple[Lpips | None, str | None]:
         ), None
     except Exception as error:  # a file that is cut short fails in many ways
         first = str(error).strip().splitlines()[0][:200] if str(error).strip() else "no reason"
-        return None, f"{network} and {channels} are no weights of LPIPS ({type(error).__name__}: {first})"
+        return None, f"damaged: {network.name} and {channels.name} are no weights of LPIPS ({first})"
 
 
 # Five halvings: below this the last layer of the network has no pixel.
@@ -195,4 +194,4 @@ def load_package() -> tuple[Any, str | None]:
     try:
         return optional_import("flip_evaluator", "FLIP"), None
     except PolarguideError:
-        return None, f"the package {PACKAGE} is not installed"
+        return None, f"not installed: the package {PACKAGE}"

@@ -231,8 +231,9 @@ def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> li
         scores_only: leave out what belongs to the run alone (times, counts) and what has no value.
 
     Returns:
-        Labels and values with their units, in the order of the table; "n/a" and why for a metric without a value. One
-        that has no reason recorded, for want of ground truth or of a layer, is left out: see ``absent_metrics``.
+        Labels and values with their units, in the order of the table; "n/a" and why for a metric without a value, in
+        a few words: ``explained`` has the rest. One that has no reason recorded, for want of ground truth or of a
+        layer, is left out: see ``absent_metrics``.
         Below the PSNR stands that of the worst view, which a mean hides.
     """
     lines = []
@@ -242,9 +243,20 @@ def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> li
             continue
         reason = record.get(f"{metric.key}_reason")
         if value is not None or reason:
-            lines.append((metric.label, f"n/a ({reason})" if value is None else metric.text(value)))
+            why = str(reason).partition(": ")[0]
+            lines.append((metric.label, f"n/a ({why})" if value is None else metric.text(value)))
         if metric.key == "psnr":
             lines += _worst_view(record, metric)
+    return lines
+
+
+def explained(record: Mapping[str, Any]) -> list[str]:
+    """What is more to say of metrics that a table calls "n/a", a line each."""
+    lines = []
+    for metric in METRICS:
+        more = str(record.get(f"{metric.key}_reason") or "").partition(": ")[2]
+        if more and metric.shown == "tables" and record.get(metric.key) is None:
+            lines.append(f"{metric.label}: {more}")
     return lines
 
 

@@ -1,52 +1,52 @@
-"""A run as the files of other programs, and as a web page."""
+"""A run as the files of other programs."""
 
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from polarguide.capture import read_model
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.presentation import colored
-from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.errors import PolarguideError
 from polarguide.core.files import (
     atomic_folder,
-    holds_files,
     make_folder,
     require_inside,
     temporary_folder,
     write_text,
 )
-from polarguide.core.options import ExportFormat, ModelOptions, PathLike, check_choice, check_finite
+from polarguide.core.options import (
+    Axes,
+    ExportFormat,
+    ModelOptions,
+    PathLike,
+    PlyFields,
+    check_choice,
+    check_finite,
+)
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.fields.model import FieldModel
 from polarguide.optics.color import srgb_encode
-from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
-from polarguide.results.evaluation.table import shown_metrics
+from polarguide.results.export.cameras import write_cameras
 from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
 from polarguide.results.export.model.build import BASE_COLORS, Charted, charted_subject, textured_model
 from polarguide.results.export.model.gltf import write_glb
 from polarguide.results.export.model.obj import write_obj
-from polarguide.results.export.model.subject import counted, subject_of, subject_surface, write_stl
+from polarguide.results.export.model.subject import subject_surface, write_stl
 from polarguide.results.export.package import RECORD, about_files, package_record
 from polarguide.results.export.placement import (
     GENERATOR,
     Placement,
     comments,
     rewrite_splats,
-    write_colmap,
-    write_transforms,
 )
 from polarguide.results.export.presented import Presented
-from polarguide.results.export.share import share_page
 from polarguide.results.export.splat_glb import COLOR_SPACES, Encoding, write_splat_glb
 from polarguide.results.export.splats import write_sog, write_spz
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
@@ -62,8 +62,6 @@ from polarguide.runs.model import write_run_ply
 from polarguide.runs.opened import OpenedRun
 from polarguide.visualization import figures
 
-TRANSFORMS = "transforms.json"
-
 PANORAMA_HEIGHT = 512
 SPLATS = ("ply", "spz", "sog", "splat-glb", "splat-usdz", "points")
 """Formats of Gaussians."""
@@ -76,13 +74,15 @@ def export(
     *,
     resolution: int = RESOLUTION,
     spz_version: int = 3,
+    fields: PlyFields = "release",
+    axes: Axes = "upright",
     model: ModelOptions = ModelOptions(),
     reporter: Reporter = SILENT,
 ) -> list[Path]:
-    """Write a run as the files of other programs, as it is presented: in its color, cropped, in meters, upright.
+    """Write a run as the files of other programs, as it is presented: its subject, in its color, in meters, upright.
 
     Args:
-        run: the run; its scene is read for all but ply, spz and sog.
+        run: the run; of its scene, ply, spz and sog need poses and masks alone.
         format: ply, spz, sog and splat-glb are ordinary splats, with reflections baked as far as harmonics carry
             them; mesh (GLB and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb and
             obj are a textured model; points are opaque Gaussians with normals; environment is the learned light as a
@@ -90,6 +90,8 @@ def export(
         out: folder to write; ``export`` in the run's folder by default.
         resolution: voxels of the mesh along its longest side, 16 to 1024.
         spz_version: version of the SPZ file, 3 or 4; readers are split between them.
+        fields: of ply: release is the 62 floats of the 3DGS release; all adds polarguide.ply, with our linear fields.
+        axes: upright, +y in GLB and USD, -y elsewhere; or scene, the scene's own in all but GLB and USD.
         model: options of the textured model.
         reporter: receives progress.
 
@@ -104,7 +106,7 @@ def export(
         require_inside(run.folder, folder)
     refuse_scene(folder)
     writers: dict[str, Callable[[], list[Path]]] = {
-        "ply": lambda: [_ply(run, presented, folder / "splats.ply")],
+        "ply": lambda: _plys(run, presented, folder, fields),
         "spz": lambda: [_spz(run, presented, folder / "splats.spz", spz_version)],
         "sog": lambda: [_sog(run, presented, folder / "splats.sog")],
         "splat-glb": lambda: _splat_glb(run, presented, folder),
@@ -116,68 +118,32 @@ def export(
         "stl": lambda: _stl(run, presented, folder / "model.stl", resolution, model, reporter),
         "points": lambda: _points(run, presented, folder),
         "environment": lambda: _environment(run, presented, folder, reporter),
-        "cameras": lambda: _cameras(run, presented, folder),
-        "all": lambda: _all(run, presented, folder, resolution, model, reporter),
+        "cameras": lambda: write_cameras(run, presented, folder, reporter),
+        "all": lambda: _all(run, presented, folder, resolution, spz_version, model, reporter),
     }
     check_choice("format", format, writers)
     check_finite("resolution", resolution, 16, 1024)
     check_finite("spz_version", spz_version, 3, 4)
+    check_choice("fields", fields, get_args(PlyFields))
+    check_choice("axes", axes, get_args(Axes))
+    if fields != "release" and format != "ply":
+        expected = "release, but for --format ply"
+        raise PolarguideError("fields", expected=expected, found=fields, remedy="Leave it out.")
     if format in SPLATS:
         run.gaussian_model(f"format {format}")
-    presented = Presented(run)
+    # What shows no Gaussians says nothing of how many there are.
+    heard = SILENT if format in ("environment", "cameras") else reporter
+    presented = Presented(run, axes=axes, masked=model.masked, reporter=heard)
     make_folder(folder)
     with reporter.track(f"writing {format}", None):
         return writers[format]()
 
 
-def share(run: OpenedRun, path: PathLike | None = None, *, title: str = "", caption: str = "") -> Path:
-    """Write a run as one web page that renders it with its reflections, and needs nothing beside itself.
-
-    The photographs' poses are its views; the first test view is where it begins.
-
-    Args:
-        run: the run; its scene is read.
-        path: file to write, ending in .html; ``share.html`` in the run's folder by default.
-        title: heading of the page; that of the presentation, or the scene's name, by default.
-        caption: text below it; the recipe and its steps by default. The word about polarization follows.
-
-    Returns:
-        The file's path.
-
-    Raises:
-        PolarguideError: a name that ends in something else, or scores that cannot be read.
-    """
-    path = run.folder / "share.html" if path is None else Path(path)
-    if path.suffix.lower() not in (".html", ".htm"):
-        raise PolarguideError(
-            "out", expected="a name that ends in .html", found=str(path), remedy="Choose such a name."
-        )
-    model = run.gaussian_model("share")
-    presented = Presented(run)
-    assert presented.gaussians is not None
-    views = run.scene.test_views + run.scene.train_views
-    scored = (run.folder / METRICS_FILE).exists()
-    scores = shown_metrics(read_metrics(run.folder), scores_only=True) if scored else []
-    health = run.health
-    page = share_page(
-        presented.gaussians,
-        model.light,
-        model.shading,
-        {view.name: view.camera for view in views},
-        first=views[0].name,
-        title=title or presented.presentation.title or run.scene.name,
-        caption=f"{caption or f'{run.recipe.name}, {run.steps:,} steps'} · polarization: {run.polarization}",
-        metrics=[
-            *((f"{label}, test views", text) for label, text in scores),
-            ("Gaussians", f"{len(presented.gaussians['means']):,}"),
-        ],
-        notes=[f"Warning: {warning}" for warning in health.warnings] if health is not None else [],
-        presentation=presented.presentation,
-        footprints=presented.footprints,
-    )
-    make_folder(path.parent)
-    write_text(path, page)
-    return path
+def _plys(run: OpenedRun, presented: Presented, folder: Path, fields: PlyFields) -> list[Path]:
+    paths = [_ply(run, presented, folder / "splats.ply")]
+    if fields == "all":
+        paths.append(_ply(run, presented, folder / "polarguide.ply", own_fields=True))
+    return paths
 
 
 def _ply(
@@ -187,30 +153,24 @@ def _ply(
     placement: Placement | None = None,
     *,
     linear: bool = False,
+    own_fields: bool = False,
 ) -> Path:
     with temporary_folder(path.with_suffix(".whole")) as folder:
         whole = folder / path.name
         model = run.gaussian_model("format ply")
         color = presented.presentation.color
-        write_run_ply(whole, model.state, model.shading, _camera_centers(run), color=color, linear=linear)
+        write_run_ply(
+            whole,
+            model.state,
+            model.shading,
+            presented.centers,
+            color=color,
+            linear=linear,
+            own_fields=own_fields,
+        )
         selected = None if presented.inside is None else presented.inside.cpu()
         rewrite_splats(path, whole, placement or presented.placement, selected, presented.comments)
     return path
-
-
-def _camera_centers(run: OpenedRun) -> Tensor | None:
-    """Centers of the scene's cameras [M, 3], which tell on what side surfaces are seen; warns if it is not there."""
-    try:
-        model = read_model(run.scene_folder)
-        return torch.stack([model.camera(name).center for name in model.names])
-    except PolarguideError:
-        warnings.warn(
-            f"The scene of {run.folder} is not at {run.scene_folder} any more: normals are turned away from the "
-            "middle of the Gaussians, not to the nearest camera.",
-            PolarguideWarning,
-            stacklevel=2,
-        )
-        return None
 
 
 def _spz(run: OpenedRun, presented: Presented, path: Path, version: int) -> Path:
@@ -260,9 +220,7 @@ def _mesh(
         mesh = implicit_mesh(run.cameras, run.model, resolution=resolution)
     else:
         mesh = scene_mesh(run.cameras, presented.surface_view(run, "format mesh"), resolution=resolution)
-    if (crop := presented.presentation.crop) is not None:
-        inside = crop.inside(torch.from_numpy(mesh.surface.vertices), run.camera_frame).numpy()
-        mesh = mesh.within(inside)
+    mesh = mesh.within(presented.subject.holds(torch.from_numpy(mesh.surface.vertices)).numpy())
     colors = colored(torch.from_numpy(mesh.colors), presented.presentation.color).clamp(max=1)
     mesh = replace(mesh, colors=colors.numpy())
     paths = [folder / "mesh.glb", folder / "mesh.ply"]
@@ -296,7 +254,8 @@ def _charted(
 ) -> Charted:
     view = presented.surface_view(run, f"format {kind}")
     with temporary_folder(folder / kind) as parts:
-        return charted_subject(run, view, presented.presentation, options, resolution, parts, reporter)
+        inside = presented.subject.inside
+        return charted_subject(run, view, inside, options, resolution, parts, reporter)
 
 
 def _textured(
@@ -335,10 +294,9 @@ def _stl(
     reporter: Reporter,
 ) -> list[Path]:
     """For 3D printing: closed, in millimeters where the scale is known, and with up along z, as slicers have it."""
-    inside = subject_of(run, presented.presentation.crop, masked=options.masked)
     view, options = presented.surface_view(run, "format stl"), replace(options, close_bottom=True)
-    surface, _, _ = subject_surface(run, view, inside, options, resolution)
-    reporter.say(counted(surface))
+    inside = presented.subject.inside
+    surface, _, _ = subject_surface(run, view, inside, options, resolution, reporter)
     right, up, back = run.frame.panorama_axes().numpy().T
     axes = np.stack([right, -back, up], axis=1)
     scale = presented.placement.scale * (MILLIMETERS if presented.placement.metric else 1.0)
@@ -353,6 +311,7 @@ def _all(
     presented: Presented,
     folder: Path,
     resolution: int,
+    spz_version: int,
     options: ModelOptions,
     reporter: Reporter,
 ) -> list[Path]:
@@ -366,6 +325,9 @@ def _all(
         subject = _charted(run, presented, parts, resolution, lit, reporter, "glb")
         for chosen in (lit, unlit):
             _textured(run, presented, parts, subject, chosen, reporter, "glb")
+        _ply(run, presented, parts / "splats.ply")
+        _spz(run, presented, parts / "splats.spz", spz_version)
+        _sog(run, presented, parts / "splats.sog")
         _splat_glb(run, presented, parts)
         if radiant:
             _environment(run, presented, parts, reporter)
@@ -401,22 +363,3 @@ def _environment(run: OpenedRun, presented: Presented, folder: Path, reporter: R
     write_hdr(paths[1], picture)
     figures.write_png(paths[2], figures.radiance_to_rgb(picture))
     return paths
-
-
-def _cameras(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
-    scene, placement = run.scene, presented.placement
-    model = folder / "sparse" / "0"
-    require_inside(folder, model)
-    if model.is_dir() and holds_files(model) and not (folder / TRANSFORMS).exists():
-        raise PolarguideError(
-            model,
-            expected="no model, or one of an earlier export",
-            found="another",
-            remedy="Give another --out.",
-        )
-    cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
-    points = placement.points(scene.points)
-    write_colmap(model, cameras, points, scene.point_colors, comments=presented.comments)
-    about = {**presented.origin.record(), **placement.record()}
-    write_transforms(folder / TRANSFORMS, cameras, about)
-    return [model, folder / TRANSFORMS]

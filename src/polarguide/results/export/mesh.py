@@ -74,6 +74,9 @@ def write_mesh(
 
         def about(tree: dict[str, Any]) -> None:
             tree["asset"] |= asset_record(placement, origin)
+            # Without a material a reader has to take a rough metal, which shows no diffuse color.
+            tree["materials"] = [{"name": "diffuse", "pbrMetallicRoughness": DIELECTRIC}]
+            tree["meshes"][0]["primitives"][0]["material"] = 0
 
         data = scene.export(file_type="glb", include_normals=True, tree_postprocessor=about)
     else:
@@ -92,6 +95,8 @@ def asset_record(placement: Placement, origin: Origin) -> dict[str, Any]:
     }
 
 
+DIELECTRIC = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+"""Of glTF: what shows vertex colors as a diffuse surface."""
 OPAQUE = 0.5
 FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
     (name, "u1") for name in ("red", "green", "blue")

@@ -13,6 +13,9 @@ RECORD = "model.json"
 FILES = {
     "model.glb": "textured mesh, lit by the viewer",
     "model-unlit.glb": "textured mesh with the picture's colors, for viewers without light",
+    "splats.ply": "splats, -y up (SuperSplat, Spark, Unity, Unreal)",
+    "splats.spz": "the same, compressed, +y up",
+    "splats.sog": "the same, compressed, -y up",
     "splats-srgb.glb": "splats for readers that blend encoded colors (Babylon, PlayCanvas)",
     "splats-linear.glb": "splats for readers that blend linear colors (three.js)",
     "environment.exr": "the learned light as a panorama of linear radiance",
@@ -54,5 +57,8 @@ def package_record(run: OpenedRun, placement: Placement, origin: Origin, base_co
         "base_color": base_color,
         "not_known": unknown,
         "scores": dict(shown_metrics(read_metrics(run.folder), scores_only=True)) if scored else {},
-        "cameras": transforms(cameras)["frames"],
+        "cameras": [
+            {"view": name, **{key: value for key, value in frame.items() if key != "file_path"}}
+            for name, frame in zip(cameras, transforms(cameras)["frames"], strict=True)
+        ],
     }

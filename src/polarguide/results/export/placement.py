@@ -49,20 +49,18 @@ class Placement:
 
     @classmethod
     def of(cls, presentation: Presentation, around: SceneFrame | None) -> Placement:
-        """In meters where the scale is known; up along -y where an up axis was chosen, else in the scene's own axes.
+        """In meters where the scale is known; up along -y, or in the scene's own axes.
 
         -y is up in files of Gaussians as in the photographs' own axes: x right, y down, z ahead.
 
         Args:
-            presentation: of the run. around: the scene's frame with its up axis; needed where one was chosen.
+            presentation: of the run. around: the scene's frame with its up axis; None: the scene's own axes.
         """
         scale, rotation = presentation.meters_per_unit, torch.eye(3, dtype=torch.float64)
-        upright = presentation.up_axis is not None
-        if upright:
-            assert around is not None
+        if around is not None:
             right, up, back = around.panorama_axes().unbind(1)
             rotation = torch.stack((right, -up, -back))
-        return cls(rotation, scale or 1.0, scale is not None, upright)
+        return cls(rotation, scale or 1.0, scale is not None, around is not None)
 
     @property
     def changes(self) -> bool:
@@ -204,8 +202,8 @@ def rewrite_splats(
         PlyData([vertices], byte_order="<").write(temporary)
 
 
-SUFFIX = ".png"
-"""Of the images that a view's name stands for."""
+IMAGES, SUFFIX = "images", ".png"
+"""The folder and the suffix of the images that a view's name stands for."""
 # nerfstudio's cameras look along -z with y up: OpenGL's axes, not OpenCV's.
 _OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
@@ -268,7 +266,7 @@ def transforms(cameras: Mapping[str, Camera]) -> dict[str, Any]:
         pose[:3, :3], pose[:3, 3] = camera.rotation.T, camera.center
         frames.append(
             {
-                "file_path": f"images/{name}{SUFFIX}",
+                "file_path": f"{IMAGES}/{name}{SUFFIX}",
                 **{"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
                 **{"w": camera.width, "h": camera.height},
                 "transform_matrix": (pose @ _OPENGL).tolist(),

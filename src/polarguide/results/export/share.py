@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import msgspec
@@ -25,6 +25,7 @@ from polarguide.raster.interface import MINIMUM_ALPHA
 from polarguide.runs.model import baked_harmonics
 from polarguide.shading.cubemap import ringed_texels
 from polarguide.shading.model import PLAIN_LAYERS, Light, PageShading, Parameters, ShadingModel
+from polarguide.visualization.figures import color_gradient
 from polarguide.visualization.pages import page, page_part
 
 PACKAGE = "polarguide.results.export"
@@ -200,6 +201,28 @@ SHADERS = {
 }
 LAYERS = ("final", "diffuse", "specular", "base", "strength", "normal", "metalness", "roughness")
 """Layers that the page can show, in its order."""
+
+
+class Words(NamedTuple):
+    """What the page says of a layer: its name on the button, a sentence, and what the ends of its colors mean."""
+
+    label: str
+    sentence: str
+    low: str = ""
+    high: str = ""
+
+
+WORDS = {
+    "final": Words("picture", "what a camera sees"),
+    "diffuse": Words("without gloss", "the color and shading of the things, without reflections"),
+    "specular": Words("gloss alone", "what surfaces reflect, and nothing else"),
+    "base": Words("below the gloss", "the color of the layer under the reflections"),
+    "strength": Words("reflectivity", "how much of its mirror image a surface shows", "nothing", "all"),
+    "normal": Words("shape", "where surfaces face: red to the right, green up, blue toward you"),
+    "metalness": Words("metal", "what is metal", "no", "yes"),
+    "roughness": Words("roughness", "how blurred mirror images are", "mirror", "matte"),
+}
+"""By the names of the layers, for somebody who knows none of them."""
 _SHOWN_WITH = {"metalness": {"metal"}, "roughness": {"roughness"}}
 BAKED = (
     "This page has no shaders for the reflections of this model. Each Gaussian shows its color toward the eye, with "
@@ -220,6 +243,7 @@ def share_page(
     notes: Sequence[str] = (),
     presentation: Presentation = NOTHING,
     footprints: Tensor | None = None,
+    gloss: float = 1.0,
 ) -> str:
     """The page.
 
@@ -231,6 +255,7 @@ def share_page(
         metrics: labels and values, any text. notes: paragraphs before them, any text.
         presentation: color, up axis, scale and credit.
         footprints: [N] of the training, see ``raster.magnification``; None: not known.
+        gloss: how many times brighter than it is the specular layer is shown where it is shown alone.
 
     Returns:
         HTML that asks for nothing from outside; its own policy forbids it to.
@@ -240,13 +265,18 @@ def share_page(
     if shaded is None:
         shaded, layers = baked_page(gaussians, light, shading), PLAIN_LAYERS
     quantized = records(gaussians, shaded.values, footprints)
+    shown = [
+        name for name in LAYERS if name in layers and shaded.values.keys() >= _SHOWN_WITH.get(name, set())
+    ]
+    if shaded.constants.get("blend") == "fresnel":
+        shown.remove("base")  # it is the diffuse layer
     scene: dict[str, Any] = {
         "kind": shaded.kind,
         "texels": quantized.itemsize // TEXEL,
         "count": len(quantized),
-        "layers": [
-            name for name in LAYERS if name in layers and shaded.values.keys() >= _SHOWN_WITH.get(name, set())
-        ],
+        "layers": shown,
+        "words": {name: WORDS[name]._asdict() for name in shown},
+        "gloss": gloss,
         "index": 1.5,
         "resolution": int(shaded.light[0].shape[1]) if shaded.light else 1,
         "levels": max(1, len(shaded.light)),
@@ -279,6 +309,7 @@ def share_page(
             "dcterms.provenance": presentation.provenance,
         },
         scene=scene,
+        ramp=color_gradient("viridis"),
         shaders={name: page_part(PACKAGE, file) for name, file in SHADERS.items()},
         records=_packed(planes(quantized)),
         **{name: "" if values is None else _packed(values.tobytes()) for name, values in arrays.items()},

@@ -128,7 +128,7 @@ def write_splat_usdz(path: Path, ply: Path, about: dict[str, Any]) -> None:
 
 
 def _module(name: str) -> Any:
-    return optional_import(f"pxr.{name}", WHAT, extra="usd")
+    return optional_import(f"pxr.{name}", WHAT)
 
 
 def _package(path: Path, about: dict[str, Any], fill: Callable[[Any, Path], None]) -> None:

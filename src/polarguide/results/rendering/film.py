@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.trajectory import interpolated, orbit, read_path
 from polarguide.results.rendering.pictures import rendered_depths
+from polarguide.results.rendering.subject import part_shown, subject_of
 from polarguide.runs.opened import OpenedRun, checked_layers
 from polarguide.shading.result import POLARIZED
 from polarguide.visualization import figures
@@ -89,29 +92,57 @@ def _require_whole(encoder: Any, path: Path, count: int) -> None:
 
 SWINGS = {"orbit": 0.0, "spiral": 0.25}
 """Paths around the scene: by what share of the cameras' distance they go up and down."""
+FILLED = 0.9
+"""Share of the subject's Gaussians, the innermost, that a turntable has in its pictures from all sides."""
 FRAMES_PER_SECOND = 30.0
 RENDERED = 160
 """Bytes that a pixel takes at least while it is rendered: layers, and what they are made of."""
 
 
-def path_cameras(run: OpenedRun, path: str, frames: int) -> tuple[list[Camera], float]:
+def path_cameras(
+    run: OpenedRun, path: str, frames: int, size: tuple[int, int] | None = None
+) -> tuple[list[Camera], float]:
     """Cameras of a path, and their frames a second.
 
     Args:
         run: its cameras are the ones to move around.
-        path: ``orbit``, ``spiral``, ``interpolate``, or a JSON file of cameras.
+        path: ``orbit``, ``turntable`` (around the subject, so near that it fills the picture), ``spiral``,
+            ``interpolate``, or a JSON file of cameras.
         frames: how many, except of a file.
+        size: width and height of the pictures, except of a file; None: the photographs'.
 
     Raises:
-        PolarguideError: too many frames, or a file that cannot be read.
+        PolarguideError: too many frames, a size for a file, which has its own, or a file that cannot be read.
     """
     check_finite("frames", frames, 1, 100_000)
     cameras = list(run.cameras.values())
+    if size is not None:
+        cameras = [camera.extended(*size) for camera in cameras]
+    if path == "turntable":
+        return _turntable(run, cameras, frames), FRAMES_PER_SECOND
     if path == "interpolate":
         return interpolated(cameras, frames), FRAMES_PER_SECOND
     if path in SWINGS:
         return orbit(cameras, frames, swing=SWINGS[path], around=run.frame), FRAMES_PER_SECOND
+    if size is not None:
+        raise PolarguideError(
+            "size",
+            expected="a path that has no sizes of its own",
+            found=f"the file {path}",
+            remedy="Give its cameras the width and height.",
+        )
     return read_path(Path(path))
+
+
+def _turntable(run: OpenedRun, cameras: list[Camera], frames: int) -> list[Camera]:
+    means = run.gaussian_model("turntable").state.gaussians["means"].detach()
+    inner = means[subject_of(run).holds(means)].cpu().double()
+    center = inner.median(dim=0).values
+    radius = float((inner - center).norm(dim=1).quantile(FILLED))
+    lens = cameras[0]
+    narrow = min(lens.width / lens.fx, lens.height / lens.fy) / 2
+    distance = radius / math.sin(math.atan(narrow))
+    return orbit(cameras, frames, around=replace(run.frame, center=center), distance=distance)
 
 
 def write_film(
@@ -121,14 +152,16 @@ def write_film(
     path: str = "orbit",
     layers: Sequence[str] = ("final",),
     frames: int = 120,
+    size: tuple[int, int] | None = None,
     reporter: Reporter = SILENT,
 ) -> None:
-    """Render layers side by side along a path.
+    """Render layers of the subject side by side along a path; in a video of several layers, with their names.
 
     Args:
         run: the run; its scene is read.
         out: MP4 file to write, or a folder for PNG files.
         path, frames: those of the cameras; see ``path_cameras``.
+        size: width and height of the film, all layers together; None: each layer has the photographs' size.
         layers: names of layers.
 
     Raises:
@@ -138,7 +171,8 @@ def write_film(
     refuse_scene(out if out.suffix.lower() != ".mp4" else out.parent)
     if out.parent == run.folder:  # somebody else may have made the run's folder
         require_inside(run.folder, out)
-    cameras, speed = path_cameras(run, path, frames)
+    tile = None if size is None else (size[0] // len(names), size[1])
+    cameras, speed = path_cameras(run, path, frames, tile)
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     if len(sizes) > 1:
         raise PolarguideError(
@@ -150,7 +184,11 @@ def write_film(
     width, height = sizes[0]
     remedy = "Give the cameras of the path a smaller width and height."
     require_memory(Path(path), RENDERED * width * height, f"pictures of {width}x{height}", remedy=remedy)
-    pictures = _pictures(run, names, cameras, reporter)
+    named = out.suffix.lower() == ".mp4" and len(names) > 1
+    pictures = _pictures(run, names, cameras, reporter, named=named)
+    if size is not None:  # a width that the layers do not share evenly ends with black columns
+        rest = size[0] % len(names)
+        pictures = (np.pad(picture, ((0, 0), (0, rest), (0, 0))) for picture in pictures)
     if out.suffix.lower() == ".mp4":
         make_folder(out.parent)
         count = write_video(out, pictures, frames_per_second=speed)
@@ -164,16 +202,23 @@ def write_film(
 
 
 def _pictures(
-    run: OpenedRun, layers: list[str], cameras: list[Camera], reporter: Reporter
+    run: OpenedRun, layers: list[str], cameras: list[Camera], reporter: Reporter, *, named: bool
 ) -> Iterator[Picture]:
-    """Layers side by side, a picture for each camera."""
-    depths = rendered_depths(run, cameras) if "depth" in layers else None
+    """Layers side by side, a picture for each camera, with their names where these are wanted."""
+    within = part_shown(run, reporter)
+    depths = rendered_depths(run, cameras, within) if "depth" in layers else None
     color, surface = run.presentation.color, bool({"normal", "depth"} & {*layers})
     polarized = not {*layers}.isdisjoint(POLARIZED)
     with reporter.track("rendering", len(cameras)) as advance:
         for number, camera in enumerate(cameras):
-            result = run.result(camera, depth="depth" in layers, surface=surface, polarized=polarized)
+            result = run.result(
+                camera, depth="depth" in layers, surface=surface, polarized=polarized, within=within
+            )
             run.chosen_layers(result, layers)
-            pictures = [layer_picture(result, name, camera, depths, color=color) for name in layers]
+            tiles = []
+            for name in layers:
+                picture = layer_picture(result, name, camera, depths, color=color)
+                assert picture is not None
+                tiles.append(figures.with_name(picture, name) if named else picture)
             advance(number + 1)
-            yield np.concatenate([picture for picture in pictures if picture is not None], axis=1)
+            yield np.concatenate(tiles, axis=1)

@@ -152,13 +152,17 @@ def surface_of(box: Box, field: Tensor, weight: Tensor) -> Surface:
 
 def largest_pieces(surface: Surface, smallest: float) -> Surface:
     """The connected pieces that have at least a share of the largest one's faces."""
+    return surface.with_faces(large_faces(surface, smallest))[0]
+
+
+def large_faces(surface: Surface, smallest: float) -> NDArray[np.int64]:
+    """The faces [F, 3] of these pieces."""
     count = len(surface.vertices)
     ends = surface.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
     graph = coo_matrix((np.ones(len(ends), dtype=np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
     _, piece = connected_components(graph, directed=False)
     sizes = np.bincount(piece[surface.faces[:, 0]], minlength=int(piece.max()) + 1)
-    faces = surface.faces[sizes[piece[surface.faces[:, 0]]] >= smallest * sizes.max()]
-    return surface.with_faces(faces)[0]
+    return surface.faces[sizes[piece[surface.faces[:, 0]]] >= smallest * sizes.max()]
 
 
 RESOLUTION = 192
@@ -178,7 +182,7 @@ class ColoredMesh:
     colors: NDArray[np.float64]
 
     def within(self, vertices: NDArray[np.bool_]) -> ColoredMesh:
-        """The faces all of whose vertices are kept, [V] bool.
+        """The faces all of whose vertices are kept, [V] bool, without the small pieces that the cut leaves.
 
         Raises:
             PolarguideError: there are none.
@@ -189,7 +193,8 @@ class ColoredMesh:
                 "the crop box", expected="a surface in it", found="none", remedy="Make it larger, or move it."
             )
         surface, used = self.surface.with_faces(faces)
-        return ColoredMesh(surface, self.colors[used])
+        large, kept = surface.with_faces(large_faces(surface, SMALLEST_PIECE))
+        return ColoredMesh(large, self.colors[used[kept]])
 
 
 @torch.no_grad()

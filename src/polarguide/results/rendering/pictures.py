@@ -18,6 +18,7 @@ from polarguide.core.files import atomic, make_folder, require_inside, write_who
 from polarguide.core.options import PathLike, PictureFormat, check_choice
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import to_json
+from polarguide.fields.model import Within
 from polarguide.geometry.camera import Camera
 from polarguide.optics import luminance
 from polarguide.results.rendering.relight import write_exr
@@ -171,11 +172,11 @@ def common_depths(run: OpenedRun, views: Sequence[View]) -> Depths:
     return rendered_depths(run, [view.camera for view in views])
 
 
-def rendered_depths(run: OpenedRun, cameras: Sequence[Camera]) -> Depths:
-    """The range of the rendered depths of a few of some cameras."""
+def rendered_depths(run: OpenedRun, cameras: Sequence[Camera], within: Within | None = None) -> Depths:
+    """The range of the rendered depths of a few of some cameras; ``within``: what is shown of the scene."""
     values = []
     for camera in cameras[:: max(1, len(cameras) // 4)]:
-        result = run.result(camera)
+        result = run.result(camera, within=within)
         assert result.depth is not None
         values.append(result.depth[result.alpha > 0.5].flatten().cpu())
     joined = torch.cat(values)

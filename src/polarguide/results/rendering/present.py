@@ -16,8 +16,8 @@ from polarguide.capture import Scene, load_scene, read_model
 from polarguide.capture.layout import find_layout
 from polarguide.capture.presentation import (
     CREDITS,
+    EITHER,
     PRESENTATION_FILE,
-    WHITE,
     Chart,
     Presentation,
     Vector,
@@ -31,7 +31,7 @@ from polarguide.core.files import require_folder
 from polarguide.core.options import DeviceName, PathLike
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import decode
-from polarguide.core.text import decimal
+from polarguide.core.text import command, decimal
 from polarguide.results.rendering.chart import chart_of
 from polarguide.results.rendering.picking import gains_of, gray_world, photograph_color, surface_at
 from polarguide.runs.folder import CONFIGURATION
@@ -55,6 +55,7 @@ def present(
     author: str | None = None,
     license: str | None = None,
     provenance: str | None = None,
+    scene: PathLike | None = None,
     device: DeviceName = "cpu",
     reporter: Reporter = SILENT,
 ) -> Presentation:
@@ -74,8 +75,10 @@ def present(
             whose surface is level; up is its normal there.
         points: two PLACEs whose distance is known. distance: it, such as ``85mm``.
         meters_per_unit: how long one unit of the scene is, or ``none``.
-        crop: ``none``, or left,right,down,up,front,back in percent of the cameras' distance, as the viewer counts.
+        crop: left,right,down,up,front,back in percent of the cameras' distance, as the viewer counts; ``all``: the
+            whole scene; ``none``: the subject, see ``results.rendering.subject``.
         title, author, license, provenance: one line of text each; ``none`` or nothing removes it.
+        scene: where the scene of a run lies now, if it was moved; ``run.json`` of the run has it from then on.
         device: what surfaces are rendered on.
         reporter: receives the progress of long operations.
 
@@ -86,6 +89,8 @@ def present(
         PolarguideError: no such folder, or a value that cannot be read; nothing is written then.
     """
     place = _Place(Path(folder), device, reporter)
+    if scene is not None:
+        place.move_scene(scene)
     own = read_presentation(place.folder)
     changes: dict[str, Any] = {}
     if white_balance is not None:
@@ -103,12 +108,13 @@ def present(
         changes["meters_per_unit"] = _scale(points, distance, meters_per_unit, place)
     if crop is not None:
         up = changes["up_axis"] if "up_axis" in changes else place.shown(own).up_axis
-        changes["crop"] = None if crop == "none" else _crop(crop, up)
+        changes["crop"] = None if crop in ("none", "all") else _crop(crop, up)
+        changes["whole"] = crop == "all"
     texts = {"title": title, "author": author, "license": license, "provenance": provenance}
     changes |= {
         name: "" if (text := texts[name]) == "none" else text for name in CREDITS if texts[name] is not None
     }
-    place.refuse_inherited(name for name, value in changes.items() if value in (None, ""))
+    place.refuse_inherited(_removed(changes))
     unchanged = {name: value for name, value in own.to_record().items() if name not in _replaced(changes)}
     record = {**unchanged, **{name: msgspec.to_builtins(value) for name, value in changes.items()}}
     decoded = decode(record, Presentation, "presentation", remedy="Correct the value; nothing was written.")
@@ -142,6 +148,16 @@ class _Place:
         """The scene, or that of the run."""
         return self._run.scene if self._is_run else load_scene(self.folder, reporter=self._reporter)
 
+    def move_scene(self, scene: PathLike) -> None:
+        """Point the run to where its scene lies now.
+
+        Raises:
+            PolarguideError: this is no run, or that is another scene.
+        """
+        if not self._is_run:
+            raise _wrong("scene", "the folder of a run, whose scene was moved", str(self.folder))
+        self._run.point_to(scene)
+
     def shown(self, own: Presentation) -> Presentation:
         """The presentation that applies, with these values of the folder's own."""
         return own.over(read_presentation(self._scene_folder)) if self._is_run else own
@@ -157,12 +173,12 @@ class _Place:
             return
         above = read_presentation(self._scene_folder)
         for name in removed:
-            if getattr(above, name) not in (None, ""):
+            if getattr(above, name) not in NOTHING:
                 raise PolarguideError(
                     name,
                     expected="a value of the run's own to remove",
                     found=f"one of its scene's ({self._scene_folder / PRESENTATION_FILE})",
-                    remedy=f"Remove it there (polarguide present {self._scene_folder}), or give the run another.",
+                    remedy=f"Remove it there ({command('present', self._scene_folder)}), or give the run another.",
                 )
 
     def pixel(self, text: str) -> tuple[str, float, float] | None:
@@ -223,9 +239,17 @@ def _white_balance(text: str, place: _Place) -> Vector | None:
     return red, green, blue
 
 
-def _replaced(changes: dict[str, Any]) -> tuple[str, ...]:
-    """White balance and chart, where one of them is given: it takes the other's place."""
-    return WHITE if any(changes.get(name) is not None for name in WHITE) else ()
+NOTHING = (None, "", False)
+
+
+def _replaced(changes: dict[str, Any]) -> set[str]:
+    """The fields of ``EITHER`` of which one is given: it takes the other's place."""
+    return {name for names in EITHER if any(changes.get(n) not in NOTHING for n in names) for name in names}
+
+
+def _removed(changes: dict[str, Any]) -> list[str]:
+    """The fields that are taken back without another in their place."""
+    return [name for name in changes if changes[name] in NOTHING and name not in _replaced(changes)]
 
 
 def _chart(text: str, place: _Place) -> Chart:
@@ -275,7 +299,7 @@ def _scale(
 
 
 def _crop(text: str, up: Vector | None) -> dict[str, Any]:
-    sides = _require_numbers(text, 6, "crop", "none, or left,right,down,up,front,back in percent")
+    sides = _require_numbers(text, 6, "crop", "none, all, or left,right,down,up,front,back in percent")
     left, right, down, above, front, back = (side / 100 for side in sides)
     return {"low": (left, down, front), "high": (right, above, back), "up": up}
 
@@ -320,6 +344,8 @@ def described(presentation: Presentation) -> list[str]:
     if (crop := presentation.crop) is not None:
         sides = (100 * side for pair in zip(crop.low, crop.high, strict=True) for side in pair)
         lines["crop"] = f"{_listed(tuple(sides))} % of the cameras' distance"
+    if presentation.whole:
+        lines["crop"] = "all of the scene"
     lines |= {name: getattr(presentation, name) for name in CREDITS}
     return [f"{name}: {text}" for name, text in lines.items() if text] or ["nothing is set"]
 

@@ -18,12 +18,13 @@ from polarguide.core.system import free_memory
 from polarguide.results.export.model.bake import Baked, ColorSource, bake
 from polarguide.results.export.model.gltf import Textured, color_pixels, linear_pixels
 from polarguide.results.export.model.irradiance import WHAT, Surroundings, arriving_light, delit, irradiance
-from polarguide.results.export.model.subject import Inside, SurfaceView, counted, subject_of, subject_surface
+from polarguide.results.export.model.subject import SurfaceView, subject_surface
 from polarguide.results.export.model.texels import Texels, texels_of
 from polarguide.results.export.model.unwrap import Unwrapped, unwrap
 from polarguide.results.export.placement import Placement
 from polarguide.results.rendering.mesh import ColoredMesh, Surface, fused_surface, painted
 from polarguide.results.rendering.relight import mirrored_light, needs_radiance
+from polarguide.results.rendering.subject import Inside
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.deferred import DeferredShading
@@ -88,7 +89,7 @@ class Charted:
 def charted_subject(
     run: OpenedRun,
     surface_view: SurfaceView,
-    presentation: Presentation,
+    inside: Inside | None,
     options: ModelOptions,
     resolution: int,
     folder: Path,
@@ -97,8 +98,9 @@ def charted_subject(
     """The surface of what is to be exported, with texture coordinates.
 
     Args:
-        run: of Gaussians; its scene is read. surface_view: renders a view of what lies in the crop box.
-        presentation: how it is presented. options: options of the model. resolution: voxels along its longest side.
+        run: of Gaussians; its scene is read. surface_view: renders a view of the subject's Gaussians.
+        inside: what belongs to the subject; None: everything. options: options of the model.
+        resolution: voxels along its longest side.
         folder: for temporary files. reporter: receives progress, counts and warnings.
 
     Raises:
@@ -108,12 +110,10 @@ def charted_subject(
     require_room(options.texture)
     if options.resolved_base_color == "delit":
         needs_radiance(run.model.shading, what=WHAT)
-        require_package("embreex", WHAT, extra="model")
+        require_package("embreex", WHAT)
     with reporter.track("fusing the surface"):
-        inside = subject_of(run, presentation.crop, masked=options.masked)
-        surface, views, box = subject_surface(run, surface_view, inside, options, resolution)
+        surface, views, box = subject_surface(run, surface_view, inside, options, resolution, reporter)
         mesh = painted(surface, views, box)
-    reporter.say(counted(mesh.surface))
     unwrapped = unwrap(mesh.surface.vertices, mesh.surface.faces, options.texture, folder, reporter)
     return Charted(mesh, inside, box.size, unwrapped, texels_of(unwrapped, options.texture))
 

@@ -121,8 +121,8 @@ class _Rays:
     """
 
     def __init__(self, mesh: ColoredMesh) -> None:
-        scenes: Any = optional_import("embreex.rtcore_scene", WHAT, extra="model")
-        meshes: Any = optional_import("embreex.mesh_construction", WHAT, extra="model")
+        scenes: Any = optional_import("embreex.rtcore_scene", WHAT)
+        meshes: Any = optional_import("embreex.mesh_construction", WHAT)
         self._faces, self._colors = mesh.surface.faces, mesh.colors
         corners = np.ascontiguousarray(mesh.surface.vertices[self._faces], np.float32)
         self._scene = scenes.EmbreeScene()

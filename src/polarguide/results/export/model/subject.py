@@ -1,4 +1,4 @@
-"""The subject of a run as a clean mesh: what lies in the crop box, and in the masks of the foreground."""
+"""The subject of a run as a clean mesh."""
 
 from __future__ import annotations
 
@@ -6,64 +6,32 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from polarguide.capture.presentation import Crop
-from polarguide.core.errors import PolarguideError
 from polarguide.core.files import write_whole
 from polarguide.core.options import ModelOptions
-from polarguide.geometry.camera import Camera, seen_at
+from polarguide.core.progress import Reporter
+from polarguide.geometry.camera import Camera
 from polarguide.results.export.model.topology import Places, simplified, topology
 from polarguide.results.rendering.mesh import Box, ColoredMesh, DepthSamples, Surface, fused_surface
+from polarguide.results.rendering.subject import Inside
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.result import RenderResult
 
 SurfaceView = Callable[[Camera], RenderResult]
-Inside = Callable[[Places], NDArray[np.bool_]]
-"""Which places [N, 3] of the scene belong to the subject."""
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
-def subject_of(run: OpenedRun, crop: Crop | None, *, masked: bool) -> Inside | None:
-    """What belongs to the subject: all in the crop box, and where ``masked``, in the mask of most views that have it.
-
-    Returns:
-        None where that is everything.
-
-    Raises:
-        PolarguideError: masks are asked for, and the scene has none.
-    """
-    views = [view for view in run.scene.views if view.mask is not None] if masked else []
-    if masked and not views:
-        raise PolarguideError(
-            "--masked",
-            expected="a scene with masks of the foreground (masks/)",
-            found="none",
-            remedy="Set a crop box instead: polarguide present RUN --crop.",
-        )
-    if crop is None and not views:
-        return None
-
-    def inside(places: Places) -> NDArray[np.bool_]:
-        points = torch.from_numpy(places)
-        votes = torch.zeros(len(points))
-        for view in views:
-            assert view.mask is not None
-            pixel, _, in_picture = seen_at(points - view.camera.center, view.camera)
-            votes += in_picture * torch.where(view.mask.cpu()[pixel], 1.0, -1.0)
-        mask = votes > 0 if views else torch.ones(len(points), dtype=torch.bool)
-        if crop is not None:
-            mask &= crop.inside(points, run.camera_frame)
-        return np.asarray(mask.numpy())
-
-    return inside
-
-
 def subject_surface(
-    run: OpenedRun, surface_view: SurfaceView, inside: Inside | None, options: ModelOptions, resolution: int
+    run: OpenedRun,
+    surface_view: SurfaceView,
+    inside: Inside | None,
+    options: ModelOptions,
+    resolution: int,
+    reporter: Reporter,
 ) -> tuple[Surface, list[tuple[Camera, DepthSamples]], Box]:
-    """The simplified surface of the subject, what each camera saw of it, and the grid it was fused in.
+    """The simplified surface of the subject, what each camera saw of it, and the grid it was fused in. The reporter
+    receives its counts.
 
     Raises:
         PolarguideError: there is none.
@@ -72,6 +40,7 @@ def subject_surface(
     if inside is not None:
         surface = ColoredMesh(surface, surface.vertices).within(inside(surface.vertices)).surface
     surface = simplified(surface, options.triangles, closed=options.close_bottom)
+    reporter.say(counted(surface))
     return surface, views, box
 
 

@@ -67,7 +67,7 @@ def simplified(surface: Surface, triangles: int, *, closed: bool = False) -> Sur
     """
     if len(surface.faces) <= triangles:
         return cleaned(surface.vertices, surface.faces, closed=closed)
-    simplify: Any = optional_import("fast_simplification", "a textured model", extra="model").simplify
+    simplify: Any = optional_import("fast_simplification", "a textured model").simplify
     middle = surface.vertices.mean(axis=0)  # it computes in single precision
     vertices, faces = simplify(
         np.ascontiguousarray(surface.vertices - middle, np.float32),

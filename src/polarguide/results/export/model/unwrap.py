@@ -85,7 +85,7 @@ def unwrap(
 
 def run_xatlas() -> None:
     """The process: reads the mesh from the first file that the command line names, writes the atlas to the second."""
-    xatlas = optional_import("xatlas", "a textured model", extra="model")
+    xatlas = optional_import("xatlas", "a textured model")
     task, answer = sys.argv[1:3]
     with np.load(task) as mesh:
         atlas: Any = xatlas.Atlas()

@@ -27,9 +27,9 @@ class Page {
     scene.layers.forEach((name, place) => {
       const button = document.createElement("button");
       button.type = "button";
-      button.textContent = name;
+      button.textContent = scene.words[name].label;
       button.dataset.layer = name;
-      button.title = `${name} (${place + 1})`;
+      button.title = `${scene.words[name].sentence} (${place + 1})`;
       button.onclick = () => this.choose(name);
       byId("layers").append(button);
     });
@@ -68,9 +68,21 @@ class Page {
 
   choose(name) {
     this.looks.layer = LAYERS.indexOf(name);
+    this.explain(name);
     for (const button of byId("layers").children)
       button.setAttribute("aria-pressed", String(button.dataset.layer === name));
     this.redraw();
+  }
+
+  /** The legend of a layer, and its name at the handle. */
+  explain(name) {
+    const { label, sentence, low, high } = this.scene.words[name], { gloss } = this.scene;
+    const brighter = name === "specular" && gloss > 1 ? `, ${gloss} times as bright` : "";
+    byId("sentence").textContent = `${label}: ${sentence}${brighter}`;
+    byId("right").textContent = label;
+    byId("low").textContent = low;
+    byId("high").textContent = high;
+    byId("ends").hidden = !high;
   }
 
   setBalanced(on) {
@@ -82,6 +94,7 @@ class Page {
   setComparing(on) {
     this.comparing = on;
     byId("handle").hidden = !on;
+    if (on) byId("drag").className = "done"; // the names at the handle stand there
     byId("compare").setAttribute("aria-pressed", String(on));
     this.setSplit(this.compare);
   }
@@ -130,6 +143,7 @@ class Page {
   /** Render at low resolution while the camera moves. */
   move() {
     this.moving = performance.now();
+    byId("drag").className = "done";
     this.redraw();
     clearTimeout(this.resting);
     this.resting = setTimeout(() => {

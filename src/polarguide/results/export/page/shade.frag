@@ -7,6 +7,7 @@ uniform vec2 size;
 uniform int layer;     // 0 final, 1 diffuse, 2 specular, 3 base, 4 strength, 5 normal, 6 metalness, 7 roughness
 uniform float split;   // left of this column stands the diffuse layer
 uniform float gain;    // on the specular layer
+uniform float gloss;   // on it where it is shown alone
 uniform float exposure;
 uniform mat3 color;    // from the camera's linear RGB to what is shown
 uniform float index;   // refractive
@@ -137,7 +138,7 @@ void main() {
 #endif
   specular *= gain;
   int which = pixel.x < split ? 1 : layer;
-  vec3 seen = encode(which == 0 ? diffuse + specular : which == 1 ? diffuse : which == 2 ? specular : base.rgb);
+  vec3 seen = encode(which == 0 ? diffuse + specular : which == 1 ? diffuse : which == 2 ? gloss * specular : base.rgb);
   if (which == 4) seen = texelFetch(viridis, ivec2(int(clamp(strength, 0.0, 1.0) * 255.0 + 0.5), 0), 0).rgb;
 #ifdef METAL
   if (which == 6)

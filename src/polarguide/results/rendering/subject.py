@@ -1,0 +1,136 @@
+"""The subject of a run: what films, pages and exported files show of it, unless somebody chose otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polarguide.core.errors import PolarguideError
+from polarguide.core.progress import Reporter
+from polarguide.core.text import command
+from polarguide.fields.model import Within
+from polarguide.geometry.camera import Camera, seen_at
+from polarguide.runs.model import GaussianModel
+from polarguide.runs.opened import OpenedRun
+
+Inside = Callable[[NDArray[Any]], NDArray[np.bool_]]
+"""Which places [N, 3] of the scene belong to the subject."""
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """What is shown of a scene.
+
+    Attributes:
+        inside: what belongs to it; None: everything. words: what that is, for people.
+    """
+
+    inside: Inside | None
+    words: str
+
+    def holds(self, places: Tensor) -> Tensor:
+        """Which places [N, 3] belong to it, [N] bool on their device."""
+        if self.inside is None:
+            return torch.ones(len(places), dtype=torch.bool, device=places.device)
+        return torch.from_numpy(self.inside(places.detach().cpu().numpy())).to(places.device)
+
+    def told(self, kept: int, total: int, run: OpenedRun) -> str:
+        """A line about what was cut, and how to change it; empty where nothing was."""
+        if kept == total:
+            return ""
+        return (
+            f"{kept:,} of {total:,} Gaussians: {self.words}. "
+            f"Everything: {command('present', run.folder, '--crop', 'all')}   "
+            f"a box: {command('view', run.folder)}, Crop"
+        )
+
+
+def subject_of(run: OpenedRun, *, masked: bool = False) -> Subject:
+    """The subject: what lies in the crop box; without one, what the scene's masks show; without masks, the region that
+    the cameras look at.
+
+    A place is in the masks if it is so in most of the pictures that have it, and in the region that the cameras look at
+    if most of them have it in their pictures.
+
+    Args:
+        run: the run; where the scene has masks they are read, else poses alone.
+        masked: whether it must be in the masks, too, where there is a crop box.
+
+    Raises:
+        PolarguideError: masks are asked for and the scene has none, or the scene is not there any more.
+    """
+    presentation = run.presentation
+    if masked and not run.has_masks:
+        raise PolarguideError(
+            "--masked",
+            expected="a scene with masks of the foreground (masks/)",
+            found="none",
+            remedy="Set a crop box instead: polarguide present RUN --crop.",
+        )
+    crop = presentation.crop
+    if crop is not None:
+        around = run.camera_frame
+
+        def boxed(places: NDArray[Any]) -> NDArray[np.bool_]:
+            return np.asarray(crop.inside(torch.from_numpy(places), around).numpy())
+
+        if not masked:
+            return Subject(boxed, "what lies in the crop box")
+        shown = _in_masks(run)
+        return Subject(
+            lambda places: boxed(places) & shown(places), "what lies in the crop box and the masks"
+        )
+    if run.has_masks and (masked or not presentation.whole):
+        return Subject(_in_masks(run), "what most of the scene's masks show")
+    if presentation.whole:
+        return Subject(None, "everything")
+    return Subject(_looked_at([*run.poses.values()]), "what most of the cameras have in their pictures")
+
+
+def part_shown(run: OpenedRun, reporter: Reporter) -> Within | None:
+    """What a film shows of a run, as renderings take it; None: all, as of a field, of which every ray asks.
+
+    Args:
+        run: the run. reporter: receives the line of ``Subject``.
+
+    Raises:
+        PolarguideError: the scene is not there any more.
+    """
+    if not isinstance(run.model, GaussianModel):
+        return None
+    subject = subject_of(run)
+    inside = subject.holds(run.model.state.gaussians["means"])
+    if line := subject.told(int(inside.sum()), len(inside), run):
+        reporter.say(line)
+    return lambda _: inside
+
+
+def _in_masks(run: OpenedRun) -> Inside:
+    masks = [(view.camera, view.mask.cpu()) for view in run.scene.views if view.mask is not None]
+
+    def inside(places: NDArray[Any]) -> NDArray[np.bool_]:
+        points = torch.from_numpy(places)
+        votes = torch.zeros(len(points))
+        for camera, mask in masks:
+            pixel, _, in_picture = seen_at(points - camera.center, camera)
+            votes += in_picture * torch.where(mask[pixel], 1.0, -1.0)
+        return np.asarray((votes > 0).numpy())
+
+    return inside
+
+
+def _looked_at(cameras: Sequence[Camera]) -> Inside:
+    def inside(places: NDArray[Any]) -> NDArray[np.bool_]:
+        points = torch.from_numpy(places)
+        count = torch.zeros(len(points))
+        for camera in cameras:
+            count += seen_at(points - camera.center, camera)[2]
+        return np.asarray((2 * count > len(cameras)).numpy())
+
+    return inside
