@@ -6,6 +6,8 @@ import csv
 import io
 import itertools
 import math
+import os
+import posixpath
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,9 +20,9 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.capture.calibration import Calibration
 from polarguide.core.errors import PolarguideError
-from polarguide.core.files import read_file
+from polarguide.core.files import read_file, stored
 from polarguide.core.records import shortened
-from polarguide.core.text import csv_lines, number_or_nan
+from polarguide.core.text import canonical, csv_lines, decimal_comma, number_or_nan
 from polarguide.geometry.polarizer import ANGLES
 from polarguide.optics import Mount
 
@@ -196,7 +198,8 @@ class Line:
 
     Attributes:
         number: number of the line, from 1.
-        file: the picture's name: inside ``polar/`` of a scene, else relative to the folder of the photographs.
+        file: the picture's name, without detours such as ``./``: inside ``polar/`` of a scene, else relative to the
+            folder of the photographs.
         view: pictures of one view share their pose; None for a view of its own, called like the file without suffix.
         angle: angle of the polarizer.
         gain: exposure relative to the other pictures; None if it is not given.
@@ -231,17 +234,37 @@ def read_table(path: Path) -> list[Line]:
         where = f"{path} (line {number})"
         if not len(_NEEDED) <= len(row) <= len(columns):
             found = f"{len(row)}: {shortened(','.join(row))}"
+            if len(row) > len(columns) and decimal_comma(map(",".join, itertools.pairwise(row))):
+                found += ", which may be a decimal comma"
             raise PolarguideError(where, expected=f"{len(columns)} cells", found=found, remedy=_REMEDY)
         line = _line(where, number, dict(zip(columns, row, strict=False)))
         if line.file in lines:
-            raise PolarguideError(
-                where,
-                expected="one line for each file",
-                found=f"two for {line.file}, lines {lines[line.file].number} and {number}",
-                remedy="Remove one of them.",
-            )
+            raise _listed_twice(where, lines[line.file], line)
         lines[line.file] = line
     return list(lines.values())
+
+
+def files_of(root: Path, table: Path, lines: Sequence[Line]) -> list[Path]:
+    """The files of a table's lines in a folder, as the file system has them; they need not exist.
+
+    Raises:
+        PolarguideError: two lines name one file.
+    """
+    files = [stored(root / line.file) for line in lines]
+    first: dict[str, Line] = {}
+    for line, path in zip(lines, files, strict=True):
+        before = first.setdefault(os.path.realpath(path), line)
+        if before is not line:
+            raise _listed_twice(f"{table} (line {line.number})", before, line)
+    return files
+
+
+def _listed_twice(where: str, first: Line, second: Line) -> PolarguideError:
+    names = " and ".join(dict.fromkeys((first.file, second.file)))
+    found = f"two for {names}, lines {first.number} and {second.number}"
+    return PolarguideError(
+        where, expected="one line for each file", found=found, remedy="Remove one of them."
+    )
 
 
 def read_rows(path: Path, remedy: str) -> list[tuple[int, list[str]]]:
@@ -264,12 +287,13 @@ def read_rows(path: Path, remedy: str) -> list[tuple[int, list[str]]]:
 
 def _header(path: Path, row: list[str]) -> list[str]:
     columns = [cell.lower() for cell in row]
+    between = ", with semicolons between columns" if any(";" in cell for cell in row) else ""
     known = set(columns) <= {*_COLUMNS, *_WRITTEN_BY_TRAINING} and len(set(columns)) == len(columns)
     if not known or not set(_NEEDED) <= set(columns):
         raise PolarguideError(
             f"{path} (line 1)",
             expected="the header file,angle or file,view,angle,gain",
-            found=shortened(",".join(row)) if row else "an empty file",
+            found=shortened(",".join(row)) + between if row else "an empty file",
             remedy=_REMEDY,
         )
     return columns
@@ -286,7 +310,7 @@ def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
         raise PolarguideError(
             f"{where}, {file}",
             expected=f"an angle in degrees up to {LARGEST:g}, unknown or none",
-            found=shortened(cells.get("angle", "")),
+            found=_cell(cells.get("angle", "")),
             remedy="Write unknown where the angle was not noted, none where there was no filter.",
         )
     gain = number_or_nan(cells["gain"]) if cells.get("gain") else None
@@ -294,10 +318,18 @@ def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
         raise PolarguideError(
             f"{where}, {file}",
             expected=f"a gain from {1 / _LARGEST_GAIN:g} to {_LARGEST_GAIN:g}, or an empty cell",
-            found=shortened(cells["gain"]),
+            found=_cell(cells["gain"]),
             remedy="Leave it empty if it is not known.",
         )
-    return Line(number, file, cells.get("view") or None, angle, gain)
+    return Line(
+        number, posixpath.normpath(canonical(file)), canonical(cells.get("view", "")) or None, angle, gain
+    )
+
+
+def _cell(text: str) -> str:
+    """A cell that is no number, for messages."""
+    comma = decimal_comma([text])
+    return f"{comma} with a decimal comma; numbers have a point" if comma else shortened(text)
 
 
 def table_text(lines: Iterable[tuple[str, str, Exposure, float | None, str]]) -> str:

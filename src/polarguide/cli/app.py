@@ -102,7 +102,11 @@ def run(arguments: Sequence[str]) -> int:
         sys.stderr,
     ):  # names of files may have bytes that are no text, or that it cannot say
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+            # ASCII is what Python takes in the C locale, where terminals show UTF-8 as well.
+            ascii_only = stream.encoding.lower() in ("ascii", "us-ascii", "ansi_x3.4-1968")
+            by_locale = "PYTHONIOENCODING" not in os.environ
+            encoding = "utf-8" if ascii_only and by_locale else None
+            stream.reconfigure(encoding=encoding, errors="backslashreplace")
     try:
         with warnings_printed():
             status = _call(verb, arguments)

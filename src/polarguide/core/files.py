@@ -14,6 +14,7 @@ from pathlib import Path
 
 from polarguide.core.errors import PolarguideError
 from polarguide.core.system import process_is_alive
+from polarguide.core.text import canonical
 
 LARGEST_FILE = 1 << 31
 _MASK = os.umask(0)  # what rights new files do not get; it can only be asked for by setting it
@@ -169,6 +170,17 @@ def _reason(error: OSError) -> str:
     if isinstance(error, shutil.Error) and isinstance(error.args[0], list):
         return str(error.args[0][0][-1])
     return error.strerror or str(error)
+
+
+def stored(path: Path) -> Path:
+    """A path as the file system has it: where nothing is there, what has the same name in another form of Unicode."""
+    if os.path.lexists(path) or path == path.parent:
+        return path
+    folder = stored(path.parent)
+    same: list[Path] = []
+    with contextlib.suppress(OSError):
+        same = [entry for entry in folder.iterdir() if canonical(entry.name) == canonical(path.name)]
+    return same[0] if len(same) == 1 else folder / path.name
 
 
 def require_folder(path: Path, *, expected: str, remedy: str) -> None:

@@ -2,10 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import math
+import re
+import unicodedata
 from collections.abc import Iterable
+from pathlib import PurePath
+
+
+def canonical(name: str) -> str:
+    """A name in the composed form of Unicode (NFC, UAX 15), in which names are compared.
+
+    File systems and programs store one name as different characters: an u-umlaut is one sign, or u and two dots.
+    """
+    return unicodedata.normalize("NFC", name)
+
+
+def stem_of(path: PurePath) -> str:
+    """A file's name without its suffix, ``canonical``."""
+    return canonical(path.stem)
 
 
 def decimal(text: str) -> float:
@@ -36,12 +53,24 @@ def decimals(text: str) -> tuple[float, ...]:
         return ()
 
 
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
+
+
+def decimal_comma(cells: Iterable[str]) -> str:
+    """The first of several texts that is a number with a decimal comma, as ``0,9238``; empty where none is."""
+    return next((cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell)), "")
+
+
 def printable(text: str, *, lines: bool = False) -> str:
     """Escape control characters in a text, such as names of files, before it is printed.
 
     Args:
         lines: whether it may have several lines.
     """
+    with contextlib.suppress(
+        UnicodeEncodeError
+    ):  # in the C locale, Python has made names in UTF-8 single bytes
+        text = text.encode("utf-8", "surrogateescape").decode("utf-8", "surrogateescape")
     return "".join(
         sign
         if sign.isprintable() or (lines and sign == "\n")

@@ -38,6 +38,7 @@ from polarguide.core.files import check_out, holds_files, make_folder, read_file
 from polarguide.core.progress import Reporter
 from polarguide.core.records import decode, read_record, shortened, to_json
 from polarguide.core.system import hold_folder
+from polarguide.core.text import canonical, stem_of
 from polarguide.preparation.settings import PrepareSettings, known_intrinsics
 from polarguide.preparation.source import Source, developed
 
@@ -180,7 +181,8 @@ class SceneFolder:
                 found=f"{name} {new}",
                 remedy="Repeat the command as it was, or give another --out; nothing was written.",
             )
-        self.measured, self.views = state.get("measured"), state.get("views", {})
+        self.measured = state.get("measured")
+        self.views = {canonical(view): record for view, record in state.get("views", {}).items()}
 
     def require_measured(self, needs: Collection[str]) -> None:
         """Check that what an earlier call has measured, if there was one, has all that is read of it.
@@ -403,7 +405,7 @@ class Workshop:
         measured = self._folder.measured
         assert measured is not None
         known = measured.setdefault(PHOTOGRAPHS, {})
-        if images.is_dir() and any(path.stem not in views for path in images.iterdir()):
+        if images.is_dir() and any(stem_of(path) not in views for path in images.iterdir()):
             shutil.rmtree(self._root, ignore_errors=True)  # of an earlier call with other poses
             known.clear()
         for path in (images, masks):

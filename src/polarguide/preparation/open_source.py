@@ -26,6 +26,7 @@ from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_folder
+from polarguide.core.text import stem_of
 from polarguide.preparation.filter_source import FilterSource, SinglesSource
 from polarguide.preparation.mosaic_source import MosaicSource
 from polarguide.preparation.settings import PrepareSettings, check_format
@@ -38,7 +39,7 @@ def _views_of_masks(files: Iterable[Path], views: Sequence[str]) -> dict[str, Pa
     pictures = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
     for shorten in (str, view_of_name, lambda name: name.removesuffix("_mask")):
         for path in pictures:
-            view = shorten(path.stem)
+            view = shorten(stem_of(path))
             if view in views:
                 masks.setdefault(view, path)
     return masks
@@ -114,7 +115,7 @@ def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
     files = list_files(root, SHOT_SUFFIXES)
     if not files:
         return any(angle not in ANGLES for angle in folders_of_angles(root).values())
-    named = angles_of_names([path.stem for path in files])
+    named = angles_of_names([stem_of(path) for path in files])
     shots = [name for name in named if name is not None]
     if any(angle not in ANGLES for _, angle in shots):
         return True

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
+from polarguide.core.text import decimal_comma
 from polarguide.geometry.camera import quaternion
 
 MODELS = {
@@ -95,12 +96,13 @@ def write_cameras(
 
 _PARAMETERS = dict(MODELS.values())
 _LONGEST_NAME = 4096
+_BEFORE_NAMES = 9  # cells of an image before its name
 
 
 def check_model_files(folder: Path, kind: str) -> None:
     """Check the files of a model, of suffix ``kind``; missing files are skipped.
 
-    Of text files, which pycolmap checks itself, only the colors of points are looked at.
+    Of text files, which pycolmap checks itself, only decimal commas and the colors of points are looked for.
 
     Raises:
         PolarguideError: a file is truncated, damaged, or has trailing bytes.
@@ -121,6 +123,13 @@ def check_model_files(folder: Path, kind: str) -> None:
                     found = f"{len(data)} bytes where its counts require {end}"
             except (struct.error, ValueError) as error:
                 found = f"a damaged one ({error})" if data else "an empty file"
+        elif comma := _decimal_comma(data):
+            raise PolarguideError(
+                path,
+                expected="numbers with a decimal point",
+                found=comma,
+                remedy="Write the model again in a program or a locale (LC_NUMERIC=C) that writes points.",
+            )
         elif name == "points3D":
             found = _strange_color(data)
         if found is not None:
@@ -130,6 +139,18 @@ def check_model_files(folder: Path, kind: str) -> None:
                 found=found,
                 remedy="Copy or export the model again.",
             )
+
+
+_HEAD = 1 << 16  # bytes; a program writes all lines alike
+
+
+def _decimal_comma(data: bytes) -> str:
+    """Where the first lines of a text file have a decimal comma; empty where they have none."""
+    for number, line in enumerate(data[:_HEAD].decode("ascii", "replace").splitlines(), 1):
+        comma = "" if line.startswith("#") else decimal_comma(line.split()[:_BEFORE_NAMES])
+        if comma:
+            return f"a decimal comma, {comma} in line {number}"
+    return ""
 
 
 def _strange_color(data: bytes) -> str | None:

@@ -19,6 +19,7 @@ from polarguide.capture.colmap.files import check_model_files
 from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
+from polarguide.core.text import canonical
 from polarguide.geometry.camera import FARTHEST, LENS, Camera, can_be_lens
 
 _POSE = 9  # number, quaternion, translation, camera: what stands before the name
@@ -65,7 +66,10 @@ def read_text_images(data: bytes) -> TextImages:
             number = int(head[0])
             if number in names:
                 raise ValueError(f"image {number} stands there twice")
-            names[number] = head[_POSE].decode().strip()
+            try:
+                names[number] = head[_POSE].decode().strip()
+            except UnicodeDecodeError:
+                raise ValueError(f"line {count} has a name that is not in UTF-8") from None
             out.append(b" ".join([*head[:_POSE], b"%d" % number]))
     return TextImages(b"\n".join(out) + b"\n\n", names)
 
@@ -297,7 +301,7 @@ def view_of_name(name: str, views: Collection[str] = ()) -> str:
     Suffixes without one are no kinds of files: ``./train/r_0.5`` is called so. Nor is what follows a point in the name
     of one of ``views``: Metashape's labels have no suffix.
     """
-    path = PurePosixPath(name.replace("\\", "/"))
+    path = PurePosixPath(canonical(name).replace("\\", "/"))
     if path.name in views:
         return path.name
     return path.stem if any(sign.isalpha() for sign in path.suffix) else path.name
