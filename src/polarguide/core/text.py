@@ -11,6 +11,8 @@ import unicodedata
 from collections.abc import Iterable
 from pathlib import PurePath
 
+_MOST_DIGITS = 10  # Python itself refuses thousands of them
+
 
 def canonical(name: str) -> str:
     """A name in the composed form of Unicode (NFC, UAX 15), in which names are compared.
@@ -35,6 +37,11 @@ def decimal(text: str) -> float:
     if "_" in text or not text.isascii():
         raise ValueError(f"not a number: {text!r}")
     return float(text)
+
+
+def whole_number(text: str) -> int | None:
+    """A whole number of plain digits; None for other texts, and for more digits than any count here has."""
+    return int(text) if text.isascii() and text.isdigit() and len(text) < _MOST_DIGITS else None
 
 
 def number_or_nan(text: str) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -44,6 +45,7 @@ from polarguide.preparation.source import Source, developed
 
 JOURNAL = "prepare.json"
 SCENE = "scene.json"
+SPLIT = "split.json"
 SFM = ".sfm"
 PARTIAL = ".sparse.partial"
 FOLDERS = ("polar", "invalid", "masks", "sparse")
@@ -285,6 +287,11 @@ class SceneFolder:
         sizes = write_view(self.root, view, codes, invalid, mask, angles)
         self.views[view] = {**record, "files": sizes}
         self.save()
+
+    def hold_out(self, views: Sequence[str]) -> None:
+        """Note which views are for tests, unless the user has."""
+        if views and not os.path.lexists(self.root / SPLIT):
+            write_whole(self.root / SPLIT, to_json({"test": list(views)}))
 
     def drop(self, view: str) -> None:
         """Remove a view that an earlier call without poses wrote, and that has none."""

@@ -7,11 +7,11 @@ from __future__ import annotations
 import os
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from polarguide.capture.colmap.model import view_of_name
+from polarguide.capture.colmap.model import holds_model, view_of_name
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
 from polarguide.capture.exposures import TABLE, angles_of_names, folders_of_angles
@@ -20,7 +20,7 @@ from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
 from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.layout import angle_folders, describe_contents, index_files, list_files
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
-from polarguide.capture.pose_files import read_pose_file
+from polarguide.capture.pose_files import TEST, parts_of_poses, read_parts
 from polarguide.capture.sensor.pattern import SENSOR_NAMES
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
@@ -173,6 +173,7 @@ def poses_beside(root: Path) -> list[str]:
     names = (
         "sparse",
         "transforms.json",
+        "transforms_train.json",
         "cameras.xml",
         "cameras.npz",
         "cameras_new.npz",
@@ -221,7 +222,10 @@ def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto
         assert pictures.cameras is not None
         return Poses.of_cameras(pictures.cameras, root, pictures.views)
     path = Path(origin)
-    if path.suffix.lower() in POSE_FILES and path.is_file():
+    parts = {"all": path} if path.suffix.lower() in POSE_FILES and path.is_file() else {}
+    if path.is_dir() and not holds_model(path):
+        parts = parts_of_poses(path)
+    if parts:
         known, assumed = set(pictures.views), set[str]()
 
         def sizes(view: str) -> tuple[tuple[int, int], ...]:
@@ -229,11 +233,29 @@ def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto
             stored = pictures.stored(view if view in known else pictures.views[0])
             return stored.turned_first if poses_of == "displayed" else stored.sizes
 
-        cameras = read_pose_file(path, pictures.views, sizes)
-        poses = Poses.of_cameras(cameras, path, pictures.views, [path])
+        cameras, tests = read_parts(parts, pictures.views, sizes)
+        poses = Poses.of_cameras(cameras, path, pictures.views, list(parts.values()))
         poses.assumed_sizes = frozenset(assumed)
+        poses.held_out = tuple(view for view in poses.views if view in tests)
+        poses.notes = _notes_of_parts(path, parts, poses)
         return poses
     return Poses.read(path, pictures.views)
+
+
+def _notes_of_parts(path: Path, parts: Mapping[str, Path], poses: Poses) -> tuple[str, ...]:
+    """Which parts of a capture the poses are of."""
+    if path.is_dir() and len(parts) > 1:
+        held = (
+            f"{len(poses.held_out)} views of {parts[TEST].name} are held out for tests."
+            if TEST in parts
+            else ""
+        )
+        return (f"Poses of {listed([file.name for file in parts.values()])}. {held}".strip(),)
+    beside = parts_of_poses(path.parent) if path.is_file() else {}
+    if path in beside.values() and len(beside) > 1 and poses.missing:
+        others = listed([file.name for file in beside.values() if file != path])
+        return (f"{others} beside {path.name}: --poses {shlex.quote(str(path.parent))} reads all of them.",)
+    return ()
 
 
 def settle_pose_frames(pictures: Source, poses: Poses, frame_given: str) -> str:

@@ -113,6 +113,10 @@ def prepare_scene(
     reporter.say(f"{len(pictures.views)} views, format {pictures.kind}.")
     if frames:
         reporter.say(frames)
+    for note in poses.notes if poses is not None else ():
+        reporter.say(note)
+    for warning in poses.warnings if poses is not None else ():
+        reporter.warn(warning)
     beside = poses_beside(root) if settings.poses == "sfm" else []
     if beside:
         ways = " or ".join(f"--poses {shlex.quote(str(root / name))}" for name in beside)
@@ -137,6 +141,7 @@ def _write_scene(
     reporter: Reporter,
 ) -> Prepared:
     """Write what is missing of a scene that has been measured."""
+    tests = () if poses is None else poses.held_out
     folder.start()
     work = Workshop(folder, pictures, settings, reporter)
     points: dict[str, Any] | None = None
@@ -167,6 +172,7 @@ def _write_scene(
         reporter.say(note)
     if poses is not None:
         _write_model(folder, poses)
+        folder.hold_out([view for view in poses.views if view in tests])
     if pictures.kind == "singles":
         estimate = settings.gains == "auto"
         write_exposure_table(folder, estimate=estimate, posed=poses is not None, reporter=reporter)

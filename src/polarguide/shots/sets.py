@@ -36,7 +36,7 @@ from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_file
 from polarguide.core.records import shortened
-from polarguide.core.text import canonical, stem_of
+from polarguide.core.text import canonical, stem_of, whole_number
 from polarguide.shots.options import Kind
 
 
@@ -326,7 +326,6 @@ def _video(path: Path) -> ExposureSet:
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 _COLUMNS = ["frame", "angle"]
-_MOST_DIGITS = 12
 _REMEDY = "Write a line for each frame to use: its number, counted from 0, and its angle in degrees."
 
 
@@ -350,16 +349,15 @@ def read_frame_table(path: Path, video: Path) -> list[tuple[int, Angle]]:
     frames: dict[int, Angle] = {}
     for number, row in rows[1:]:
         angle = parse_angle(row[1]) if len(row) == len(_COLUMNS) else None
-        # Longer numbers are no frame of any video, and Python's ``int`` refuses those of thousands of digits.
-        whole = row[0].isascii() and row[0].isdecimal() and len(row[0]) <= _MOST_DIGITS
-        if angle is None or not whole or int(row[0]) in frames:
+        frame = whole_number(row[0])
+        if angle is None or frame is None or frame in frames:
             raise PolarguideError(
                 f"{path} (line {number})",
                 expected=f"a frame that no other line has, and its angle up to {LARGEST:g} degrees",
                 found=shortened(",".join(row)),
                 remedy=_REMEDY,
             )
-        frames[int(row[0])] = angle
+        frames[frame] = angle
     return sorted(frames.items())
 
 

@@ -1,4 +1,4 @@
-"""The binary files of a COLMAP model: checked before they are read, and written for posed cameras without points."""
+"""The files of a COLMAP model: checked before they are read, and written for posed cameras without points."""
 
 from __future__ import annotations
 
@@ -96,7 +96,6 @@ def write_cameras(
 
 _PARAMETERS = dict(MODELS.values())
 _LONGEST_NAME = 4096
-_BEFORE_NAMES = 9  # cells of an image before its name
 
 
 def check_model_files(folder: Path, kind: str) -> None:
@@ -147,7 +146,7 @@ _HEAD = 1 << 16  # bytes; a program writes all lines alike
 def _decimal_comma(data: bytes) -> str:
     """Where the first lines of a text file have a decimal comma; empty where they have none."""
     for number, line in enumerate(data[:_HEAD].decode("ascii", "replace").splitlines(), 1):
-        comma = "" if line.startswith("#") else decimal_comma(line.split()[:_BEFORE_NAMES])
+        comma = "" if line.startswith("#") else decimal_comma(line.split()[:_POSE])
         if comma:
             return f"a decimal comma, {comma} in line {number}"
     return ""
@@ -235,3 +234,63 @@ def _at_most(count: int, most: int) -> int:
     if count > most:
         raise ValueError(f"a count of {count} that the file is too short for")
     return count
+
+
+_POSE = 9  # number, quaternion, translation, camera: what stands before the name
+_PLACE = 3  # x, y and the number of a point; pycolmap checks all of them, lines of images show in the first
+
+
+@dataclass(frozen=True)
+class TextImages:
+    """A text model that pycolmap can read in place of an ``images.txt``.
+
+    Attributes:
+        data: the same file with names that have no blanks.
+        names: number of an image -> its name.
+    """
+
+    data: bytes
+    names: dict[int, str]
+
+
+def read_text_images(data: bytes) -> TextImages:
+    """Take the names out of an ``images.txt``.
+
+    An image with one line, as some programs write it, would make pycolmap pass over every other image.
+
+    Raises:
+        ValueError: lines are not those of images and their observations in turn, or a name is not in UTF-8.
+    """
+    out: list[bytes] = []
+    names: dict[int, str] = {}
+    number: int | None = None  # of the image whose observations come next
+    for count, line in enumerate(data.splitlines(), 1):
+        cells = line.split()
+        if number is not None:
+            if len(cells) % _PLACE or not all(map(_is_number, cells[: _POSE + _PLACE])):
+                raise ValueError(f"line {count} does not hold the observations of image {number}")
+            number = None
+            out.append(line)
+        elif not cells or line.lstrip().startswith(b"#"):
+            out.append(line)
+        else:
+            head = line.split(None, _POSE)
+            if len(head) <= _POSE or not (head[0].isdigit() and all(map(_is_number, head[:_POSE]))):
+                raise ValueError(f"line {count} does not hold an image")
+            number = int(head[0])
+            if number in names:
+                raise ValueError(f"image {number} stands there twice")
+            try:
+                names[number] = head[_POSE].decode().strip()
+            except UnicodeDecodeError:
+                raise ValueError(f"line {count} has a name that is not in UTF-8") from None
+            out.append(b" ".join([*head[:_POSE], b"%d" % number]))
+    return TextImages(b"\n".join(out) + b"\n\n", names)
+
+
+def _is_number(cell: bytes) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
