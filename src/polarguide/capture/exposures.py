@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import math
 import os
@@ -20,7 +18,7 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.capture.calibration import Calibration
 from polarguide.core.errors import PolarguideError
-from polarguide.core.files import read_file, stored
+from polarguide.core.files import read_rows, stored
 from polarguide.core.records import shortened
 from polarguide.core.text import canonical, csv_lines, decimal_comma, number_or_nan
 from polarguide.geometry.polarizer import ANGLES
@@ -186,7 +184,6 @@ _COLUMNS = ("file", "view", "angle", "gain", "modulation", "note")
 _NEEDED = ("file", "angle")
 # Columns that a training writes, and that are not read; ``certainty`` in earlier versions.
 _WRITTEN_BY_TRAINING = ("modulation", "note", "certainty")
-_LARGEST_TABLE = 1 << 26
 # A camera exposes over some twenty stops either way; more leaves no numbers in single precision.
 _LARGEST_GAIN = 1e6
 _REMEDY = "Columns are file, angle (degrees, unknown or none) and, where wanted, view and gain, with commas between."
@@ -267,33 +264,14 @@ def _listed_twice(where: str, first: Line, second: Line) -> PolarguideError:
     )
 
 
-def read_rows(path: Path, remedy: str) -> list[tuple[int, list[str]]]:
-    """The rows of a CSV file that are not empty: number of the line, from 1, and cells without blanks around them.
-
-    Raises:
-        PolarguideError: the file cannot be read, or is no CSV file; ``remedy`` is for messages.
-    """
-    data = read_file(path, largest=_LARGEST_TABLE, remedy=remedy)
-    try:
-        text = io.StringIO(data.decode("utf-8-sig"), newline="")
-        reader = csv.reader(text, strict=True, skipinitialspace=True)
-        rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise PolarguideError(
-            path, expected="CSV text in UTF-8", found=f"something else ({error})", remedy=remedy
-        ) from None
-    return [(number, row) for number, row in rows if any(row)]
-
-
 def _header(path: Path, row: list[str]) -> list[str]:
     columns = [cell.lower() for cell in row]
-    between = ", with semicolons between columns" if any(";" in cell for cell in row) else ""
     known = set(columns) <= {*_COLUMNS, *_WRITTEN_BY_TRAINING} and len(set(columns)) == len(columns)
     if not known or not set(_NEEDED) <= set(columns):
         raise PolarguideError(
             f"{path} (line 1)",
             expected="the header file,angle or file,view,angle,gain",
-            found=shortened(",".join(row)) + between if row else "an empty file",
+            found=shortened(",".join(row)) if row else "an empty file",
             remedy=_REMEDY,
         )
     return columns
@@ -302,9 +280,8 @@ def _header(path: Path, row: list[str]) -> list[str]:
 def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
     """One line from its cells by column."""
     file = cells["file"]
-    if not file or "\0" in file:
-        found = shortened(file) if file else "an empty cell"
-        raise PolarguideError(where, expected="the name of a file", found=found, remedy=_REMEDY)
+    if not file:
+        raise PolarguideError(where, expected="the name of a file", found="an empty cell", remedy=_REMEDY)
     angle = parse_angle(cells.get("angle", ""))
     if angle is None:
         raise PolarguideError(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import glob
+import io
 import os
 import re
 import shutil
@@ -266,6 +268,46 @@ def read_file(
             found=error.strerror or str(error),
             remedy=remedy,
         ) from error
+
+
+_LARGEST_TABLE = 1 << 26
+
+
+def read_rows(path: Path, remedy: str) -> list[tuple[int, list[str]]]:
+    """The rows of a CSV file that are not empty: number of the line, from 1, and cells without blanks around them.
+
+    Cells have commas between them, or semicolons as spreadsheets of some countries write them.
+
+    Raises:
+        PolarguideError: the file cannot be read, or is no CSV file; ``remedy`` is for messages.
+    """
+    data = read_file(path, largest=_LARGEST_TABLE, remedy=remedy)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise _no_csv(path, error, remedy) from None
+    head = text.partition("\n")[0]
+    delimiter = ";" if head.count(";") > head.count(",") else ","
+    reader = csv.reader(
+        io.StringIO(text, newline=""), strict=True, skipinitialspace=True, delimiter=delimiter
+    )
+    rows: list[tuple[int, list[str]]] = []
+    line = 0  # where the last row ended
+    try:
+        for row in reader:
+            line = reader.line_num
+            rows.append((line, [cell.strip() for cell in row]))
+    except csv.Error as error:
+        raise _no_csv(f"{path} (line {line + 1})", error, remedy) from None
+    null = next((number for number, row in rows if any("\0" in cell for cell in row)), None)
+    if null is not None:
+        raise _no_csv(f"{path} (line {null})", "a null character", remedy)
+    return [(number, row) for number, row in rows if any(row)]
+
+
+def _no_csv(where: object, found: object, remedy: str) -> PolarguideError:
+    found = f"something else ({found})"
+    return PolarguideError(where, expected="CSV text in UTF-8", found=found, remedy=remedy)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -26,6 +26,7 @@ from polarguide.experiments.collection import (
     CaptureRecord,
     Processing,
     Request,
+    source_digest,
     source_stamp,
 )
 from polarguide.experiments.compare import locked
@@ -236,16 +237,22 @@ def is_scene(folder: Path) -> bool:
 
 def _task(capture: Capture, root: Path, options: BatchOptions) -> Processing:
     path = capture.path.absolute()
+    folder = (root / CAPTURES / capture.name).absolute()
+    stamp, earlier = source_stamp(path), None
+    with contextlib.suppress(
+        PolarguideError
+    ):  # the process that works on it says what is wrong with its record
+        earlier = CaptureRecord.load(folder)
     request = Request(
         source=str(path),
-        stamp=source_stamp(path),
+        stamp=stamp,
         prepare=None if is_scene(path) else capture.prepare.record(),
         recipe=capture.recipe,
         settings=capture.settings,
         reading=capture.reading,
         formats=options.formats,
+        digest=source_digest(path, None if earlier is None else earlier.request, stamp),
     )
-    folder = (root / CAPTURES / capture.name).absolute()
     return Processing(capture.name, str(folder), request, ComputeOptions(options.threads, options.device))
 
 

@@ -40,6 +40,7 @@ from polarguide.core.progress import Reporter
 from polarguide.core.records import decode, read_record, shortened, to_json
 from polarguide.core.system import hold_folder
 from polarguide.core.text import canonical, stem_of
+from polarguide.preparation.request import FileStamp, first_difference
 from polarguide.preparation.settings import PrepareSettings, known_intrinsics
 from polarguide.preparation.source import Source, developed
 
@@ -69,7 +70,8 @@ class _Request(msgspec.Struct):
     settings: _Settings
     source: str
     format: str
-    file: dict[str, tuple[int, int]]
+    file: dict[str, FileStamp]
+    model: dict[str, FileStamp] = {}
 
 
 class _Exposure(msgspec.Struct):
@@ -174,7 +176,7 @@ class SceneFolder:
             for record in (before, now):
                 record["settings"] = {k: v for k, v in record["settings"].items() if k not in _OF_POSES}
                 record.pop("model", None)
-        differing = _first_difference(before, now)
+        differing = first_difference(before, now)
         if differing is not None:
             name, old, new = differing
             raise PolarguideError(
@@ -336,22 +338,6 @@ def _require_exposures(journal: Path, view: str, record: _View) -> None:
             found=shortened(named),
             remedy=REMEDY,
         )
-
-
-def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> tuple[str, str, str] | None:
-    """Name, old and new value of the first thing that differs."""
-    for part in sorted(before.keys() | now.keys()):
-        old, new = before.get(part), now.get(part)
-        if old == new:
-            continue
-        if isinstance(old, dict) and isinstance(new, dict):
-            keys = sorted(old.keys() | new.keys())
-            key = next(k for k in keys if (k in old) != (k in new) or old[k] != new[k])
-            if part == "settings":
-                return key, str(old.get(key)), str(new.get(key))
-            return f"{part} {key}", "as it was", "that was changed, added or removed"
-        return part, str(old), str(new)
-    return None
 
 
 PHOTOGRAPHS = "photographs"

@@ -25,7 +25,7 @@ from polarguide.core.files import make_folder, writing
 from polarguide.core.progress import Reporter
 from polarguide.core.records import option_name
 from polarguide.preparation.exposure_table import write_exposure_table
-from polarguide.preparation.folder import PARTIAL, PHOTOGRAPHS, SCENE, SFM, SceneFolder, Workshop
+from polarguide.preparation.folder import JOURNAL, PARTIAL, PHOTOGRAPHS, SCENE, SFM, SceneFolder, Workshop
 from polarguide.preparation.open_source import (
     known_poses,
     open_source,
@@ -33,6 +33,7 @@ from polarguide.preparation.open_source import (
     poses_beside,
     settle_pose_frames,
 )
+from polarguide.preparation.request import request_of
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Source, developed, measured_source
 
@@ -105,7 +106,15 @@ def prepare_scene(
     frames = ""
     if poses is not None and settings.poses != "dataset":
         frames = settle_pose_frames(pictures, poses, settings.poses_of)
-    folder = SceneFolder(target, _request(root, pictures, settings, poses))
+    request = request_of(
+        root,
+        [target / JOURNAL, target / SCENE],
+        pictures.kind,
+        settings.record(),
+        [*pictures.paths, *pictures.masks.values()],
+        poses.files if poses is not None else (),
+    )
+    folder = SceneFolder(target, request)
     folder.require_measured(pictures.needs)
     if folder.finished:
         reporter.say(f"{target} is complete already; nothing to do.")
@@ -212,28 +221,6 @@ def _without_poses(root: Path, pictures: Source, settings: PrepareSettings) -> s
         f"Each view alone has S0, DoLP, AoLP, normals and separations: {command}. "
         "Nothing was written; --poses none develops the views without poses."
     )
-
-
-def _request(root: Path, pictures: Source, settings: PrepareSettings, poses: Poses | None) -> dict[str, Any]:
-    """Settings that must not change between the calls that write one scene."""
-
-    def fingerprint(path: Path) -> list[int]:
-        status = path.stat()
-        return [status.st_size, status.st_mtime_ns]
-
-    request = {
-        "source": os.path.realpath(root),
-        "format": pictures.kind,
-        "settings": settings.record(),
-        "file": {
-            str(path): fingerprint(path)
-            for path in (*pictures.paths, *pictures.masks.values())
-            if path.exists()
-        },
-    }
-    if poses is not None and poses.files:
-        request["model"] = {path.name: fingerprint(path) for path in poses.files}
-    return request
 
 
 def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, reporter: Reporter) -> None:

@@ -27,14 +27,13 @@ from polarguide.capture.exposures import (
     nominal,
     normalized,
     parse_angle,
-    read_rows,
     read_table,
 )
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, group_files
 from polarguide.capture.layout import ambiguous, list_files
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
-from polarguide.core.files import require_file
+from polarguide.core.files import read_rows, require_file
 from polarguide.core.records import shortened
 from polarguide.core.text import canonical, stem_of, whole_number
 from polarguide.shots.options import Kind
