@@ -41,7 +41,7 @@ from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.record import read_metrics
 from polarguide.results.evaluation.table import COLUMNS, Metric
 from polarguide.runs.folder import CHECKPOINT, RunConfiguration
-from polarguide.runs.health import Health
+from polarguide.runs.health import recorded_health
 from polarguide.training.settings import TrainSettings
 from polarguide.visualization.pages import page
 
@@ -77,9 +77,9 @@ class Row:
         """Findings of the inspection, and warnings of the training."""
         if self.record is None:
             return ()
-        health = Health.load(self.folder / RUN) if "train" in self.record.done else None
-        own = () if health is None else (f"polarization: {health.polarization.text}", *health.warnings)
-        return (*self.record.findings, *own)
+        polarization, own = recorded_health(self.folder / RUN) if "train" in self.record.done else (None, ())
+        evidence = () if polarization is None else (f"polarization: {polarization}",)
+        return (*self.record.findings, *evidence, *own)
 
     def links(self) -> list[tuple[str, str]]:
         """Label and path of what there is, from the folder of all."""
