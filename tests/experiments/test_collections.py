@@ -8,6 +8,7 @@ from html import unescape
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pandas as pd
 import pytest
 from faults import Fault
@@ -124,7 +125,7 @@ def test_a_capture_is_known_by_its_content(tmp_path: Path) -> None:
     (moved / "0" / "v.png").write_bytes(b"124")  # as large
     changed = _task(Capture("a", moved, PrepareSettings()), tmp_path, OPTIONS).request
     Fault(str(folder), "(stamp)", "files that have changed").raised_by(record.require, changed, folder)
-    old = CaptureRecord(FORMAT, replace(begun, digest=""))  # of an earlier version
+    old = CaptureRecord(FORMAT, msgspec.structs.replace(begun, digest=""))  # of an earlier version
     Fault(str(folder), "(stamp)", "files that have changed").raised_by(old.require, again, folder)
 
 

@@ -38,22 +38,10 @@ def test_cameras_in_one_place_have_no_epipolar_lines(moved: float) -> None:
         generator.uniform(20, 60, (50, 2)),
         generator.normal(size=(50, 128)).astype(np.float32),
     )
-    first, second = (
-        SimpleNamespace(
-            name=f"v{k}",
-            camera=Camera(
-                80,
-                80,
-                90.0,
-                90.0,
-                40.0,
-                40.0,
-                torch.eye(3).double(),
-                torch.tensor([k * moved, 0, 0]).double(),
-            ),
-        )
-        for k in range(2)
-    )
+    turn = torch.eye(3, dtype=torch.float64)
+    places = [torch.tensor([k * moved, 0, 0], dtype=torch.float64) for k in range(2)]
+    cameras = [Camera(80, 80, 90.0, 90.0, 40.0, 40.0, turn, place) for place in places]
+    first, second = (SimpleNamespace(name=f"v{k}", camera=camera) for k, camera in enumerate(cameras))
     features = points, descriptors
     with warnings.catch_warnings():
         warnings.simplefilter("error")

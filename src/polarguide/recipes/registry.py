@@ -326,6 +326,16 @@ def recipe_named(name: str) -> Method:
     )
 
 
+def recipe_names() -> list[str]:
+    """Names of all recipes that ``train`` and ``compare`` take: built-in ones, their ablations, and those of plug-ins.
+
+    Example:
+        >>> polarguide.recipe_names()[:2]    # doctest: +SKIP
+        ['3dgs', '3dgs-dr']
+    """
+    return [*RECIPES, *(name for name in _BUILT_IN if name not in RECIPES), *_plugins()[0]]
+
+
 def ablations_of(name: str) -> tuple[Method, ...]:
     """The ablations of a recipe: built-in ones, or what plug-ins offer as ``name:variation``; there may be none.
 

@@ -99,7 +99,7 @@ def _layers(maps: ShotMaps, differences: Differences | None) -> dict[str, tuple[
         "dolp": ("DoLP, bright at 0.5", dolp_to_rgb(dolp, 0.5), maps.dolp_debiased),
         "aolp": ("AoLP as hue", aolp_to_rgb(aolp), np.degrees(maps.aolp)),
         PHOTOGRAPH: (
-            "photograph (S0 / 2), red: beyond a limit",
+            "photograph (S0 / 2); red: beyond a limit, outlined: its pixels",
             np.repeat(gray[..., None], 3, axis=2),
             maps.s0,
         ),
