@@ -210,6 +210,8 @@ def test_help_of_every_verb_names_and_explains_every_flag(
 LOADED = """
 import contextlib, sys
 from polarguide.__main__ import main
+from polarguide.cli.runs import print_scores
+from polarguide.results.evaluation import table as metrics_table
 for line in sys.argv[1:]:
     sys.argv[1:] = line.split()
     with contextlib.suppress(SystemExit):
@@ -265,3 +267,12 @@ def test_python_m_and_its_exit_status() -> None:
     assert done.stdout == ""
     assert len(done.stderr.splitlines()) == 1
     assert done.stderr.startswith("error: no-such-run: expected a run folder")
+
+
+def test_a_label_is_no_markup(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(metrics_table, "shown_metrics", lambda record: [("[/b] [red]mine", "0.5")])
+    monkeypatch.setattr(metrics_table, "absent_metrics", lambda record: [])
+    print_scores({"objects": {}}, "[/i]")
+    shown = capsys.readouterr().out
+    assert "[/b] [red]mine" in shown
+    assert "[/i]" in shown

@@ -17,9 +17,7 @@ import tomllib
 import torch
 from plugins import install
 
-from polarguide.cli.runs import print_scores
 from polarguide.core.errors import PolarguideWarning
-from polarguide.results.evaluation import table
 from polarguide.results.evaluation.metric import GROUP, plugged_metrics
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "how-to" / "write-a-plugin.md"
@@ -162,12 +160,3 @@ def test_a_measure_that_fails_has_no_value(
         for _ in range(2):  # each view is scored, one warning is enough
             assert metric.measure(target, layers) == value
     assert [complaint in str(warning.message) for warning in caught] == ([] if complaint is None else [True])
-
-
-def test_a_label_is_no_markup(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(table, "shown_metrics", lambda record: [("[/b] [red]mine", "0.5")])
-    monkeypatch.setattr(table, "absent_metrics", lambda record: [])
-    print_scores({"objects": {}}, "[/i]")
-    shown = capsys.readouterr().out
-    assert "[/b] [red]mine" in shown
-    assert "[/i]" in shown
