@@ -102,10 +102,8 @@ def run(arguments: Sequence[str]) -> int:
         sys.stderr,
     ):  # names of files may have bytes that are no text, or that it cannot say
         if isinstance(stream, io.TextIOWrapper):
-            # ASCII is what Python takes in the C locale, where terminals show UTF-8 as well.
-            ascii_only = stream.encoding.lower() in ("ascii", "us-ascii", "ansi_x3.4-1968")
-            by_locale = "PYTHONIOENCODING" not in os.environ
-            encoding = "utf-8" if ascii_only and by_locale else None
+            # In the C locale Python takes names of files for ASCII, and terminals show UTF-8 all the same.
+            encoding = "utf-8" if sys.getfilesystemencoding() == "ascii" else None
             stream.reconfigure(encoding=encoding, errors="backslashreplace")
     try:
         with warnings_printed():
