@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from polarguide.geometry.camera import Camera
     from polarguide.inspection.settings import InspectSettings
     from polarguide.preparation.settings import PrepareSettings
+    from polarguide.recipes.registry import recipe_names
     from polarguide.shots.calibration.settings import CalibrateSettings
     from polarguide.shots.exposures import find_shots
     from polarguide.shots.maps import ShotMaps
@@ -51,6 +52,7 @@ _NAMES = {
     "core.options": ("SceneOptions", "SessionOptions"),
     "preparation.settings": ("PrepareSettings",),
     "core.progress": ("Reporter",),
+    "recipes.registry": ("recipe_names",),
     "shots.calibration.settings": ("CalibrateSettings",),
     "shots.exposures": ("find_shots",),
     "shots.maps": ("ShotMaps",),
@@ -99,6 +101,7 @@ __all__ = [
     "priors",
     "read_analyzers",
     "read_shot",
+    "recipe_names",
     "shot_priors",
     "surface_maps",
     "train",
@@ -131,7 +134,7 @@ def _imported(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})
 
 
 def _version() -> str:

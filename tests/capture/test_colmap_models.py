@@ -118,6 +118,32 @@ def test_cameras_without_a_focal_length_are_refused(tmp_path: Path) -> None:
     Fault("image a.png").raised_by(Poses.read, tmp_path, ["a"])
 
 
+def test_a_binary_model_beside_a_text_model_of_other_poses_is_told(capture: TinyCapture) -> None:
+    to_binary(capture)
+    folder = model_folder(capture)
+    pycolmap.Reconstruction(str(folder)).write_text(str(folder))
+    assert read_model(capture.root).warnings == ()
+    for name in ("rigs.txt", "frames.txt"):  # which hold the poses, too
+        (folder / name).unlink()
+    lines = (folder / "images.txt").read_text().splitlines()
+    place = next(number for number, line in enumerate(lines) if not line.startswith("#"))
+    cells = lines[place].split()
+    cells[5] = str(float(cells[5]) + 0.01)
+    lines[place] = " ".join(cells)
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    (warning,) = read_model(capture.root).warnings
+    assert f"images.txt has other poses or cameras than images.bin ({cells[9]})" in warning
+
+
+@pytest.mark.parametrize(("name", "old", "new"), [("cameras", ".5", ",5"), ("images", "0.", "0,")])
+def test_decimal_commas_of_a_model_are_named(capture: TinyCapture, name: str, old: str, new: str) -> None:
+    path = model_folder(capture) / f"{name}.txt"
+    path.write_text(path.read_text().replace(old, new))
+    Fault(f"{name}.txt", "numbers with a decimal point", "a decimal comma").raised_by(
+        read_model, capture.root
+    )
+
+
 def test_binary_wins_over_text(capture: TinyCapture) -> None:
     text = {path.name: path.read_text() for path in model_folder(capture).iterdir()}
     to_binary(capture)

@@ -224,6 +224,28 @@ def test_fields_that_are_not_known_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("top", "frame"),
+    [
+        ({}, {"sharpness": math.nan}),
+        ({}, {"time": -math.inf}),
+        ({"aabb_scale": math.inf}, {}),
+        ({"offset": [0, math.nan, 0], "applied_transform": [[math.nan]]}, {"depth_file_path": [math.nan]}),
+    ],
+)
+def test_fields_that_are_not_used_may_hold_anything(tmp_path: Path, top: dict, frame: dict) -> None:
+    cameras = read_pose_file(write_json(tmp_path / "t.json", {**WHOLE, **top}, frame), VIEWS, stated)
+    assert {camera.parameters for camera in cameras.values()} == {(90, 92, 33, 23)}
+
+
+@pytest.mark.parametrize(
+    ("top", "frame", "field"), [({"cx": math.nan}, {}, "cx"), ({}, {"fl_x": math.inf}, "frames[0].fl_x")]
+)
+def test_fields_that_are_used_must_be_finite(tmp_path: Path, top: dict, frame: dict, field: str) -> None:
+    path = write_json(tmp_path / "t.json", {**WHOLE, **top}, frame)
+    Fault(f"t.json ({field})", expected="a finite number").raised_by(read_pose_file, path, VIEWS, stated)
+
+
+@pytest.mark.parametrize(
     ("inner", "size"), [(INNER, (WIDTH, HEIGHT)), (np.diag([2, 2, 1]) @ INNER, (128, 96))]
 )
 def test_a_size_that_the_file_lacks_is_that_of_the_pictures_it_fits(

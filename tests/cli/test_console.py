@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import io
+import os
 import subprocess
 import sys
 import warnings
@@ -19,6 +20,7 @@ from polarguide.cli.console import ConsoleReporter, JobReporter, Lines, bars, sa
 from polarguide.cli.runs import _errors, print_scores
 from polarguide.core.errors import PolarguideWarning
 from polarguide.core.text import printable
+from polarguide.results.evaluation import table
 from polarguide.results.evaluation.table import METRICS, OBJECT_METRICS
 
 HOSTILE = "\x1b[2J\x1b]0;mine\x07\u202e"
@@ -85,6 +87,15 @@ def test_a_console_that_cannot_say_a_letter_gets_its_escape(monkeypatch: pytest.
     say("\u2603\udcff")
     stream.flush()
     assert b"\\u2603\\udcff" in stream.buffer.getvalue()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", ["gr\u00fcn", "u\u0308", "\u96ea"])
+def test_names_are_readable_in_the_c_locale(tmp_path: Path, name: str) -> None:
+    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    command = [sys.executable, "-m", "polarguide", "eval", os.fsencode(tmp_path / name)]
+    done = subprocess.run(command, capture_output=True, env={**os.environ, **plain}, check=False)
+    assert done.returncode == 2
+    assert f"/{name}: expected".encode() in done.stderr
 
 
 def test_the_display_shows_markup_in_names_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
@@ -265,3 +276,12 @@ def test_python_m_and_its_exit_status() -> None:
     assert done.stdout == ""
     assert len(done.stderr.splitlines()) == 1
     assert done.stderr.startswith("error: no-such-run: expected a run folder")
+
+
+def test_a_label_is_no_markup(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(table, "shown_metrics", lambda record: [("[/b] [red]mine", "0.5")])
+    monkeypatch.setattr(table, "absent_metrics", lambda record: [])
+    print_scores({"objects": {}}, "[/i]")
+    shown = capsys.readouterr().out
+    assert "[/b] [red]mine" in shown
+    assert "[/i]" in shown

@@ -99,7 +99,18 @@ def test_it_is_rendered(earlier: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("kernels", instruction_sets())
 def test_it_is_exported_as_then(earlier: Path, tmp_path: Path, kernels: str) -> None:
     polarguide.present(earlier, crop="all")
-    words = ["--format", "ply", "--fields", "all", "--axes", "scene", "--out", str(tmp_path), "--threads", "1"]
+    words = [
+        "--format",
+        "ply",
+        "--fields",
+        "all",
+        "--axes",
+        "scene",
+        "--out",
+        str(tmp_path),
+        "--threads",
+        "1",
+    ]
     with selected(kernels):
         assert command(["export", str(earlier), *words]) == 0
     paths = earlier / "point_cloud.ply", tmp_path / "polarguide.ply"

@@ -62,10 +62,14 @@ def test_limits_and_the_picture_of_what_is_beyond(
     assert middle[0] > middle[1] > middle[2]
     bound = (middle[1] + middle[2]) / 2
     limits.write_text(json.dumps({"regions": {"left": {"s0_mean": {"min": bound}}}}))
-    assert measure(shots, *options) == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert measure(shots, *options, "--overwrite") == 3
-    assert "beyond: v002: left s0_mean" in capsys.readouterr().out
+    taken = (out / "table.jsonl").read_text()
+    assert measure(shots, *options) == 3
+    said = capsys.readouterr().out
+    assert "3 shots judged by other limits; their figures stay" in said
+    assert "beyond: v002: left s0_mean" in said
+    figures = [[row["s0_mean"] for row in json.loads(line)["regions"]] for line in taken.splitlines()]
+    lines = (out / "table.jsonl").read_text().splitlines()
+    assert [[row["s0_mean"] for row in json.loads(line)["regions"]] for line in lines] == figures
     assert [(row["shot"], row["region"], row["status"]) for row in rows_of(out)] == [
         ("v000", "left", "within"), ("v000", "roi2", "measured"),
         ("v001", "left", "within"), ("v001", "roi2", "measured"),
@@ -78,6 +82,14 @@ def test_limits_and_the_picture_of_what_is_beyond(
     green = (picture[..., 1] > 180) & (picture[..., 0] < 80)
     assert red[100, :4].any()  # ten times as large: the left edge of "left"
     assert green[80:240, 400:402].any()  # and of the other
+
+    # Wider limits take the picture away, other regions need a table of their own.
+    limits.write_text(json.dumps({"limits": {"saturated": {"max": 0}}}))
+    assert measure(shots, *options) == 0
+    assert list((out / "beyond").iterdir()) == []
+    assert {row["status"] for row in rows_of(out)} == {"within"}
+    assert measure(shots, "--out", out, "--roi", "left=0,0,21,48", "--limits", limits) == 2
+    assert "--overwrite" in capsys.readouterr().err
 
 
 def test_a_golden_part(shots: Path, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """A batch: what fails alone, what goes on, what excludes what, and the page over all."""
 
+import os
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -7,6 +8,7 @@ from html import unescape
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pandas as pd
 import pytest
 from faults import Fault
@@ -16,9 +18,9 @@ from tiny_capture import ideal_intensities, write_tiny_capture
 from polarguide.core.options import SceneOptions
 from polarguide.core.records import decode
 from polarguide.experiments import job_queue
-from polarguide.experiments.batch import Capture, _task, run_batch
+from polarguide.experiments.batch import Capture, Row, _task, run_batch
 from polarguide.experiments.children import Message, encoded
-from polarguide.experiments.collection import STEPS, CaptureRecord, prepare_settings
+from polarguide.experiments.collection import FORMAT, STEPS, CaptureRecord, prepare_settings
 from polarguide.experiments.compare import locked
 from polarguide.experiments.options import BatchOptions
 from polarguide.preparation.settings import PrepareSettings
@@ -105,6 +107,44 @@ def test_two_in_one_folder_exclude_each_other(collection: list[Capture], tmp_pat
         Fault("", "nobody", "another batch").raised_by(run_batch, collection, tmp_path, OPTIONS)
     Fault("recipe").raised_by(run_batch, [replace(collection[0], recipe="magic")], tmp_path / "new", OPTIONS)
     assert not (tmp_path / "new").exists()
+
+
+def test_a_capture_is_known_by_its_content(tmp_path: Path) -> None:
+    folder, source = tmp_path / "captures" / "a", tmp_path / "a"
+    (source / "0").mkdir(parents=True)
+    (source / "0" / "v.png").write_bytes(b"123")
+    begun = _task(Capture("a", source, PrepareSettings()), tmp_path, OPTIONS).request
+    record = CaptureRecord(FORMAT, begun)
+    folder.mkdir(parents=True)
+    record.save(folder)
+    os.utime(source / "0" / "v.png", ns=(1, 1))
+    moved = source.rename(tmp_path / "moved")
+    again = _task(Capture("a", moved, PrepareSettings()), tmp_path, OPTIONS).request
+    assert again.stamp != begun.stamp
+    record.require(again, folder)
+    (moved / "0" / "v.png").write_bytes(b"124")  # as large
+    changed = _task(Capture("a", moved, PrepareSettings()), tmp_path, OPTIONS).request
+    Fault(str(folder), "(stamp)", "files that have changed").raised_by(record.require, changed, folder)
+    old = CaptureRecord(FORMAT, msgspec.structs.replace(begun, digest=""))  # of an earlier version
+    Fault(str(folder), "(stamp)", "files that have changed").raised_by(old.require, again, folder)
+
+
+def test_damaged_health_is_a_remark_of_its_capture(tmp_path: Path) -> None:
+    folder = tmp_path / "captures" / "a"
+    (folder / "run").mkdir(parents=True)
+    (folder / "run" / "health.json").write_text("{")
+    request = _task(Capture("a", tmp_path, PrepareSettings()), tmp_path, OPTIONS).request
+    row = Row(
+        "a",
+        "",
+        folder,
+        "done",
+        "",
+        CaptureRecord(FORMAT, request, done=("prepare", "train"), findings=("x",)),
+    )
+    first, second = row.remarks()
+    assert first == "x"
+    assert "health.json: expected a JSON file" in second
 
 
 def test_settings_survive_their_way(tmp_path: Path) -> None:

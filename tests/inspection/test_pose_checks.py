@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +12,10 @@ import torch
 from captures import write_scene
 from glossy_ball import camera_at
 
+from polarguide.geometry.camera import Camera
 from polarguide.inspection import inspect
 from polarguide.inspection.capture import Capture, read_capture
-from polarguide.inspection.inspect import PairError, _fundamental, epipolar_errors, view_errors
+from polarguide.inspection.inspect import PairError, _fundamental, _pair_error, epipolar_errors, view_errors
 
 
 def test_projections_of_one_point_lie_on_each_others_epipolar_lines() -> None:
@@ -26,6 +29,24 @@ def test_projections_of_one_point_lie_on_each_others_epipolar_lines() -> None:
     line = line / np.hypot(*line[:2])
     assert abs(line @ pixels[1]) < 1e-9
     assert abs(line @ (pixels[1] + np.array([*(3 * line[:2]), 0]))) == pytest.approx(3)
+
+
+@pytest.mark.parametrize("moved", [0.0, 0.1])
+def test_cameras_in_one_place_have_no_epipolar_lines(moved: float) -> None:
+    generator = np.random.default_rng(0)
+    points, descriptors = (
+        generator.uniform(20, 60, (50, 2)),
+        generator.normal(size=(50, 128)).astype(np.float32),
+    )
+    turn = torch.eye(3, dtype=torch.float64)
+    places = [torch.tensor([k * moved, 0, 0], dtype=torch.float64) for k in range(2)]
+    cameras = [Camera(80, 80, 90.0, 90.0, 40.0, 40.0, turn, place) for place in places]
+    first, second = (SimpleNamespace(name=f"v{k}", camera=camera) for k, camera in enumerate(cameras))
+    features = points, descriptors
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = _pair_error(first, second, features, features, 1)
+    assert (found is None) == (moved == 0.0)
 
 
 def pairs(errors: dict[tuple[str, str], float]) -> list[PairError]:

@@ -16,7 +16,7 @@ from typing import Any, get_args, get_type_hints
 import cv2
 import numpy as np
 import pytest
-from camera_files import write_mosaics
+from camera_files import write_model, write_mosaic, write_mosaics
 from faults import Fault
 from refused_preparations import MOSAIC, NAMES, refused
 
@@ -95,12 +95,65 @@ def test_a_stopped_preparation_gives_the_same_files(tmp_path: Path, monkeypatch:
         )
 
 
+def touched(source: Path, out: Path) -> tuple[Path, Path]:
+    for path in source.iterdir():
+        os.utime(path, ns=(1, 1))
+    return source, out
+
+
+def renamed(source: Path, out: Path) -> tuple[Path, Path]:
+    return source.rename(source.with_name("moved")), out.rename(out.with_name("scene"))
+
+
+def typed_otherwise(source: Path, out: Path) -> tuple[Path, Path]:
+    return Path(os.path.relpath(source)), out
+
+
+def copied(source: Path, out: Path) -> tuple[Path, Path]:
+    return Path(shutil.copytree(source, source.with_name("copy"))), out
+
+
+@pytest.mark.parametrize("change", [touched, renamed, typed_otherwise, copied])
+@pytest.mark.parametrize("posed", [False, True])
+def test_files_are_known_by_their_content(tmp_path: Path, change: Callable, posed: bool) -> None:
+    source, out = tmp_path / "in", tmp_path / "out"
+    write_mosaics(source)
+    write_mosaic(tmp_path / "dark.png", np.zeros((48, 64)))
+    model = write_model(tmp_path / "in" / "sparse" / "0", NAMES, "PINHOLE 64 48 80 82 33 25")
+    settings = replace(MOSAIC, dark_frame=tmp_path / "dark.png", poses=str(model) if posed else "none")
+    prepare_scene(source, out, settings)
+    source, out = change(source, out)
+    first = out / "polar" / "v000_000.png"
+    before = first.stat().st_mtime_ns
+    (tmp_path / "elsewhere").mkdir()
+    dark = Path(shutil.move(tmp_path / "dark.png", tmp_path / "elsewhere"))
+    later = replace(settings, dark_frame=dark, poses=str(source / "sparse" / "0"))
+    assert prepare_scene(source, out, later).new != posed
+    assert first.stat().st_mtime_ns == before
+
+
+def test_a_record_without_digests_goes_on_by_sizes_and_times(tmp_path: Path) -> None:
+    source, out = tmp_path / "in", tmp_path / "out"
+    write_mosaics(source)
+    prepare_scene(source, out, MOSAIC)
+    scene = json.loads((out / "scene.json").read_text())
+    files = scene["prepare"]["request"]["file"]
+    scene["prepare"]["request"]["file"] = {str(source / name): stamp[:2] for name, stamp in files.items()}
+    (out / "scene.json").write_text(json.dumps(scene))
+    assert not prepare_scene(source, out, MOSAIC).new
+    os.utime(source / "v001.png", ns=(1, 1))
+    Fault(found="file v001.png that was changed").raised_by(prepare_scene, source, out, MOSAIC)
+
+
 def other_setting(source: Path, out: Path) -> PrepareSettings:
     return replace(MOSAIC, demosaic="quarter")
 
 
 def changed_source(source: Path, out: Path) -> PrepareSettings:
-    os.utime(source / "v001.png", ns=(1, 1))
+    data = (source / "v001.png").read_bytes()
+    before = os.stat(source / "v001.png")
+    (source / "v001.png").write_bytes(data[:-1] + bytes([data[-1] ^ 1]))  # as large, and said to be as old
+    os.utime(source / "v001.png", ns=(before.st_atime_ns, before.st_mtime_ns + 1))
     return MOSAIC
 
 
@@ -118,7 +171,7 @@ def foreign_scene(source: Path, out: Path) -> PrepareSettings:
     ("change", "fault"),
     [
         (other_setting, Fault(expected="a preparation with demosaic half", found="demosaic quarter")),
-        (changed_source, Fault(expected="v001.png as it was", found="changed, added or removed")),
+        (changed_source, Fault(expected="v001.png as it was", found="that was changed")),
         (more_views, Fault(expected="v009.png")),
         (foreign_scene, Fault(found="scene.json of another origin")),
     ],

@@ -281,7 +281,7 @@ def test_the_same_command_goes_on_and_another_calibration_is_refused(tmp_path: P
     prepare_scene(tmp_path / "raw", tmp_path / "scene", settings)
     assert not prepare_scene(tmp_path / "raw", tmp_path / "scene", settings).new
     write_analyzers(tmp_path / "other.safetensors", replace(true_calibration(sensor), lens="another"))
-    Fault(found="that was changed, added or removed").raised_by(
+    Fault(found="file ../camera.safetensors that was removed").raised_by(
         prepare_scene,
         tmp_path / "raw",
         tmp_path / "scene",

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import unicodedata
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -255,6 +257,70 @@ def test_poses_may_follow_on_none(tmp_path: Path) -> None:
     assert done.left_out == ["v002"]
     assert (tmp_path / "out" / "polar" / "v000_000.png").stat().st_mtime_ns == written
     assert len(load_scene(tmp_path / "out").views) == 2
+
+
+@pytest.mark.parametrize(("files", "model"), [("NFD", "NFC"), ("NFC", "NFD")])
+@pytest.mark.parametrize("kind", ["colmap", "transforms"])
+def test_names_are_compared_in_one_form_of_unicode(tmp_path: Path, files: str, model: str, kind: str) -> None:
+    views = [f"B\N{LATIN SMALL LETTER U WITH DIAERESIS}hne {k}" for k in range(3)]
+    stored = [unicodedata.normalize(files, view) for view in views]
+    for name in stored:
+        write_mosaic(tmp_path / "in" / f"{name}.png", mosaic(behind(smooth_light()), COLOR))
+        write_picture(
+            tmp_path / "masks" / f"{unicodedata.normalize(model, name)}.png", np.ones((24, 32)), bits=8
+        )
+    named = [unicodedata.normalize(model, view) for view in views]
+    poses = write_model(tmp_path / "model", named, "PINHOLE 64 48 80 82 33 25")
+    if kind == "transforms":
+        poses = write_transforms_of(tmp_path / "t.json", named)
+    settings = replace(MOSAIC, poses=str(poses), masks=tmp_path / "masks")
+    assert prepare_scene(tmp_path / "in", tmp_path / "out", settings).views == views
+    split = {"test": [unicodedata.normalize("NFD", views[1])]}
+    (tmp_path / "out" / "split.json").write_text(json.dumps(split))
+    scene = load_scene(tmp_path / "out")
+    assert [view.name for view in scene.test_views] == [views[1]]
+    assert scene.view(unicodedata.normalize("NFD", views[2])).mask is not None
+
+
+def write_transforms_of(path: Path, views: Sequence[str]) -> Path:
+    """A transforms.json of cameras on a circle, which look at its middle."""
+    frames = []
+    for view in views:
+        turn = int(view[-1]) / 10
+        pose = np.eye(4)
+        pose[:3, 0] = np.cos(turn), 0, -np.sin(turn)
+        pose[:3, 2] = np.sin(turn), 0, np.cos(turn)
+        pose[:3, 3] = 2.5 * pose[:3, 2]
+        frames.append({"file_path": f"{view}.png", "transform_matrix": pose.tolist()})
+    path.write_text(json.dumps({"fl_x": 80, "cx": 33, "cy": 25, "w": 64, "h": 48, "frames": frames}))
+    return path
+
+
+def test_parts_of_poses_make_one_scene(tmp_path: Path) -> None:
+    write_mosaics(tmp_path / "in", 4)
+    write_transforms_of(tmp_path / "transforms_train.json", NAMES[:2])
+    write_transforms_of(tmp_path / "transforms_val.json", NAMES[2:])
+    write_transforms_of(tmp_path / "transforms_test.json", ["v003"])
+    heard = Heard()
+    settings = replace(MOSAIC, poses=str(tmp_path))
+    prepare_scene(tmp_path / "in", tmp_path / "out", settings, heard)
+    assert any("1 views of transforms_test.json are held out" in text for text in heard.said)
+    scene = load_scene(tmp_path / "out")
+    assert [view.name for view in scene.train_views] == list(NAMES)
+    assert [view.name for view in scene.test_views] == ["v003"]
+    heard = Heard()
+    one = replace(MOSAIC, poses=str(tmp_path / "transforms_train.json"))
+    prepare_scene(tmp_path / "in", tmp_path / "one", one, heard)
+    assert any(f"--poses {tmp_path} reads all of them" in text for text in heard.said)
+
+
+def test_a_view_in_two_parts_of_poses_is_refused(tmp_path: Path) -> None:
+    write_mosaics(tmp_path / "in")
+    write_transforms_of(tmp_path / "transforms_train.json", NAMES)
+    write_transforms_of(tmp_path / "transforms_test.json", NAMES[1:2])
+    Fault("transforms_test.json", found="v001 again").raised_by(
+        prepare_scene, tmp_path / "in", tmp_path / "out", replace(MOSAIC, poses=str(tmp_path))
+    )
 
 
 def summary(scene: Path) -> dict:

@@ -248,7 +248,7 @@ def test_what_was_stopped_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert len(table(scene)) == 4
     first = next(capture.folder.glob("v0_*"))
     first.rename(first.with_name("v0_unknown.jpg"))
-    Fault(found="that was changed, added or removed").raised_by(prepare_scene, capture.folder, scene, asked)
+    Fault(found="that was removed").raised_by(prepare_scene, capture.folder, scene, asked)
 
 
 @pytest.mark.parametrize(
@@ -339,7 +339,25 @@ TABLES = {
     "empty angle": ("file,angle\na.png,\nb.png,0\n", Fault("line 2", expected="an angle")),
     "no file": ("file,angle\na.png,0\nb.png,0\nc.png,0\n", Fault(expected="the file", found="nothing")),
     "no header": ("a.png,0\nb.png,0\n", Fault(expected="the header file,angle")),
-    "semicolons": ("file;angle\na.png;0\n", Fault(remedy="with commas between")),
+    "doubled under two spellings": (
+        "file,angle\na.png,0\n./a.png,1\n",
+        Fault(found="two for a.png, lines 2 and 3"),
+    ),
+    "doubled by a detour": (
+        "file,angle\na.png,0\n../in/a.png,1\n",
+        Fault(found="two for a.png and ../in/a.png"),
+    ),
+    "decimal comma": ('file,angle\na.png,"22,5"\nb.png,0\n', Fault(found="22,5 with a decimal comma")),
+    "decimal comma and semicolons": (
+        "file;angle\na.png;22,5\nb.png;0\n",
+        Fault(found="22,5 with a decimal comma"),
+    ),
+    "decimal comma without quotes": (
+        "file,angle\na.png,22,5\nb.png,0\n",
+        Fault(found="may be a decimal comma"),
+    ),
+    "null character": ("file,angle\na\0.png,0\nb.png,0\n", Fault("line 2)", found="a null character")),
+    "unclosed quote": ('file,angle\na.png,"0\nb.png,0\n', Fault("line 2)", found="unexpected end of data")),
     "strange column": ("file,angle,size\na.png,0,1\nb.png,0,1\n", Fault(expected="the header")),
     "too few cells": ("file,angle\na.png\nb.png,0\n", Fault("line 2)", "2 cells", "1")),
     "too many cells": ("file,angle\na.png,0,1\nb.png,0\n", Fault("line 2)", "2 cells", "3")),
@@ -365,6 +383,24 @@ TABLES = {
     ),
     "gain": ("file,angle,gain\na.png,0,0\nb.png,0,1\n", Fault(expected="a gain from")),
 }
+
+
+def test_one_file_in_two_forms_of_unicode_is_listed_twice(tmp_path: Path) -> None:
+    write_three(tmp_path / "in", ("\N{LATIN SMALL LETTER U WITH DIAERESIS}.png", "b.png"))
+    (tmp_path / "in" / "angles.csv").write_text(
+        "file,angle\n\u00fc.png,0\nu\u0308.png,20\nb.png,1\n", encoding="utf-8"
+    )
+    refused(
+        tmp_path, PLAIN, Fault(expected="one line for each file", found="two for \u00fc.png, lines 2 and 3")
+    )
+
+
+def test_a_table_with_semicolons_and_another_form_of_unicode(tmp_path: Path) -> None:
+    write_three(tmp_path / "in", ("u\u0308.png", "b.png"))
+    (tmp_path / "in" / "angles.csv").write_text("file;angle\n\u00fc.png;22.5\nb.png;0\n", encoding="utf-8")
+    prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
+    rows = [(row["view"], row["angle"]) for row in table(tmp_path / "out")]
+    assert rows == [("b", "0"), ("\u00fc", "22.5")]
 
 
 @pytest.mark.parametrize("case", TABLES)

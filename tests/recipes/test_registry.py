@@ -20,6 +20,16 @@ NUMBER = 3
 TAKEN = replace(ONE, name="3dgs")
 def made(): return SEVERAL
 def broken(): raise RuntimeError("no GPU here")
+def ends(): raise SystemExit(0)
+NAMED = replace(ONE, name=7)
+LINES = replace(ONE, about="two\\nlines")
+def rate(**rates): return replace(ONE, rates={{**ONE.rates, **rates}})
+def function(): return rate(means=len)
+def negative(): return rate(means=-1e-4)
+def unknown(): return rate(colors=1e-3)
+def endless(): return rate(means=float("inf"))
+PRIORS = replace(ONE, priors=replace(ONE.priors, threshold="high"))
+STAGES = replace(ONE, stages=tuple(replace(stage, hold_normals=3) for stage in ONE.stages))
 """
 
 
@@ -56,6 +66,15 @@ def test_a_built_in_name_loads_no_plug_in(monkeypatch: pytest.MonkeyPatch, tmp_p
         ("broken", "RuntimeError: no GPU here"),
         ("none", "AttributeError"),
         ("TAKEN", "3dgs, which is built in"),
+        ("ends", "SystemExit: 0"),
+        ("NAMED", "7"),
+        ("LINES", "two\\nlines"),
+        ("function", "means = <built-in function len>"),
+        ("negative", "means = -0.0001"),
+        ("unknown", "found colors"),
+        ("endless", "means = inf"),
+        ("PRIORS", '"high"'),
+        ("STAGES", "3"),
     ],
 )
 def test_a_plug_in_that_fails_is_named_when_it_is_asked_for(
@@ -67,6 +86,21 @@ def test_a_plug_in_that_fails_is_named_when_it_is_asked_for(
         Fault(f"plug-in {name} (plug_{name}:{what})", "", found).raised_by(recipe_named, asked)
     Fault(found=f"plug-in {name}").raised_by(recipe_named, "nobodys")
     assert recipe_named("3dgs") is RECIPES["3dgs"]
+
+
+@pytest.mark.parametrize(
+    ("what", "field", "expected"),
+    [
+        ("NAMED", "(name)", "a line of text"),
+        ("PRIORS", "(priors.threshold)", "a number"),
+        ("STAGES", "(stages[0].hold_normals)", "true or false"),
+    ],
+)
+def test_a_wrong_field_of_a_plug_ins_recipe_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, what: str, field: str, expected: str
+) -> None:
+    module(monkeypatch, tmp_path, f"field{what.lower()}", what)
+    Fault(field, expected).raised_by(recipe_named, f"field{what.lower()}")
 
 
 def test_two_plug_ins_of_one_name_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

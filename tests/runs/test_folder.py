@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from faults import Fault
+from heard import Heard
 from safetensors import safe_open
 from safetensors.torch import save_file
 from trainings import make_trainer
@@ -248,6 +249,29 @@ def test_a_finished_run_keeps_no_state_of_the_optimizer(
     assert (tmp_path / "False" / CHECKPOINT).read_bytes() == before
     save_checkpoint(tmp_path, replace(state, frozen=state.gaussians.snapshot()), optimizer=False)
     assert not {"adam", "frozen"} & names(tmp_path)
+
+
+@pytest.mark.parametrize("name", [CHECKPOINT, CONFIGURATION])
+def test_a_link_to_nowhere_is_no_new_training(
+    demo_scene: Path, trained: Path, tmp_path: Path, name: str
+) -> None:
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    (run / name).unlink()
+    (run / name).symlink_to(tmp_path / "unmounted" / name)
+    given = {"settings": TrainSettings(40), "reading": SceneOptions(downscale=4)}
+    fault = Fault(found="a link to nowhere") if name == CHECKPOINT else Fault(name, "a readable file")
+    fault.raised_by(polarguide.train, demo_scene, run, **given, resume=True)
+    Fault(expected="a new folder", found="a run").raised_by(polarguide.train, demo_scene, run, **given)
+    assert (run / name).is_symlink()
+
+
+def test_a_run_without_a_checkpoint_says_that_it_begins_again(demo_scene: Path, tmp_path: Path) -> None:
+    run, heard = tmp_path / "run", Heard()
+    given = {"settings": TrainSettings(2), "reading": SceneOptions(downscale=8), "recipe": "3dgs"}
+    polarguide.train(demo_scene, run, **given)
+    (run / CHECKPOINT).unlink()
+    polarguide.train(demo_scene, run, **given, resume=True, reporter=heard)
+    assert any("has no checkpoint: the training begins at step 0" in text for text in heard.said)
 
 
 def test_more_steps_than_a_training_was_begun_with(demo_scene: Path, trained: Path, tmp_path: Path) -> None:

@@ -23,7 +23,16 @@ from polarguide.core.progress import SILENT
 from polarguide.geometry.camera import Camera
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
-from polarguide.runs.health import HEALTH, Evidence, Health, Limits, Polarization, examine, warnings_of
+from polarguide.runs.health import (
+    HEALTH,
+    Evidence,
+    Health,
+    Limits,
+    Polarization,
+    examine,
+    recorded_health,
+    warnings_of,
+)
 from polarguide.runs.model import GaussianModel
 from polarguide.shading.result import RenderResult
 from polarguide.training.angles.polarizers import Polarizers
@@ -241,6 +250,18 @@ def test_the_word_says_what_most_views_tell_and_what_is_in_doubt() -> None:
     assert {view.exposures for view in plain.train_views} == {PLAIN}
     lost = tuple(view.with_exposures((Exposure(),)) for view in one.train_views)
     assert Polarization.of(lost, (), measured=True, fitted=True).word == "none"
+
+
+@pytest.mark.parametrize("data", [b"{", b'{"views": 3}', b"\x00" * 9, None])
+def test_a_damaged_record_is_a_warning_of_its_run(tmp_path: Path, data: bytes | None) -> None:
+    assert recorded_health(tmp_path) == (None, ())
+    if data is None:
+        (tmp_path / HEALTH).symlink_to(tmp_path / "nowhere")
+    else:
+        (tmp_path / HEALTH).write_bytes(data)
+    polarization, (warning,) = recorded_health(tmp_path)
+    assert polarization is None
+    assert HEALTH in warning
 
 
 def test_a_training_writes_its_health_and_the_page_shows_it(demo_scene: Path, tmp_path: Path) -> None:

@@ -58,6 +58,17 @@ def test_what_is_painted_counts_before_the_scenes_own_materials(
     assert over.test_views[0].materials is None
 
 
+def test_paint_on_a_held_out_view_is_refused(scene: polarguide.Scene, tmp_path: Path) -> None:
+    test = scene.test_views[0]
+    blank = torch.zeros(test.camera.height, test.camera.width, dtype=torch.uint8)
+    write_painted(tmp_path, {**pictures(scene), test.name: blank})
+    assert read_painted(tmp_path, scene) is not None  # says nothing
+    write_painted(tmp_path, {test.name: blank + 2})
+    Fault(f"{test.name}.png", "a view that is trained on", "held out").raised_by(
+        read_painted, tmp_path, scene
+    )
+
+
 @pytest.mark.parametrize(
     ("name", "picture", "fault"),
     [

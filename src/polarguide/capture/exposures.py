@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import math
+import os
+import posixpath
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,9 +18,9 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.capture.calibration import Calibration
 from polarguide.core.errors import PolarguideError
-from polarguide.core.files import read_file
+from polarguide.core.files import read_rows, stored
 from polarguide.core.records import shortened
-from polarguide.core.text import csv_lines, number_or_nan
+from polarguide.core.text import canonical, csv_lines, decimal_comma, number_or_nan
 from polarguide.geometry.polarizer import ANGLES
 from polarguide.optics import Mount
 
@@ -184,7 +184,6 @@ _COLUMNS = ("file", "view", "angle", "gain", "modulation", "note")
 _NEEDED = ("file", "angle")
 # Columns that a training writes, and that are not read; ``certainty`` in earlier versions.
 _WRITTEN_BY_TRAINING = ("modulation", "note", "certainty")
-_LARGEST_TABLE = 1 << 26
 # A camera exposes over some twenty stops either way; more leaves no numbers in single precision.
 _LARGEST_GAIN = 1e6
 _REMEDY = "Columns are file, angle (degrees, unknown or none) and, where wanted, view and gain, with commas between."
@@ -196,7 +195,8 @@ class Line:
 
     Attributes:
         number: number of the line, from 1.
-        file: the picture's name: inside ``polar/`` of a scene, else relative to the folder of the photographs.
+        file: the picture's name, without detours such as ``./``: inside ``polar/`` of a scene, else relative to the
+            folder of the photographs.
         view: pictures of one view share their pose; None for a view of its own, called like the file without suffix.
         angle: angle of the polarizer.
         gain: exposure relative to the other pictures; None if it is not given.
@@ -231,35 +231,37 @@ def read_table(path: Path) -> list[Line]:
         where = f"{path} (line {number})"
         if not len(_NEEDED) <= len(row) <= len(columns):
             found = f"{len(row)}: {shortened(','.join(row))}"
+            if len(row) > len(columns) and decimal_comma(map(",".join, itertools.pairwise(row))):
+                found += ", which may be a decimal comma"
             raise PolarguideError(where, expected=f"{len(columns)} cells", found=found, remedy=_REMEDY)
         line = _line(where, number, dict(zip(columns, row, strict=False)))
         if line.file in lines:
-            raise PolarguideError(
-                where,
-                expected="one line for each file",
-                found=f"two for {line.file}, lines {lines[line.file].number} and {number}",
-                remedy="Remove one of them.",
-            )
+            raise _listed_twice(where, lines[line.file], line)
         lines[line.file] = line
     return list(lines.values())
 
 
-def read_rows(path: Path, remedy: str) -> list[tuple[int, list[str]]]:
-    """The rows of a CSV file that are not empty: number of the line, from 1, and cells without blanks around them.
+def files_of(root: Path, table: Path, lines: Sequence[Line]) -> list[Path]:
+    """The files of a table's lines in a folder, as the file system has them; they need not exist.
 
     Raises:
-        PolarguideError: the file cannot be read, or is no CSV file; ``remedy`` is for messages.
+        PolarguideError: two lines name one file.
     """
-    data = read_file(path, largest=_LARGEST_TABLE, remedy=remedy)
-    try:
-        text = io.StringIO(data.decode("utf-8-sig"), newline="")
-        reader = csv.reader(text, strict=True, skipinitialspace=True)
-        rows = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise PolarguideError(
-            path, expected="CSV text in UTF-8", found=f"something else ({error})", remedy=remedy
-        ) from None
-    return [(number, row) for number, row in rows if any(row)]
+    files = [stored(root / line.file) for line in lines]
+    first: dict[str, Line] = {}
+    for line, path in zip(lines, files, strict=True):
+        before = first.setdefault(os.path.realpath(path), line)
+        if before is not line:
+            raise _listed_twice(f"{table} (line {line.number})", before, line)
+    return files
+
+
+def _listed_twice(where: str, first: Line, second: Line) -> PolarguideError:
+    names = " and ".join(dict.fromkeys((first.file, second.file)))
+    found = f"two for {names}, lines {first.number} and {second.number}"
+    return PolarguideError(
+        where, expected="one line for each file", found=found, remedy="Remove one of them."
+    )
 
 
 def _header(path: Path, row: list[str]) -> list[str]:
@@ -278,15 +280,14 @@ def _header(path: Path, row: list[str]) -> list[str]:
 def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
     """One line from its cells by column."""
     file = cells["file"]
-    if not file or "\0" in file:
-        found = shortened(file) if file else "an empty cell"
-        raise PolarguideError(where, expected="the name of a file", found=found, remedy=_REMEDY)
+    if not file:
+        raise PolarguideError(where, expected="the name of a file", found="an empty cell", remedy=_REMEDY)
     angle = parse_angle(cells.get("angle", ""))
     if angle is None:
         raise PolarguideError(
             f"{where}, {file}",
             expected=f"an angle in degrees up to {LARGEST:g}, unknown or none",
-            found=shortened(cells.get("angle", "")),
+            found=_cell(cells.get("angle", "")),
             remedy="Write unknown where the angle was not noted, none where there was no filter.",
         )
     gain = number_or_nan(cells["gain"]) if cells.get("gain") else None
@@ -294,10 +295,18 @@ def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
         raise PolarguideError(
             f"{where}, {file}",
             expected=f"a gain from {1 / _LARGEST_GAIN:g} to {_LARGEST_GAIN:g}, or an empty cell",
-            found=shortened(cells["gain"]),
+            found=_cell(cells["gain"]),
             remedy="Leave it empty if it is not known.",
         )
-    return Line(number, file, cells.get("view") or None, angle, gain)
+    return Line(
+        number, posixpath.normpath(canonical(file)), canonical(cells.get("view", "")) or None, angle, gain
+    )
+
+
+def _cell(text: str) -> str:
+    """A cell that is no number, for messages."""
+    comma = decimal_comma([text])
+    return f"{comma} with a decimal comma; numbers have a point" if comma else shortened(text)
 
 
 def table_text(lines: Iterable[tuple[str, str, Exposure, float | None, str]]) -> str:

@@ -16,6 +16,7 @@ from polarguide.capture.view import ANGLES, listed, unknown_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_folder
 from polarguide.core.system import free_memory
+from polarguide.core.text import canonical, stem_of
 
 _PICTURE_STEM = re.compile(r"(?P<view>.+)_(?P<angle>000|045|090|135)")
 _ANGLE_FOLDER = re.compile(r"(?:(?:i|pol|angle)[-_ ]?|[_ ])?(?P<angle>\d{1,3})(?:deg)?", re.IGNORECASE)
@@ -143,10 +144,11 @@ def select_views(layout: Layout, views: Sequence[str] | None) -> list[str]:
     if views is None:
         names = layout.names
     else:
-        for name in views:
+        wanted = [canonical(name) for name in views]
+        for name in wanted:
             if name not in layout.names:
                 raise unknown_view(f"{layout.root} (views)", name, layout.names)
-        names = sorted(set(views))
+        names = sorted(set(wanted))
         if not names:
             raise PolarguideError(
                 "views",
@@ -188,7 +190,7 @@ def _read_flat(
 ) -> tuple[dict[str, dict[int, Path]], dict[str, tuple[tuple[Path, Exposure], ...]]]:
     """``polar/<view>_<angle>.<suffix>``, and what a table lists."""
     lines = read_table(table) if table is not None else []
-    stored = {path.name: path for path in list_files(folder, SUFFIXES)}
+    stored = {canonical(path.name): path for path in list_files(folder, SUFFIXES)}
     for item in lines:
         if item.file not in stored:
             raise PolarguideError(
@@ -221,7 +223,7 @@ def _take_listed(
     """Add the views of a table: to ``pictures`` where they have one picture at each of the four angles."""
     views: dict[str, list[tuple[Path, Exposure]]] = {}
     for item in lines:
-        views.setdefault(item.view or Path(item.file).stem, []).append((stored[item.file], item.exposure))
+        views.setdefault(item.view or stem_of(Path(item.file)), []).append((stored[item.file], item.exposure))
     others = {}
     for view, pairs in views.items():
         named = pictures.pop(view, {})
@@ -286,16 +288,17 @@ def angle_of_folder(path: Path) -> int | None:
 
 
 def index_files(folder: Path, suffixes: tuple[str, ...], besides: Container[str] = ()) -> dict[str, Path]:
-    """Stem -> file for the files of a folder with one of the suffixes, ``besides`` some; empty if there is no such
-    folder.
+    """Stem (``canonical``) -> file for the files of a folder with one of the suffixes, ``besides`` some; empty if there
+    is no such folder.
     """
     files: dict[str, Path] = {}
     for path in list_files(folder, suffixes):
-        if path.name in besides:
+        if canonical(path.name) in besides:
             continue
-        if path.stem in files:
-            raise ambiguous(folder, f"one file called {path.stem}", files[path.stem], path)
-        files[path.stem] = path
+        stem = stem_of(path)
+        if stem in files:
+            raise ambiguous(folder, f"one file called {stem}", files[stem], path)
+        files[stem] = path
     return files
 
 

@@ -12,6 +12,7 @@ from polarguide.capture.formats.pictures import MOST_MATERIAL
 from polarguide.capture.view import unknown_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import decode
+from polarguide.core.text import canonical
 from polarguide.geometry.polarizer import ANGLES
 from polarguide.optics import Mount
 
@@ -93,7 +94,7 @@ def held_out(path: Path, data: bytes, names: list[str]) -> tuple[str, ...]:
         PolarguideError: the split has another form, names an unknown view, or leaves nothing to train on.
     """
     remedy = 'List the names of the test views, {"test": ["<view>", ...]}, or remove the file.'
-    test = decode(data, _Split, path, remedy=remedy).test
+    test = [canonical(name) for name in decode(data, _Split, path, remedy=remedy).test]
     for name in test:
         if name not in names:
             raise unknown_view(f"{path} (test)", name, names)

@@ -31,6 +31,45 @@ from polarguide.core.text import number_or_nan
 SUFFIXES = (".json", ".xml", ".npz")
 
 
+TEST = "test"
+
+
+def parts_of_poses(folder: Path) -> dict[str, Path]:
+    """The pose files of a folder as NeRF's synthetic scenes have them: ``transforms_train.json`` and those of other
+    parts by part, or ``transforms.json`` as the only one.
+    """
+    whole = folder / "transforms.json"
+    if whole.is_file():
+        return {"all": whole}
+    parts = {part: folder / f"transforms_{part}.json" for part in ("train", "val", TEST)}
+    return {part: path for part, path in parts.items() if path.is_file()}
+
+
+def read_parts(
+    parts: Mapping[str, Path], views: Sequence[str], sizes: Sizes
+) -> tuple[dict[str, PosedCamera], tuple[str, ...]]:
+    """Cameras by view name from several files, and the views of the test part.
+
+    Raises:
+        PolarguideError: as ``read_pose_file``, or two files have a camera of one view.
+    """
+    cameras: dict[str, PosedCamera] = {}
+    tests: tuple[str, ...] = ()
+    for part, path in parts.items():
+        of_part = read_pose_file(path, views, sizes)
+        twice = sorted(cameras.keys() & of_part.keys())
+        if twice:
+            raise PolarguideError(
+                path,
+                expected="frames that no other part has, as names of views are compared without folders",
+                found=f"{listed(twice)} again",
+                remedy="Give the pictures of each part names of their own, in the files of poses, too.",
+            )
+        cameras |= of_part
+        tests = tuple(sorted(of_part)) if part == TEST else tests
+    return cameras, tests
+
+
 def read_pose_file(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, PosedCamera]:
     """Cameras by view name.
 

@@ -29,6 +29,7 @@ from polarguide.capture.view import ANGLES, View, figure, listed, table, unknown
 from polarguide.capture.view_reader import StoredViews, ViewData, require_factor, view_data
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import Split, check_choice, check_count
+from polarguide.core.text import canonical
 from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 
@@ -197,7 +198,7 @@ class Scene:
             PolarguideError: there is none; the message lists the names nearest to it.
         """
         for view in self.views:
-            if view.name == name:
+            if canonical(view.name) == canonical(name):
                 return view
         raise unknown_view(self.root, name, [view.name for view in self.views])
 

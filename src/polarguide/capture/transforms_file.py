@@ -21,7 +21,8 @@ from polarguide.capture.colmap.model import view_of_name
 from polarguide.capture.datasets.dataset import checked_intrinsics, checked_pose, require_known_names
 from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
 from polarguide.capture.view import listed
-from polarguide.core.records import decode, read_record
+from polarguide.core.files import read_file
+from polarguide.core.records import LARGEST_RECORD, decode, parse
 
 Size = tuple[int, int]
 Sizes = Callable[[str], tuple[Size, ...]]
@@ -151,8 +152,9 @@ def read_transforms(path: Path, views: Collection[str], sizes: Sizes) -> dict[st
     Raises:
         PolarguideError: the file cannot be read, or a field names a camera that is not read.
     """
-    content = read_record(path, dict[str, Any], remedy="Export transforms.json again.")
-    record = decode(content, _Transforms, path, remedy="Export transforms.json again.")
+    remedy = "Export transforms.json again."
+    content = parse(read_file(path, largest=LARGEST_RECORD, remedy=remedy), path, remedy=remedy)
+    record = decode(content, _Transforms, path, remedy=remedy)
     listed_frames = [frame for key in ("frames", "test_frames") for frame in content.get(key, ())]
     names = set(content).union(*listed_frames)
     if record.camera is not None or record.normal_mts_args is not None:

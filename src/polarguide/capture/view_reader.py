@@ -34,6 +34,7 @@ from polarguide.capture.view import EVEN, Latest, Loader, View
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import LARGEST_FILE, read_file
 from polarguide.core.records import LARGEST_RECORD
+from polarguide.core.text import canonical
 from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 
@@ -61,7 +62,8 @@ class Files:
     def digest(self, root: Path) -> str:
         """SHA-256 over names in ``root`` and contents of all files that were read."""
         lines = sorted(
-            f"{path.relative_to(root).as_posix()} {digest}\n" for path, digest in self.digests.items()
+            f"{canonical(path.relative_to(root).as_posix())} {digest}\n"
+            for path, digest in self.digests.items()
         )
         return hashlib.sha256("".join(lines).encode()).hexdigest()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import importlib
 import io
 import re
@@ -18,8 +17,9 @@ import tyro
 
 from polarguide.cli.console import JobReporter, say, use_threads
 from polarguide.core.errors import PolarguideError, require_package
-from polarguide.core.files import read_file
+from polarguide.core.files import read_rows, stored
 from polarguide.core.options import EXPORT_PACKAGES, SceneOptions, check_finite
+from polarguide.core.text import canonical
 from polarguide.experiments.collection import NO_FILES, source_stamp
 from polarguide.experiments.options import BatchOptions
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
@@ -169,21 +169,15 @@ def _folders(collection: Path, out: Path) -> list[_Line]:
             remedy="Check the name.",
         )
     folders = sorted(path for path in collection.iterdir() if path.is_dir() and path.name[0] not in ".")
-    return [_Line(str(path), path.name, path) for path in folders if path.resolve() != out.resolve()]
+    return [
+        _Line(str(path), canonical(path.name), path) for path in folders if path.resolve() != out.resolve()
+    ]
 
 
 def _table(file: Path) -> list[_Line]:
     """The lines of a CSV file, with commas, or semicolons as spreadsheets of some countries write them."""
-    try:
-        text = read_file(file).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        remedy = "Save it as CSV in UTF-8."
-        raise PolarguideError(file, expected="text in UTF-8", found="other bytes", remedy=remedy) from None
-    head = text.partition("\n")[0]
-    delimiter = ";" if head.count(";") > head.count(",") else ","
-    reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
-    columns = [str(name).strip().lower() for name in reader.fieldnames or ()]
-    reader.fieldnames = columns
+    rows = read_rows(file, "Save it as CSV in UTF-8.")
+    columns = [name.lower() for name in rows[0][1]] if rows else []
     if not {"name", "path"} <= set(columns) <= set(COLUMNS) or len(set(columns)) < len(columns):
         raise PolarguideError(
             f"{file} (first line)",
@@ -192,23 +186,21 @@ def _table(file: Path) -> list[_Line]:
             remedy="Write them into the first line.",
         )
     lines = []
-    for row in reader:
-        where = f"{file} (line {reader.line_num})"
-        if None in row or None in row.values():
+    for number, row in rows[1:]:
+        where = f"{file} (line {number})"
+        if len(row) != len(columns):
             raise PolarguideError(
                 where,
                 expected=f"{len(columns)} values",
-                found="more" if None in row else "fewer",
+                found="more" if len(row) > len(columns) else "fewer",
                 remedy="Put values with a delimiter in them into double quotes.",
             )
-        values = {name: value.strip() for name, value in row.items()}
-        if any(values.values()):
-            if not values["path"]:
-                raise PolarguideError(where, expected="a path", found="none", remedy="Name its folder.")
-            path = file.parent / values["path"]
-            lines.append(
-                _Line(where, values["name"], path, values.get("sensor", ""), values.get("options", ""))
-            )
+        values = dict(zip(columns, row, strict=True))
+        if not values["path"]:
+            raise PolarguideError(where, expected="a path", found="none", remedy="Name its folder.")
+        path = stored(file.parent / values["path"])
+        more = values.get("sensor", ""), values.get("options", "")
+        lines.append(_Line(where, canonical(values["name"]), path, *more))
     return lines
 
 

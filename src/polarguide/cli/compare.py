@@ -12,6 +12,7 @@ import tyro
 import polarguide
 from polarguide.cli.console import JobReporter, say, use_threads
 from polarguide.core.errors import PolarguideError
+from polarguide.core.text import whole_number
 from polarguide.experiments.options import BenchOptions, CompareOptions, LayoutName
 from polarguide.training.settings import Background, Materials, TrainSettings
 
@@ -79,8 +80,9 @@ def chosen_steps(values: tuple[str, ...]) -> tuple[int | None, dict[str, int]]:
     common: list[int] = []
     own: dict[str, int] = {}
     for word in values:
-        name, _, number = word.rpartition("=")
-        if not number.isdecimal() or name in own or (not name and common):
+        name, _, text = word.rpartition("=")
+        number = whole_number(text)
+        if number is None or name in own or (not name and common):
             raise PolarguideError(
                 "--steps",
                 expected="a number of steps, and RECIPE=STEPS for a recipe of its own, each once",
@@ -88,9 +90,9 @@ def chosen_steps(values: tuple[str, ...]) -> tuple[int | None, dict[str, int]]:
                 remedy="For example --steps 5000 gnerp=10000.",
             )
         if name:
-            own[name] = int(number)
+            own[name] = number
         else:
-            common.append(int(number))
+            common.append(number)
     return next(iter(common), None), own
 
 

@@ -120,7 +120,7 @@ def print_scores(record: dict[str, Any], title: str) -> None:
     table.add_column("metric")
     table.add_column("value", justify="right", overflow="fold")
     for label, text in metrics.shown_metrics(record):
-        table.add_row(label, Text(printable(text)))
+        table.add_row(Text(printable(label)), Text(printable(text)))
     console.print(table)
     for line in metrics.explained(record):
         say(line)

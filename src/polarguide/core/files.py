@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import glob
+import io
 import os
 import re
 import shutil
@@ -14,6 +16,7 @@ from pathlib import Path
 
 from polarguide.core.errors import PolarguideError
 from polarguide.core.system import process_is_alive
+from polarguide.core.text import canonical
 
 LARGEST_FILE = 1 << 31
 _MASK = os.umask(0)  # what rights new files do not get; it can only be asked for by setting it
@@ -171,6 +174,17 @@ def _reason(error: OSError) -> str:
     return error.strerror or str(error)
 
 
+def stored(path: Path) -> Path:
+    """A path as the file system has it: where nothing is there, what has the same name in another form of Unicode."""
+    if os.path.lexists(path) or path == path.parent:
+        return path
+    folder = stored(path.parent)
+    same: list[Path] = []
+    with contextlib.suppress(OSError):
+        same = [entry for entry in folder.iterdir() if canonical(entry.name) == canonical(path.name)]
+    return same[0] if len(same) == 1 else folder / path.name
+
+
 def require_folder(path: Path, *, expected: str, remedy: str) -> None:
     """Check that a folder exists.
 
@@ -254,6 +268,46 @@ def read_file(
             found=error.strerror or str(error),
             remedy=remedy,
         ) from error
+
+
+_LARGEST_TABLE = 1 << 26
+
+
+def read_rows(path: Path, remedy: str) -> list[tuple[int, list[str]]]:
+    """The rows of a CSV file that are not empty: number of the line, from 1, and cells without blanks around them.
+
+    Cells have commas between them, or semicolons as spreadsheets of some countries write them.
+
+    Raises:
+        PolarguideError: the file cannot be read, or is no CSV file; ``remedy`` is for messages.
+    """
+    data = read_file(path, largest=_LARGEST_TABLE, remedy=remedy)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise _no_csv(path, error, remedy) from None
+    head = text.partition("\n")[0]
+    delimiter = ";" if head.count(";") > head.count(",") else ","
+    reader = csv.reader(
+        io.StringIO(text, newline=""), strict=True, skipinitialspace=True, delimiter=delimiter
+    )
+    rows: list[tuple[int, list[str]]] = []
+    line = 0  # where the last row ended
+    try:
+        for row in reader:
+            line = reader.line_num
+            rows.append((line, [cell.strip() for cell in row]))
+    except csv.Error as error:
+        raise _no_csv(f"{path} (line {line + 1})", error, remedy) from None
+    null = next((number for number, row in rows if any("\0" in cell for cell in row)), None)
+    if null is not None:
+        raise _no_csv(f"{path} (line {null})", "a null character", remedy)
+    return [(number, row) for number, row in rows if any(row)]
+
+
+def _no_csv(where: object, found: object, remedy: str) -> PolarguideError:
+    found = f"something else ({found})"
+    return PolarguideError(where, expected="CSV text in UTF-8", found=found, remedy=remedy)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -54,8 +54,8 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
     Raises:
         PolarguideError: the data are not JSON, or not of this type; the message names the field and the value.
     """
+    value = parse(data, where, remedy=remedy) if isinstance(data, bytes) else data
     try:
-        value = json.loads(data, object_pairs_hook=_each_once) if isinstance(data, bytes) else data
         _require_shallow(value)
         record = msgspec.convert(value, kind)
     except PolarguideError as error:  # of a type's own check
@@ -72,6 +72,21 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
         ) from None
     _require_finite(msgspec.to_builtins(record, enc_hook=str), where, remedy)
     return record
+
+
+def parse(data: bytes, where: object, *, remedy: str = CORRECT) -> Any:
+    """The values of JSON text, of any type. NaN and infinity are let through: ``decode`` checks the fields of a type.
+
+    Raises:
+        PolarguideError: the data are not JSON, or a key stands there twice.
+    """
+    try:
+        value = json.loads(data, object_pairs_hook=_each_once)
+        _require_shallow(value)
+    except (ValueError, RecursionError) as error:
+        found = f"broken JSON ({error})"
+        raise PolarguideError(where, expected="a JSON file", found=found, remedy=remedy) from None
+    return value
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -2,11 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import math
+import re
 import shlex
+import unicodedata
 from collections.abc import Iterable
+from pathlib import PurePath
+
+_MOST_DIGITS = 10  # Python itself refuses thousands of them
+
+
+def canonical(name: str) -> str:
+    """A name in the composed form of Unicode (NFC, UAX 15), in which names are compared.
+
+    File systems and programs store one name as different characters: an u-umlaut is one sign, or u and two dots.
+    """
+    return unicodedata.normalize("NFC", name)
+
+
+def stem_of(path: PurePath) -> str:
+    """A file's name without its suffix, ``canonical``."""
+    return canonical(path.stem)
 
 
 def decimal(text: str) -> float:
@@ -19,6 +38,11 @@ def decimal(text: str) -> float:
     if "_" in text or not text.isascii():
         raise ValueError(f"not a number: {text!r}")
     return float(text)
+
+
+def whole_number(text: str) -> int | None:
+    """A whole number of plain digits; None for other texts, and for more digits than any count here has."""
+    return int(text) if text.isascii() and text.isdigit() and len(text) < _MOST_DIGITS else None
 
 
 def number_or_nan(text: str) -> float:
@@ -46,12 +70,24 @@ def command(*words: object) -> str:
     return shlex.join(["polarguide", *map(str, words)])
 
 
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
+
+
+def decimal_comma(cells: Iterable[str]) -> str:
+    """The first of several texts that is a number with a decimal comma, as ``0,9238``; empty where none is."""
+    return next((cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell)), "")
+
+
 def printable(text: str, *, lines: bool = False) -> str:
     """Escape control characters in a text, such as names of files, before it is printed.
 
     Args:
         lines: whether it may have several lines.
     """
+    with contextlib.suppress(
+        UnicodeEncodeError
+    ):  # in the C locale, Python has made names in UTF-8 single bytes
+        text = text.encode("utf-8", "surrogateescape").decode("utf-8", "surrogateescape")
     return "".join(
         sign
         if sign.isprintable() or (lines and sign == "\n")

@@ -26,6 +26,7 @@ from polarguide.experiments.collection import (
     CaptureRecord,
     Processing,
     Request,
+    source_digest,
     source_stamp,
 )
 from polarguide.experiments.compare import locked
@@ -40,7 +41,7 @@ from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.record import read_metrics
 from polarguide.results.evaluation.table import COLUMNS, Metric
 from polarguide.runs.folder import CHECKPOINT, RunConfiguration
-from polarguide.runs.health import Health
+from polarguide.runs.health import recorded_health
 from polarguide.training.settings import TrainSettings
 from polarguide.visualization.pages import page
 
@@ -76,9 +77,9 @@ class Row:
         """Findings of the inspection, and warnings of the training."""
         if self.record is None:
             return ()
-        health = Health.load(self.folder / RUN) if "train" in self.record.done else None
-        own = () if health is None else (f"polarization: {health.polarization.text}", *health.warnings)
-        return (*self.record.findings, *own)
+        polarization, own = recorded_health(self.folder / RUN) if "train" in self.record.done else (None, ())
+        evidence = () if polarization is None else (f"polarization: {polarization}",)
+        return (*self.record.findings, *evidence, *own)
 
     def links(self) -> list[tuple[str, str]]:
         """Label and path of what there is, from the folder of all."""
@@ -236,16 +237,22 @@ def is_scene(folder: Path) -> bool:
 
 def _task(capture: Capture, root: Path, options: BatchOptions) -> Processing:
     path = capture.path.absolute()
+    folder = (root / CAPTURES / capture.name).absolute()
+    stamp, earlier = source_stamp(path), None
+    with contextlib.suppress(
+        PolarguideError
+    ):  # the process that works on it says what is wrong with its record
+        earlier = CaptureRecord.load(folder)
     request = Request(
         source=str(path),
-        stamp=source_stamp(path),
+        stamp=stamp,
         prepare=None if is_scene(path) else capture.prepare.record(),
         recipe=capture.recipe,
         settings=capture.settings,
         reading=capture.reading,
         formats=options.formats,
+        digest=source_digest(path, None if earlier is None else earlier.request, stamp),
     )
-    folder = (root / CAPTURES / capture.name).absolute()
     return Processing(capture.name, str(folder), request, ComputeOptions(options.threads, options.device))
 
 

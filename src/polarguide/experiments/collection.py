@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,6 +15,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import write_whole
 from polarguide.core.options import ComputeOptions, ExportFormat, SceneOptions
 from polarguide.core.records import read_record, to_json
+from polarguide.core.text import canonical
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.training.settings import TrainSettings
 
@@ -22,6 +25,7 @@ SCENE, INSPECTION, RUN, EXPORT, SHARE = "scene", "inspection", "run", "export", 
 """In the folder of each capture."""
 Step = Literal["prepare", "inspect", "train", "eval", "share", "export"]
 STEPS: tuple[Step, ...] = ("prepare", "inspect", "train", "eval", "share", "export")
+_BLOCK = 1 << 20
 NO_FILES = (0, 0, 0)
 """The stamp of a folder that is empty, or not there."""
 
@@ -31,6 +35,8 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         source: absolute path of its folder. stamp: number, size and newest time of its files.
+        digest: SHA-256 over their names and content, which tells whether they are the same where the stamp is another;
+            empty in records of earlier versions.
         prepare: ``PrepareSettings.record()``; None: the source is a scene already.
         recipe, settings, reading: those of the training. formats: formats of the export.
     """
@@ -42,6 +48,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     settings: TrainSettings
     reading: SceneOptions
     formats: tuple[ExportFormat, ...]
+    digest: str = ""
 
 
 class Processing(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="process"):
@@ -95,9 +102,12 @@ class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """
         if request.stamp == NO_FILES and set(self.done) == set(STEPS):
             return
+        alike = {"source", "digest"}  # files are known by their content, wherever they lie
+        if self.request.digest == request.digest != "":
+            alike.add("stamp")
         for name in Request.__struct_fields__:
             before, now = getattr(self.request, name), getattr(request, name)
-            if before != now:
+            if before != now and name not in alike:
                 raise PolarguideError(
                     folder,
                     expected=f"the capture and options that it was begun with ({name})",
@@ -119,11 +129,35 @@ def prepare_settings(record: dict[str, Any]) -> PrepareSettings:
 def source_stamp(folder: Path) -> tuple[int, int, int]:
     """Number of files below a folder, their bytes, and when the newest was changed (ns); without hidden ones."""
     count = size = newest = 0
+    for path in _files_below(folder):
+        with contextlib.suppress(
+            OSError, ValueError
+        ):  # it has gone meanwhile, or has a name that no file can have
+            state = os.stat(path)
+            count, size, newest = count + 1, size + state.st_size, max(newest, state.st_mtime_ns)
+    return count, size, newest
+
+
+def source_digest(folder: Path, earlier: Request | None, stamp: tuple[int, int, int]) -> str:
+    """SHA-256 over names and content of the files below a folder, without hidden ones; empty where there are none.
+
+    Args:
+        folder: of the capture. earlier: the request of an earlier call, whose digest is taken if the stamp is the same.
+        stamp: of the folder now.
+    """
+    if earlier is not None and earlier.stamp == stamp and earlier.digest:
+        return earlier.digest
+    whole = hashlib.sha256()
+    for path in sorted(_files_below(folder)):
+        with contextlib.suppress(OSError), open(path, "rb") as file:
+            whole.update(f"{canonical(os.path.relpath(path, folder))}\0".encode("utf-8", "surrogateescape"))
+            while block := file.read(_BLOCK):
+                whole.update(block)
+    return "" if stamp == NO_FILES else whole.hexdigest()
+
+
+def _files_below(folder: Path) -> Iterator[str]:
+    """Paths of the files below a folder, without hidden ones."""
     for at, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        for name in names:
-            with contextlib.suppress(OSError):  # it has gone meanwhile
-                state = os.stat(os.path.join(at, name))
-                if not name.startswith("."):
-                    count, size, newest = count + 1, size + state.st_size, max(newest, state.st_mtime_ns)
-    return count, size, newest
+        yield from (os.path.join(at, name) for name in names if not name.startswith("."))

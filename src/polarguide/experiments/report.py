@@ -29,7 +29,7 @@ from polarguide.experiments.tables import formatted, sections, seed_counts
 from polarguide.results.evaluation.metrics import normal_angles_deg
 from polarguide.results.evaluation.table import COLUMNS, Metric
 from polarguide.runs.folder import RunLog
-from polarguide.runs.health import Health
+from polarguide.runs.health import recorded_health
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.visualization import figures
 from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture
@@ -305,10 +305,10 @@ def _health(runs: Sequence[PlannedRun]) -> list[str]:
     alike: dict[str, list[str]] = {}
     warnings = []
     for run in runs:
-        health = Health.load(run.folder)
-        text = "not recorded, not checked" if health is None else health.polarization.text
+        polarization, own = recorded_health(run.folder)
+        text = "not recorded, not checked" if polarization is None else polarization
         alike.setdefault(f"polarization {text}", []).append(run.label)
-        warnings += [f"{run.label}: {warning}" for warning in (() if health is None else health.warnings)]
+        warnings += [f"{run.label}: {warning}" for warning in own]
     return [f"{text}: {'; '.join(labels)}" for text, labels in alike.items()] + warnings
 
 

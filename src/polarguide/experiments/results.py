@@ -179,13 +179,15 @@ def training_noise(by_seed: Numbers, scatter: Sequence[float | None]) -> float |
 
     Returns:
         Half the width of the 95 % confidence interval over seeds: from the seeds themselves if at least three are on
-        every scene, else from the known scatter, else from two seeds; None where neither is there.
+        every scene, else from the known scatter; None where neither is there.
     """
     values = _means_by_seed(by_seed)
-    if len(values) < LEAST_UNITS and None not in scatter:
+    if len(values) >= LEAST_UNITS:
+        return t_half_width(values)
+    if None not in scatter:
         variances = [(s or 0.0) ** 2 / len(known(row)) for s, row in zip(scatter, by_seed, strict=True)]
         return NORMAL_QUANTILE * math.sqrt(math.fsum(variances)) / len(by_seed)
-    return t_half_width(values) if len(values) > 1 else None
+    return None
 
 
 def is_noise(by_seed: Numbers, scatter: Sequence[float | None]) -> bool | None:
@@ -240,17 +242,20 @@ def scatter_on(record: Record, scenes: Iterable[str], column: Metric) -> list[fl
     return [known_scatter(column.key, black[scene]) for scene in scenes]
 
 
-def not_told_apart(
+def told_apart(
     values: Values, best: int, other: int, sign: float, scatter: Sequence[float | None]
-) -> bool:
-    """Whether the lead of one recipe over another, at the seeds that both have on every scene, is within noise."""
+) -> bool | None:
+    """Whether the lead of one recipe over another, at the seeds that both have on every scene, is beyond noise.
+
+    None where that cannot be tested: no seeds are paired, or too few without a known scatter.
+    """
     there = {scene: v for scene, v in values.items() if not np.isnan(v[[best, other]]).all()}
     leads = [sign * paired(v[best], v[other]) for v in there.values()]
     if not leads or not all(lead.size for lead in leads):
-        return False
+        return None
     by_seed = seed_means(leads)
     half = training_noise(by_seed, [s for s, scene in zip(scatter, values, strict=True) if scene in there])
-    return half is not None and fmean(fmean(known(row)) for row in by_seed) <= half
+    return None if half is None else fmean(fmean(known(row)) for row in by_seed) > half
 
 
 def differences(record: Record, compared: Sequence[Metric]) -> list[dict[str, Any]]:

@@ -25,10 +25,10 @@ from polarguide.experiments.results import (
     controlled,
     known,
     metric_of_runs,
-    not_told_apart,
     pair,
     scatter_on,
     seed_means,
+    told_apart,
     values_of,
 )
 from polarguide.results.evaluation.table import COLUMNS, MESH_LABEL, PART_METRICS, Metric
@@ -46,12 +46,12 @@ _HOW = (
 )
 _HOW_PARTS = (
     "Scores on the pixels of a part, means over seeds. Bold: as above, but no scatter is known of parts, so that with "
-    "fewer than two paired seeds only the best is bold."
+    "fewer than three paired seeds nothing is bold."
 )
 _HOW_BOLD = (
-    "Bold: the best of each scene and column, and whatever differs from it by no more than another seed may "
-    "change, with 95 % confidence: by the paired differences where three seeds are paired, else by the known "
-    "scatter of such differences; in a column without one, what shows the same digits."
+    "Bold: the best of each scene and column, and whatever the paired test cannot tell from it, with 95 % confidence: "
+    "by the differences at the same seeds where three are paired, else by the known scatter of such differences. "
+    "Where the test tells nothing apart, nothing is bold."
 )
 
 
@@ -132,11 +132,10 @@ def scores_section(results: Results) -> Section:
 def leaders(
     means: Mapping[int, float], values: Values, column: Metric, scatter: Sequence[float | None]
 ) -> set[int]:
-    """The recipes whose mean of a metric is the best, or cannot be distinguished from the best.
+    """The recipes whose mean of a metric is the best, or cannot be told from the best.
 
-    A recipe is distinguished from the best by the differences at the same seeds, if they exceed
-    ``training_noise``; where that is not known, by the displayed digits. There are no
-    leaders where fewer than two recipes have a value, or the metric has no better side.
+    A recipe is told from the best by the differences at the same seeds, if they exceed ``training_noise``. There are no
+    leaders where that tells no recipe from the best, or the metric has no better side.
 
     Args:
         means: shown values, by the place of the recipe. values: what these are means of.
@@ -146,12 +145,13 @@ def leaders(
         return set()
     sign = 1.0 if column.better == "higher" else -1.0
     best = max(means, key=lambda index: sign * means[index])
-    return {
-        index
-        for index, mean in means.items()
-        if formatted(mean, column) == formatted(means[best], column)
-        or not_told_apart(values, best, index, sign, scatter)
+    apart = {index: told_apart(values, best, index, sign, scatter) for index in means if index != best}
+    if True not in apart.values():
+        return set()
+    same_digits = {
+        i for i, mean in means.items() if formatted(mean, column) == formatted(means[best], column)
     }
+    return same_digits | {index for index, told in apart.items() if told is False}
 
 
 def score_cell(row: Row, column: Metric, bold: bool, results: Results) -> TableCell:

@@ -143,7 +143,7 @@ class _Work:
                 settings=request.settings,
                 session=SessionOptions(self.task.compute.threads, self.task.compute.device),
                 reading=request.reading,
-                resume=(run / CONFIGURATION).exists(),
+                resume=os.path.lexists(run / CONFIGURATION),
                 should_stop=should_stop,
             )
         return {}
@@ -270,7 +270,7 @@ def do(task: Task) -> None:
             settings=task.settings,
             session=SessionOptions(task.compute.threads, task.compute.device),
             reading=task.reading,
-            resume=(Path(task.folder) / CONFIGURATION).exists(),
+            resume=os.path.lexists(Path(task.folder) / CONFIGURATION),
             should_stop=should_stop,
         )
 

@@ -19,7 +19,8 @@ from polarguide.capture import checks
 from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented
 from polarguide.capture.colmap.files import MODELS
 from polarguide.capture.colmap.poses import Geometry, undistortion
-from polarguide.capture.layout import describe_contents
+from polarguide.capture.formats.pictures import SUFFIXES
+from polarguide.capture.layout import describe_contents, index_files
 from polarguide.capture.presentation import PRESENTATION_FILE
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration
@@ -151,7 +152,8 @@ def _rotate_view(capture: Capture, change: Calibration, folder: Path, view: str)
     full = int(np.iinfo(data.peak.dtype).max)
     lost = np.asarray(data.invalid | data.black | (data.peak >= full - full // 500))
     rotated = oriented((data.codes / np.float32(FULL_CODE)).astype(np.float32), change) / change.peak
-    for old in (folder / "invalid").glob(f"{view}.*"):
+    old = index_files(folder / "invalid", SUFFIXES).get(view)
+    if old is not None:
         old.unlink()
     write_view(folder, view, intensity_codes(rotated, lost), lost)
 

@@ -150,7 +150,9 @@ def _pair_error(
     matrix = _fundamental(first.camera, second.camera)
     along2, along1 = p1 @ matrix.T, p2 @ matrix
     value = np.abs((p2 * along2).sum(axis=1))
-    distance = value / np.sqrt((along1[:, :2] ** 2).sum(1) + (along2[:, :2] ** 2).sum(1)) * np.sqrt(2)
+    length = np.sqrt((along1[:, :2] ** 2).sum(1) + (along2[:, :2] ** 2).sum(1))
+    nowhere = np.full_like(value, np.inf)  # cameras in one place have no epipolar lines
+    distance = np.divide(value, length, out=nowhere, where=length > 0) * np.sqrt(2)
     near = distance < GATE_SHARE * float(np.hypot(first.camera.width, first.camera.height))
     if near.sum() < FEWEST_MATCHES:
         return None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import shutil
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -39,11 +40,14 @@ from polarguide.core.files import check_out, holds_files, make_folder, read_file
 from polarguide.core.progress import Reporter
 from polarguide.core.records import decode, read_record, shortened, to_json
 from polarguide.core.system import hold_folder
+from polarguide.core.text import canonical, stem_of
+from polarguide.preparation.request import FileStamp, first_difference
 from polarguide.preparation.settings import PrepareSettings, known_intrinsics
 from polarguide.preparation.source import Source, developed
 
 JOURNAL = "prepare.json"
 SCENE = "scene.json"
+SPLIT = "split.json"
 SFM = ".sfm"
 PARTIAL = ".sparse.partial"
 FOLDERS = ("polar", "invalid", "masks", "sparse")
@@ -67,7 +71,8 @@ class _Request(msgspec.Struct):
     settings: _Settings
     source: str
     format: str
-    file: dict[str, tuple[int, int]]
+    file: dict[str, FileStamp]
+    model: dict[str, FileStamp] = {}
 
 
 class _Exposure(msgspec.Struct):
@@ -175,7 +180,7 @@ class SceneFolder:
             for record in (before, now):
                 record["settings"] = {k: v for k, v in record["settings"].items() if k not in _OF_POSES}
                 record.pop("model", None)
-        differing = _first_difference(before, now)
+        differing = first_difference(before, now)
         if differing is not None:
             name, old, new = differing
             raise PolarguideError(
@@ -184,7 +189,8 @@ class SceneFolder:
                 found=f"{name} {new}",
                 remedy="Repeat the command as it was, or give another --out; nothing was written.",
             )
-        self.measured, self.views = state.get("measured"), state.get("views", {})
+        self.measured = state.get("measured")
+        self.views = {canonical(view): record for view, record in state.get("views", {}).items()}
 
     def require_measured(self, needs: Collection[str]) -> None:
         """Check that what an earlier call has measured, if there was one, has all that is read of it.
@@ -288,6 +294,11 @@ class SceneFolder:
         self.views[view] = {**record, "files": sizes}
         self.save()
 
+    def hold_out(self, views: Sequence[str]) -> None:
+        """Note which views are for tests, unless the user has."""
+        if views and not os.path.lexists(self.root / SPLIT):
+            write_whole(self.root / SPLIT, to_json({"test": list(views)}))
+
     def drop(self, view: str) -> None:
         """Remove a view that an earlier call without poses wrote, and that has none."""
         for name in self.views.pop(view)["files"]:
@@ -331,22 +342,6 @@ def _require_exposures(journal: Path, view: str, record: _View) -> None:
             found=shortened(named),
             remedy=REMEDY,
         )
-
-
-def _first_difference(before: dict[str, Any], now: dict[str, Any]) -> tuple[str, str, str] | None:
-    """Name, old and new value of the first thing that differs."""
-    for part in sorted(before.keys() | now.keys()):
-        old, new = before.get(part), now.get(part)
-        if old == new:
-            continue
-        if isinstance(old, dict) and isinstance(new, dict):
-            keys = sorted(old.keys() | new.keys())
-            key = next(k for k in keys if (k in old) != (k in new) or old[k] != new[k])
-            if part == "settings":
-                return key, str(old.get(key)), str(new.get(key))
-            return f"{part} {key}", "as it was", "that was changed, added or removed"
-        return part, str(old), str(new)
-    return None
 
 
 PHOTOGRAPHS = "photographs"
@@ -409,7 +404,7 @@ class Workshop:
         measured = self._folder.measured
         assert measured is not None
         known = measured.setdefault(PHOTOGRAPHS, {})
-        if images.is_dir() and any(path.stem not in views for path in images.iterdir()):
+        if images.is_dir() and any(stem_of(path) not in views for path in images.iterdir()):
             shutil.rmtree(self._root, ignore_errors=True)  # of an earlier call with other poses
             known.clear()
         for path in (images, masks):

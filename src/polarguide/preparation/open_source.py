@@ -7,11 +7,11 @@ from __future__ import annotations
 import os
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from polarguide.capture.colmap.model import view_of_name
+from polarguide.capture.colmap.model import holds_model, view_of_name
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
 from polarguide.capture.exposures import TABLE, angles_of_names, folders_of_angles, parse_angle
@@ -21,13 +21,14 @@ from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
 from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, read_picture
 from polarguide.capture.layout import angle_folders, describe_contents, index_files, list_files
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
-from polarguide.capture.pose_files import read_pose_file
+from polarguide.capture.pose_files import TEST, parts_of_poses, read_parts
 from polarguide.capture.sensor.pattern import SENSOR_NAMES
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_folder
 from polarguide.core.progress import Reporter
+from polarguide.core.text import stem_of
 from polarguide.preparation.filter_source import FilterSource, ShotsSource, SinglesSource
 from polarguide.preparation.mosaic_source import MosaicSource
 from polarguide.preparation.settings import PrepareSettings, check_format
@@ -40,7 +41,7 @@ def _views_of_masks(files: Iterable[Path], views: Sequence[str]) -> dict[str, Pa
     pictures = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
     for shorten in (str, view_of_name, lambda name: name.removesuffix("_mask")):
         for path in pictures:
-            view = shorten(path.stem)
+            view = shorten(stem_of(path))
             if view in views:
                 masks.setdefault(view, path)
     return masks
@@ -244,7 +245,7 @@ def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
     files = list_files(root, SHOT_SUFFIXES)
     if not files:
         return any(angle not in ANGLES for angle in folders_of_angles(root).values())
-    named = angles_of_names([path.stem for path in files])
+    named = angles_of_names([stem_of(path) for path in files])
     shots = [name for name in named if name is not None]
     if any(angle not in ANGLES for _, angle in shots):
         return True
@@ -302,6 +303,7 @@ def poses_beside(root: Path) -> list[str]:
     names = (
         "sparse",
         "transforms.json",
+        "transforms_train.json",
         "cameras.xml",
         "cameras.npz",
         "cameras_new.npz",
@@ -348,7 +350,10 @@ def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto
         assert pictures.cameras is not None
         return Poses.of_cameras(pictures.cameras, root, pictures.views)
     path = Path(origin)
-    if path.suffix.lower() in POSE_FILES and path.is_file():
+    parts = {"all": path} if path.suffix.lower() in POSE_FILES and path.is_file() else {}
+    if path.is_dir() and not holds_model(path):
+        parts = parts_of_poses(path)
+    if parts:
         known, assumed = set(pictures.views), set[str]()
 
         def sizes(view: str) -> tuple[tuple[int, int], ...]:
@@ -356,11 +361,29 @@ def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto
             stored = pictures.stored(view if view in known else pictures.views[0])
             return stored.turned_first if poses_of == "displayed" else stored.sizes
 
-        cameras = read_pose_file(path, pictures.views, sizes)
-        poses = Poses.of_cameras(cameras, path, pictures.views, [path])
+        cameras, tests = read_parts(parts, pictures.views, sizes)
+        poses = Poses.of_cameras(cameras, path, pictures.views, list(parts.values()))
         poses.assumed_sizes = frozenset(assumed)
+        poses.held_out = tuple(view for view in poses.views if view in tests)
+        poses.notes = _notes_of_parts(path, parts, poses)
         return poses
     return Poses.read(path, pictures.views)
+
+
+def _notes_of_parts(path: Path, parts: Mapping[str, Path], poses: Poses) -> tuple[str, ...]:
+    """Which parts of a capture the poses are of."""
+    if path.is_dir() and len(parts) > 1:
+        held = (
+            f"{len(poses.held_out)} views of {parts[TEST].name} are held out for tests."
+            if TEST in parts
+            else ""
+        )
+        return (f"Poses of {listed([file.name for file in parts.values()])}. {held}".strip(),)
+    beside = parts_of_poses(path.parent) if path.is_file() else {}
+    if path in beside.values() and len(beside) > 1 and poses.missing:
+        others = listed([file.name for file in beside.values() if file != path])
+        return (f"{others} beside {path.name}: --poses {shlex.quote(str(path.parent))} reads all of them.",)
+    return ()
 
 
 def settle_pose_frames(pictures: Source, poses: Poses, frame_given: str) -> str:

@@ -25,7 +25,7 @@ from polarguide.core.files import make_folder, writing
 from polarguide.core.progress import Reporter
 from polarguide.core.records import option_name
 from polarguide.preparation.exposure_table import write_exposure_table
-from polarguide.preparation.folder import PARTIAL, PHOTOGRAPHS, SCENE, SFM, SceneFolder, Workshop
+from polarguide.preparation.folder import JOURNAL, PARTIAL, PHOTOGRAPHS, SCENE, SFM, SceneFolder, Workshop
 from polarguide.preparation.open_source import (
     frames_of_video,
     known_poses,
@@ -34,6 +34,7 @@ from polarguide.preparation.open_source import (
     poses_beside,
     settle_pose_frames,
 )
+from polarguide.preparation.request import request_of
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import Source, developed, measured_source
 
@@ -107,7 +108,15 @@ def prepare_scene(
     frames = ""
     if poses is not None and settings.poses != "dataset":
         frames = settle_pose_frames(pictures, poses, settings.poses_of)
-    folder = SceneFolder(target, _request(root, pictures, settings, poses))
+    request = request_of(
+        root,
+        [target / JOURNAL, target / SCENE],
+        pictures.kind,
+        settings.record(),
+        [*pictures.paths, *pictures.masks.values()],
+        poses.files if poses is not None else (),
+    )
+    folder = SceneFolder(target, request)
     folder.require_measured(pictures.needs)
     if folder.finished:
         reporter.say(f"{target} is complete already; nothing to do.")
@@ -115,6 +124,10 @@ def prepare_scene(
     reporter.say(f"{len(pictures.views)} views, format {pictures.kind}.")
     if frames:
         reporter.say(frames)
+    for note in poses.notes if poses is not None else ():
+        reporter.say(note)
+    for warning in poses.warnings if poses is not None else ():
+        reporter.warn(warning)
     beside = poses_beside(root) if settings.poses == "sfm" else []
     if beside:
         ways = " or ".join(f"--poses {shlex.quote(str(root / name))}" for name in beside)
@@ -139,6 +152,7 @@ def _write_scene(
     reporter: Reporter,
 ) -> Prepared:
     """Write what is missing of a scene that has been measured."""
+    tests = () if poses is None else poses.held_out
     folder.start()
     work = Workshop(folder, pictures, settings, reporter)
     points: dict[str, Any] | None = None
@@ -169,6 +183,7 @@ def _write_scene(
         reporter.say(note)
     if poses is not None:
         _write_model(folder, poses)
+        folder.hold_out([view for view in poses.views if view in tests])
     if pictures.kind == "singles":
         estimate = settings.gains == "auto"
         write_exposure_table(folder, estimate=estimate, posed=poses is not None, reporter=reporter)
@@ -208,28 +223,6 @@ def _without_poses(root: Path, pictures: Source, settings: PrepareSettings) -> s
         f"Each view alone has S0, DoLP, AoLP, normals and separations: {command}. "
         "Nothing was written; --poses none develops the views without poses."
     )
-
-
-def _request(root: Path, pictures: Source, settings: PrepareSettings, poses: Poses | None) -> dict[str, Any]:
-    """Settings that must not change between the calls that write one scene."""
-
-    def fingerprint(path: Path) -> list[int]:
-        status = path.stat()
-        return [status.st_size, status.st_mtime_ns]
-
-    request = {
-        "source": os.path.realpath(root),
-        "format": pictures.kind,
-        "settings": settings.record(),
-        "file": {
-            str(path): fingerprint(path)
-            for path in (*pictures.paths, *pictures.masks.values())
-            if path.exists()
-        },
-    }
-    if poses is not None and poses.files:
-        request["model"] = {path.name: fingerprint(path) for path in poses.files}
-    return request
 
 
 def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, reporter: Reporter) -> None:

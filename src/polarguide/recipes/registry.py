@@ -30,7 +30,7 @@ from polarguide.recipes.polarguide import (
     RECIPE_POLARGUIDE_PAPER_KIND,
     RECIPE_POLARGUIDE_STOKES,
 )
-from polarguide.training.recipe import Action, Method, Recipe, Stage, Weights
+from polarguide.training.recipe import Action, Method, Recipe, Stage, Weights, check_recipe
 
 Change = Callable[[Recipe], Recipe]
 
@@ -373,6 +373,16 @@ def recipe_named(name: str) -> Method:
     )
 
 
+def recipe_names() -> list[str]:
+    """Names of all recipes that ``train`` and ``compare`` take: built-in ones, their ablations, and those of plug-ins.
+
+    Example:
+        >>> polarguide.recipe_names()[:2]    # doctest: +SKIP
+        ['3dgs', '3dgs-dr']
+    """
+    return [*RECIPES, *(name for name in _BUILT_IN if name not in RECIPES), *_plugins()[0]]
+
+
 def ablations_of(name: str) -> tuple[Method, ...]:
     """The ablations of a recipe: built-in ones, or what plug-ins offer as ``name:variation``; there may be none.
 
@@ -411,12 +421,13 @@ def _recipes_of(entry: EntryPoint) -> tuple[Method, ...]:
         loaded = entry.load()
         loaded = loaded() if callable(loaded) else loaded
         recipes = (loaded,) if isinstance(loaded, Method) else tuple(loaded)
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # another package may fail in any way
         found = f"{type(error).__name__}: {error}"
         raise PolarguideError(where, expected="recipes", found=found, remedy=remedy) from error
     for recipe in recipes:
         if not isinstance(recipe, Method):
             raise PolarguideError(where, expected="recipes", found=repr(recipe), remedy=remedy)
+        check_recipe(recipe, where)
         if recipe.name in _BUILT_IN:
             found = f"{recipe.name}, which is built in"
             raise PolarguideError(where, expected="a name that no other has", found=found, remedy=remedy)

@@ -193,11 +193,13 @@ def load_checkpoint(run: Path, recipe: Method, device: torch.device | str = "cpu
     """
     path = run / CHECKPOINT
     if not path.exists():
+        link = path.is_symlink()
+        again = "Bring back the file that it points to, or remove the link to begin at step 0."
         raise PolarguideError(
             run,
             expected=f"a checkpoint ({CHECKPOINT})",
-            found="none",
-            remedy="Train first, or without --resume.",
+            found="a link to nowhere" if link else "none",
+            remedy=again if link else "Train first, or without --resume.",
         )
     require_file(path, expected="a checkpoint of this program", remedy="Train again into a new folder.")
     try:

@@ -53,8 +53,8 @@ def read_painted(run: Path, scene: Scene) -> PaintedMaterials | None:
     """Materials that were painted over a run of a scene; None: there are no pictures, or they say nothing.
 
     Raises:
-        PolarguideError: a picture belongs to no view, or is damaged, of another size, or has a number that
-            ``scene.json`` does not explain.
+        PolarguideError: a picture belongs to no view or to one that is held out, is damaged, of another size, or has a
+            number that ``scene.json`` does not explain.
     """
     if not os.path.lexists(run / FOLDER):  # a link to nowhere is no absence
         return None
@@ -76,6 +76,13 @@ def read_painted(run: Path, scene: Scene) -> PaintedMaterials | None:
             listed = ", ".join(map(str, sorted(known)))
             raise PolarguideError(
                 path, expected=f"the numbers {listed}", found=str(min(unknown)), remedy=REMEDY
+            )
+        if name in scene.test_names and bool(picture.any()):
+            raise PolarguideError(
+                path,
+                expected="a view that is trained on",
+                found=f"{name}, which is held out for tests: what is painted there would change nothing",
+                remedy="Paint a view that is trained on, in polarguide view RUN, and remove this picture.",
             )
         digest.update(name.encode() + b"\0" + picture.numpy().tobytes())
         numbers[name] = picture

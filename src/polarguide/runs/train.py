@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -134,9 +135,11 @@ def train(
                 locked.enter_context(writing_to(out))
             recorded = RunConfiguration.load(out)
             _check_same(recorded, configuration, out)
-            if (out / CHECKPOINT).exists():
+            if os.path.lexists(out / CHECKPOINT):  # a link to nowhere is no absence
                 state = load_checkpoint(out, chosen, backend.device)
                 family.check(state, resolved, out)
+            else:
+                reporter.say(f"{out} has no checkpoint: the training begins at step 0")
             if recorded.painted != digest:
                 family.go_back(state, chosen, resolved, out, reporter)
                 if state is not None and leads:
@@ -377,7 +380,7 @@ def _unsuitable(out: Path, resume: bool) -> PolarguideError | None:
         refuse_scene(out)
     except PolarguideError as error:
         return error
-    if (out / CONFIGURATION).exists() == resume:
+    if os.path.lexists(out / CONFIGURATION) == resume:
         return None
     expected, found, remedy = (
         ("a run to resume", "no run.json", "Train without --resume, or name the folder of a run.")

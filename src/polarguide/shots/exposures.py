@@ -23,6 +23,7 @@ from polarguide.capture.sensor.pattern import SENSOR_NAMES
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
 from polarguide.core.errors import PolarguideError
+from polarguide.core.text import canonical, stem_of
 from polarguide.shots import sets
 from polarguide.shots.options import ShotOptions
 from polarguide.shots.sets import ExposureSet, known_places
@@ -96,7 +97,9 @@ def mosaics(files: Sequence[Path]) -> list[ExposureSet]:
     """Raw mosaics as sets; two of one folder and stem are called by their suffix, too."""
     stems = Counter(path.with_suffix("") for path in files)
     return [
-        ExposureSet(path.stem if stems[path.with_suffix("")] == 1 else path.name, "mosaic", {0: path})
+        ExposureSet(
+            stem_of(path) if stems[path.with_suffix("")] == 1 else canonical(path.name), "mosaic", {0: path}
+        )
         for path in files
     ]
 
@@ -120,7 +123,7 @@ def _of_files(files: list[Path], options: ShotOptions) -> list[ExposureSet]:
         angle = angle_of_folder(folder)
         if angle is not None:
             shots = by_root.setdefault(folder.parent, {})
-            shots.setdefault(path.stem, {}).setdefault(angle, []).append(path)
+            shots.setdefault(stem_of(path), {}).setdefault(angle, []).append(path)
     # Files of one angle are in folders that are called so by chance.
     in_folders = [c for c in by_root.values() if all(len(angles) > 1 for angles in c.values())]
     placed = {path for c in in_folders for angles in c.values() for same in angles.values() for path in same}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,10 @@ from polarguide.capture.exposures import (
     angles_of_names,
     conditioning,
     covers_turn,
+    files_of,
     nominal,
     normalized,
     parse_angle,
-    read_rows,
     read_table,
 )
 from polarguide.capture.filter.consecutive import VIDEO_SUFFIXES
@@ -34,8 +34,9 @@ from polarguide.capture.filter.shots import SHOT_SUFFIXES, group_files
 from polarguide.capture.layout import ambiguous, list_files
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
-from polarguide.core.files import require_file
+from polarguide.core.files import read_rows, require_file
 from polarguide.core.records import shortened
+from polarguide.core.text import canonical, stem_of, whole_number
 from polarguide.shots.options import Kind
 
 
@@ -193,14 +194,16 @@ def by_name(files: Sequence[Path]) -> tuple[list[ExposureSet], list[Path]]:
     rest: list[Path] = []
     for folder in dict.fromkeys(path.parent for path in files):
         inside = [path for path in files if path.parent == folder]
-        stated = angles_of_names([path.stem for path in inside])
+        stated = angles_of_names([stem_of(path) for path in inside])
         alone = all(name is not None and name[0] == "" for name in stated)
         views: dict[str, list[SetPicture]] = {}
         for path, name in zip(inside, stated, strict=True):
             if name is None or (name[0] == "" and not alone):
                 rest.append(path)
             else:
-                views.setdefault(name[0] or folder.resolve().name, []).append(SetPicture(path, name[1]))
+                views.setdefault(name[0] or canonical(folder.resolve().name), []).append(
+                    SetPicture(path, name[1])
+                )
         more, four = _any_angles(folder, views)
         sets += more
         rest += four
@@ -215,7 +218,7 @@ def by_folder(root: Path) -> list[ExposureSet]:
     for folder, name in zip(folders, stated, strict=True):
         if name is not None and name[0] == "":
             for path in list_files(folder, SHOT_SUFFIXES):
-                views.setdefault(path.stem, []).append(SetPicture(path, name[1]))
+                views.setdefault(stem_of(path), []).append(SetPicture(path, name[1]))
     if all(picture.angle in ANGLES for mine in views.values() for picture in mine):
         return []
     return [_named_set(root, view, mine) for view, mine in sorted(views.items())]
@@ -261,8 +264,9 @@ def by_table(root: Path) -> tuple[list[ExposureSet], list[Path]]:
     table = root / TABLE
     lines = read_table(table)
     base = root.resolve()
+    files = dict(zip((line.file for line in lines), files_of(root, table, lines), strict=True))
     for line in lines:
-        path = root / line.file
+        path = files[line.file]
         inside = path.resolve().is_relative_to(base)
         if not inside or path.suffix.lower() not in SHOT_SUFFIXES:
             raise PolarguideError(
@@ -274,25 +278,25 @@ def by_table(root: Path) -> tuple[list[ExposureSet], list[Path]]:
     views: dict[str, list[Line]] = {}
     for line, view in zip(lines, _views_of(root, lines), strict=True):
         views.setdefault(view, []).append(line)
-    taken = {(root / line.file).resolve() for line in lines}
+    taken = {path.resolve() for path in files.values()}
     others = [path for path in list_files(root, SHOT_SUFFIXES) if path.resolve() not in taken]
-    return [_of_lines(root, table, view, mine) for view, mine in sorted(views.items())], others
+    return [_of_lines(files, table, view, mine) for view, mine in sorted(views.items())], others
 
 
 def _views_of(root: Path, lines: Sequence[Line]) -> list[str]:
     """The view of each line."""
     without = [line for line in lines if line.view is None]
-    named = angles_of_names([Path(line.file).stem for line in without])
+    named = angles_of_names([stem_of(Path(line.file)) for line in without])
     all_named = all(name is not None and name[0] for name in named)
     of_file = {
-        line.file: name[0] if all_named and name is not None else root.resolve().name
+        line.file: name[0] if all_named and name is not None else canonical(root.resolve().name)
         for line, name in zip(without, named, strict=True)
     }
     return [of_file[line.file] if line.view is None else line.view for line in lines]
 
 
-def _of_lines(root: Path, table: Path, view: str, lines: Sequence[Line]) -> ExposureSet:
-    pictures = [SetPicture(root / line.file, line.angle, line.gain) for line in lines]
+def _of_lines(files: Mapping[str, Path], table: Path, view: str, lines: Sequence[Line]) -> ExposureSet:
+    pictures = [SetPicture(files[line.file], line.angle, line.gain) for line in lines]
     missing = [picture.path for picture in pictures if not picture.path.is_file()]
     if not missing:
         return _exposure_set(view, pictures, table)
@@ -316,8 +320,8 @@ def _video(path: Path) -> ExposureSet:
     try:
         pictures = [SetPicture(path, angle, None, frame) for frame, angle in read_frame_table(table, path)]
     except PolarguideError as error:
-        return _exposure_set(path.stem, [SetPicture(path, "unknown")], None, error)
-    return _exposure_set(path.stem, pictures, table)
+        return _exposure_set(stem_of(path), [SetPicture(path, "unknown")], None, error)
+    return _exposure_set(stem_of(path), pictures, table)
 
 
 _COLUMNS = ["frame", "angle"]
@@ -344,14 +348,15 @@ def read_frame_table(path: Path, video: Path) -> list[tuple[int, Angle]]:
     frames: dict[int, Angle] = {}
     for number, row in rows[1:]:
         angle = parse_angle(row[1]) if len(row) == len(_COLUMNS) else None
-        if angle is None or not row[0].isdecimal() or int(row[0]) in frames:
+        frame = whole_number(row[0])
+        if angle is None or frame is None or frame in frames:
             raise PolarguideError(
                 f"{path} (line {number})",
                 expected=f"a frame that no other line has, and its angle up to {LARGEST:g} degrees",
                 found=shortened(",".join(row)),
                 remedy=_REMEDY,
             )
-        frames[int(row[0])] = angle
+        frames[frame] = angle
     return sorted(frames.items())
 
 

@@ -7,12 +7,14 @@ Nothing in the loop compares a step with a constant: boundaries are fractions of
 from __future__ import annotations
 
 import json
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from typing import Any, Literal, get_type_hints
 
 from polarguide.core.errors import PolarguideError
+from polarguide.core.records import decode
 from polarguide.gaussians.densify import Densification
 from polarguide.gaussians.gaussians import CORE_SHAPES, ORIENTED_SHAPES
 from polarguide.gaussians.initialize import Initialization
@@ -23,6 +25,7 @@ from polarguide.training.rules import AngleRules, FlatRules, MetalRules, MetalVi
 Action = Literal["reset_opacity", "propagate_normals", "refresh_priors", "orient_normals"]
 Candidates = Literal["paper", "azimuths", "physical"]
 Separation = Literal["paper", "exact"]
+_REMEDY = "Correct the recipe."
 
 
 @dataclass(frozen=True)
@@ -261,8 +264,14 @@ class Recipe(Method):
 
     def __post_init__(self) -> None:
         share = sum(stage.fraction for stage in self.stages)
+        strangers = sorted(set(self.rates) - set(CORE_SHAPES))
+        factors = [
+            *self.rates.items(),
+            *(item for stage in self.stages for item in stage.rate_factors.items()),
+        ]
+        wrong_rates = [f"{name} = {rate!r}" for name, rate in factors if not _is_rate(rate)]
         named = {name for stage in self.stages for name in stage.rate_factors}
-        where, remedy = f"recipe {self.name}", "Correct the recipe."
+        where, remedy = f"recipe {self.name}", _REMEDY
         for wrong, expected, found in (
             (abs(share - 1) > 1e-6, "stages whose fractions add up to 1", f"{share:g}"),
             ("means" not in self.rates, "a rate of the means", f"{[*self.rates]}"),
@@ -270,6 +279,12 @@ class Recipe(Method):
                 not named <= self.learning_rates.keys(),
                 "rate factors of learned parameters",
                 f"{sorted(named)}",
+            ),
+            (bool(strangers), f"rates of {', '.join(CORE_SHAPES)}", ", ".join(map(str, strangers))),
+            (
+                bool(wrong_rates),
+                "rates and rate factors that are finite and not negative",
+                ", ".join(wrong_rates),
             ),
         ):
             if wrong:
@@ -300,6 +315,50 @@ class Recipe(Method):
         """All values as plain JSON types, for a run's folder."""
         plain: dict[str, Any] = json.loads(json.dumps({**asdict(self), "shading": self.shading.data()}))
         return plain
+
+
+def _is_rate(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf
+
+
+def check_recipe(recipe: Method, where: str) -> None:
+    """Check all values of a recipe that another program has made, before anything is trained.
+
+    Args:
+        recipe: the recipe. where: for messages.
+
+    Raises:
+        PolarguideError: a value has another type, is not finite, or cannot be noted in a run's folder.
+    """
+    for name in ("name", "about"):
+        text = getattr(recipe, name)
+        if not isinstance(text, str) or not text.isprintable() or not text.strip():
+            place = f"{where} ({name})"
+            raise PolarguideError(place, expected="a line of text", found=repr(text), remedy=_REMEDY)
+    if isinstance(recipe, Recipe) and not isinstance(recipe.shading, ShadingModel):
+        found = repr(recipe.shading)
+        raise PolarguideError(f"{where} (shading)", expected="a ShadingModel", found=found, remedy=_REMEDY)
+    _check_values(recipe, where, "")
+    try:
+        json.dumps(recipe.data(), allow_nan=False)
+    except (TypeError, ValueError) as error:
+        expected = "values that a run's folder can hold: numbers, texts, lists"
+        raise PolarguideError(where, expected=expected, found=str(error), remedy=_REMEDY) from None
+
+
+def _check_values(part: Any, where: str, path: str) -> None:
+    """Check the fields of a dataclass and of those in it against their types; a shading model checks its own."""
+    kinds = get_type_hints(type(part))
+    for item in fields(part):
+        value, place = getattr(part, item.name), f"{path}{item.name}"
+        if isinstance(value, ShadingModel):
+            continue
+        inner = value if isinstance(value, tuple) else (value,)
+        if inner and all(is_dataclass(each) for each in inner):
+            for number, each in enumerate(inner):
+                _check_values(each, where, f"{place}[{number}]." if isinstance(value, tuple) else f"{place}.")
+        else:
+            decode(value, kinds[item.name], f"{where} ({place})", remedy=_REMEDY)
 
 
 def _differs(now: Any, then: Any) -> bool:

@@ -7,10 +7,14 @@ import os
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import tomllib
+import torch
 from plugins import install
 
 from polarguide.core.errors import PolarguideWarning
@@ -67,6 +71,11 @@ GOOD = Metric("good", "good", "", 1, "lower", measure=measure)
 TAKEN = Metric("psnr", "mine", "", 1, "lower", measure=measure)
 OF_RUN = Metric("late", "late", "", 1, None, of="run")
 STRANGE = Metric("two words", "x", "", 1, None, measure=measure)
+NUMBERED = Metric(7, "x", "", 1, None, measure=measure)
+UNTITLED = Metric("untitled", None, "", 1, None, measure=measure)
+DIGITS = Metric("digits", "x", "", -1, None, measure=measure)
+SIDE = Metric("side", "x", "", 1, "up", measure=measure)
+def ends(): raise SystemExit(0)
 SEVERAL = lambda: [GOOD, Metric("best", "best", "", 1, None, measure=measure)]
 """
 
@@ -82,6 +91,11 @@ SEVERAL = lambda: [GOOD, Metric("best", "best", "", 1, None, measure=measure)]
         ({"a": "STRANGE"}, [], "'two words'"),
         ({"a": "MISSING", "b": "GOOD"}, ["good"], "AttributeError"),
         ({"a": "measure"}, [], "TypeError"),
+        ({"a": "NUMBERED", "b": "GOOD"}, ["good"], "found 7"),
+        ({"a": "UNTITLED"}, [], "untitled (label): expected text"),
+        ({"a": "DIGITS"}, [], "digits (digits): expected 0 to 10, found -1"),
+        ({"a": "SIDE"}, [], "side (better): expected higher or lower"),
+        ({"a": "ends"}, [], "SystemExit: 0"),
     ],
 )
 def test_what_packages_offer(
@@ -100,3 +114,49 @@ def test_what_packages_offer(
         return
     with pytest.warns(PolarguideWarning, match=re.escape(complaint)):
         assert [metric.key for metric in plugged_metrics({"psnr"})] == keys
+
+
+MEASURES = """
+import torch
+from polarguide.results.evaluation.metric import Metric
+def raising(target, layers):
+    raise KeyError("albedo")
+def exiting(target, layers):
+    raise SystemExit(0)
+def per_pixel(target, layers):
+    return layers["final"]
+def texts(target, layers):
+    return "good"
+def half(target, layers):
+    return torch.tensor(0.5)
+def metric(measure):
+    return Metric("mine", "[/b]", "", 1, "lower", measure=measure)
+RAISING, EXITING, PER_PIXEL, TEXTS, HALF = map(metric, (raising, exiting, per_pixel, texts, half))
+"""
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "complaint"),
+    [
+        ("RAISING", None, "KeyError: 'albedo'"),
+        ("EXITING", None, "SystemExit: 0"),
+        ("PER_PIXEL", None, "a tensor [4, 5, 3]"),
+        ("TEXTS", None, "found str"),
+        ("HALF", 0.5, None),
+    ],
+)
+def test_a_measure_that_fails_has_no_value(
+    place: str, value: float | None, complaint: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "offered_measures.py").write_text(MEASURES)
+    install(monkeypatch, tmp_path, GROUP, mine=f"offered_measures:{place}")
+    monkeypatch.delitem(sys.modules, "offered_measures", raising=False)
+    (metric,) = plugged_metrics(())
+    target: Any = SimpleNamespace(photograph=torch.zeros(4, 5, 3))
+    layers = {"final": torch.zeros(4, 5, 3)}
+    assert metric.measure is not None
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(2):  # each view is scored, one warning is enough
+            assert metric.measure(target, layers) == value
+    assert [complaint in str(warning.message) for warning in caught] == ([] if complaint is None else [True])

@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from faults import Fault
 
-from polarguide.shots.measurement.fields import Bound, faults, read_limits
-from polarguide.shots.measurement.regions import Region, parse_regions, placed
+from polarguide.shots.maps import NoiseModel, Reason, ShotMaps
+from polarguide.shots.measurement.fields import Bound, Limits, faults, read_limits
+from polarguide.shots.measurement.pictures import _layers, _pixels_beyond, regions_picture
+from polarguide.shots.measurement.regions import Differences, Region, parse_regions, placed
+from polarguide.visualization.figures import LINE_HEIGHT
 
 
 def test_regions_with_and_without_names() -> None:
@@ -90,3 +94,44 @@ def test_angles_may_go_through_180() -> None:
     assert [bool(faults({"aolp_mean": a}, bounds)) for a in (0, 10, 11, 90, 169, 170, 179.9)] == [
         False, False, True, True, True, False, False,
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("field", "bound", "layer"),
+    [
+        ("dolp_difference_p99", Bound(max=0.05), "dolp_difference"),
+        ("dolp_difference", Bound(min=-0.05, max=0.05), "dolp_difference"),
+        ("aolp_difference_rms", Bound(max=5.0), "aolp_difference"),
+        ("dolp_mean", Bound(min=0.2), "dolp"),
+        ("saturated", Bound(max=0), "photograph"),
+    ],
+)
+def test_the_pixels_that_are_beyond_a_limit_are_outlined(field: str, bound: Bound, layer: str) -> None:
+    """In the layer in which the part failed: a defect of 9 x 9 pixels in a region, and one outside of it."""
+    defect = np.zeros((40, 60), bool)
+    defect[10:19, 20:29] = True
+    whole = defect.copy()
+    whole[30:39, 50:59] = True
+    dolp = np.where(whole, 0.1, 0.3).astype(np.float32)
+    reason = np.where(whole, Reason.SATURATED if field == "saturated" else Reason.USABLE, Reason.USABLE)
+    stokes = np.stack([np.ones_like(dolp), dolp, np.zeros_like(dolp)])
+    maps = ShotMaps(
+        "part", (), stokes[:, None].repeat(4, 1)[0][..., None], stokes, dolp, dolp, np.zeros_like(dolp),
+        dolp, dolp, reason.astype(np.uint8), NoiseModel(1e-6, 0.0, "given"), None,
+    )  # fmt: skip
+    off = np.where(whole, -0.2, 0.0).astype(np.float32)
+    differences = Differences(np.zeros_like(off), off, np.radians(100 * off))
+    region = Region("pin", 0, 0, 40, 30)
+    limits = Limits(limits={field: bound})
+    values = _layers(maps, differences)[layer][2]
+    assert (_pixels_beyond(maps, values, region, field, bound) == defect).all()
+    picture = regions_picture(maps, [(region, [f"{field} 1 over 0"])], limits, differences)
+    yellow = (picture[..., 0] > 240) & (picture[..., 1] > 200) & (picture[..., 2] < 40)
+    rows, columns = np.nonzero(yellow)
+    scale = picture.shape[1] // 60
+    top = int(rows.min() - 10 * scale)
+    assert 0 < top < 3 * LINE_HEIGHT, "the layer that failed comes first"
+    assert abs(int(columns.min()) - 20 * scale) <= scale
+    assert abs(int(columns.max()) - 29 * scale) <= scale
+    without = regions_picture(maps, [(region, ["dolp_deviation 1 over 0"])], limits, differences)
+    assert not ((without[..., 0] > 240) & (without[..., 1] > 200) & (without[..., 2] < 40)).any()

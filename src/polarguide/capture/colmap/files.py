@@ -1,4 +1,4 @@
-"""The binary files of a COLMAP model: checked before they are read, and written for posed cameras without points."""
+"""The files of a COLMAP model: checked before they are read, and written for posed cameras without points."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
+from polarguide.core.text import decimal_comma
 from polarguide.geometry.camera import quaternion
 
 MODELS = {
@@ -100,7 +101,7 @@ _LONGEST_NAME = 4096
 def check_model_files(folder: Path, kind: str) -> None:
     """Check the files of a model, of suffix ``kind``; missing files are skipped.
 
-    Of text files, which pycolmap checks itself, only the colors of points are looked at.
+    Of text files, which pycolmap checks itself, only decimal commas and the colors of points are looked for.
 
     Raises:
         PolarguideError: a file is truncated, damaged, or has trailing bytes.
@@ -121,6 +122,13 @@ def check_model_files(folder: Path, kind: str) -> None:
                     found = f"{len(data)} bytes where its counts require {end}"
             except (struct.error, ValueError) as error:
                 found = f"a damaged one ({error})" if data else "an empty file"
+        elif comma := _decimal_comma(data):
+            raise PolarguideError(
+                path,
+                expected="numbers with a decimal point",
+                found=comma,
+                remedy="Write the model again in a program or a locale (LC_NUMERIC=C) that writes points.",
+            )
         elif name == "points3D":
             found = _strange_color(data)
         if found is not None:
@@ -130,6 +138,18 @@ def check_model_files(folder: Path, kind: str) -> None:
                 found=found,
                 remedy="Copy or export the model again.",
             )
+
+
+_HEAD = 1 << 16  # bytes; a program writes all lines alike
+
+
+def _decimal_comma(data: bytes) -> str:
+    """Where the first lines of a text file have a decimal comma; empty where they have none."""
+    for number, line in enumerate(data[:_HEAD].decode("ascii", "replace").splitlines(), 1):
+        comma = "" if line.startswith("#") else decimal_comma(line.split()[:_POSE])
+        if comma:
+            return f"a decimal comma, {comma} in line {number}"
+    return ""
 
 
 def _strange_color(data: bytes) -> str | None:
@@ -214,3 +234,63 @@ def _at_most(count: int, most: int) -> int:
     if count > most:
         raise ValueError(f"a count of {count} that the file is too short for")
     return count
+
+
+_POSE = 9  # number, quaternion, translation, camera: what stands before the name
+_PLACE = 3  # x, y and the number of a point; pycolmap checks all of them, lines of images show in the first
+
+
+@dataclass(frozen=True)
+class TextImages:
+    """A text model that pycolmap can read in place of an ``images.txt``.
+
+    Attributes:
+        data: the same file with names that have no blanks.
+        names: number of an image -> its name.
+    """
+
+    data: bytes
+    names: dict[int, str]
+
+
+def read_text_images(data: bytes) -> TextImages:
+    """Take the names out of an ``images.txt``.
+
+    An image with one line, as some programs write it, would make pycolmap pass over every other image.
+
+    Raises:
+        ValueError: lines are not those of images and their observations in turn, or a name is not in UTF-8.
+    """
+    out: list[bytes] = []
+    names: dict[int, str] = {}
+    number: int | None = None  # of the image whose observations come next
+    for count, line in enumerate(data.splitlines(), 1):
+        cells = line.split()
+        if number is not None:
+            if len(cells) % _PLACE or not all(map(_is_number, cells[: _POSE + _PLACE])):
+                raise ValueError(f"line {count} does not hold the observations of image {number}")
+            number = None
+            out.append(line)
+        elif not cells or line.lstrip().startswith(b"#"):
+            out.append(line)
+        else:
+            head = line.split(None, _POSE)
+            if len(head) <= _POSE or not (head[0].isdigit() and all(map(_is_number, head[:_POSE]))):
+                raise ValueError(f"line {count} does not hold an image")
+            number = int(head[0])
+            if number in names:
+                raise ValueError(f"image {number} stands there twice")
+            try:
+                names[number] = head[_POSE].decode().strip()
+            except UnicodeDecodeError:
+                raise ValueError(f"line {count} has a name that is not in UTF-8") from None
+            out.append(b" ".join([*head[:_POSE], b"%d" % number]))
+    return TextImages(b"\n".join(out) + b"\n\n", names)
+
+
+def _is_number(cell: bytes) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

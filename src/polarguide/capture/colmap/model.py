@@ -16,68 +16,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polarguide.capture.colmap.files import check_model_files
+from polarguide.capture.colmap.files import check_model_files, read_text_images
 from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
+from polarguide.core.text import canonical
 from polarguide.geometry.camera import FARTHEST, LENS, Camera, can_be_lens
-
-_POSE = 9  # number, quaternion, translation, camera: what stands before the name
-_PLACE = 3  # x, y and the number of a point; pycolmap checks all of them, lines of images show in the first
-
-
-@dataclass(frozen=True)
-class TextImages:
-    """A text model that pycolmap can read in place of an ``images.txt``.
-
-    Attributes:
-        data: the same file with names that have no blanks.
-        names: number of an image -> its name.
-    """
-
-    data: bytes
-    names: dict[int, str]
-
-
-def read_text_images(data: bytes) -> TextImages:
-    """Take the names out of an ``images.txt``.
-
-    An image with one line, as some programs write it, would make pycolmap pass over every other image.
-
-    Raises:
-        ValueError: lines are not those of images and their observations in turn, or a name is not in UTF-8.
-    """
-    out: list[bytes] = []
-    names: dict[int, str] = {}
-    number: int | None = None  # of the image whose observations come next
-    for count, line in enumerate(data.splitlines(), 1):
-        cells = line.split()
-        if number is not None:
-            if len(cells) % _PLACE or not all(map(_is_number, cells[: _POSE + _PLACE])):
-                raise ValueError(f"line {count} does not hold the observations of image {number}")
-            number = None
-            out.append(line)
-        elif not cells or line.lstrip().startswith(b"#"):
-            out.append(line)
-        else:
-            head = line.split(None, _POSE)
-            if len(head) <= _POSE or not (head[0].isdigit() and all(map(_is_number, head[:_POSE]))):
-                raise ValueError(f"line {count} does not hold an image")
-            number = int(head[0])
-            if number in names:
-                raise ValueError(f"image {number} stands there twice")
-            names[number] = head[_POSE].decode().strip()
-            out.append(b" ".join([*head[:_POSE], b"%d" % number]))
-    return TextImages(b"\n".join(out) + b"\n\n", names)
-
-
-def _is_number(cell: bytes) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
 
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 # Perspective models that are a plain pinhole when all of their distortion parameters are zero.
@@ -164,6 +108,7 @@ def read_model(root: Path) -> ColmapModel:
     folder, kind = find_model(root, itself=False)
     files = tuple(path for path in (folder / (name + kind) for name in MODEL_FILES) if path.exists())
     model = load_model(folder, kind)
+    stale = other_text_model(folder, kind, model)
     images = posed_images(model)
     points, colors, tracks, numbers = _points_of(model)
     dropped = len(model.points3D) - len(points)
@@ -176,7 +121,7 @@ def read_model(root: Path) -> ColmapModel:
         )
     beyond = f"not finite, or farther than {FARTHEST:g}, and were left out."
     warning = f"{dropped} of {dropped + len(points)} 3D points are {beyond}"
-    warnings = (warning,) if dropped else ()
+    warnings = (*stale, *([warning] if dropped else []))
     rows = {number: row for row, number in enumerate(numbers)}
     return ColmapModel(folder, files, points, colors, warnings, images, dict(model.cameras), tracks, rows)
 
@@ -239,6 +184,12 @@ def find_model(root: Path, *, itself: bool = True, points: bool = True) -> tuple
     )
 
 
+def holds_model(root: Path) -> bool:
+    """Whether ``find_model`` finds a model, or a part of one, in a folder."""
+    places = (root / "sparse" / "0", root / "sparse", root / "0", root)
+    return any((folder / f"cameras{kind}").exists() for folder in places for kind in (".bin", ".txt"))
+
+
 def load_model(folder: Path, kind: str) -> Any:
     """The model in a folder, as pycolmap's ``Reconstruction``; without points if it has no file of them.
 
@@ -269,6 +220,55 @@ def load_model(folder: Path, kind: str) -> Any:
             remedy="Export the model again; text files need two lines per image.",
         ) from error
     return model
+
+
+# Share by which numbers of two models may differ: programs write as few as six digits as text.
+_DIGITS = 1e-5
+
+
+def other_text_model(folder: Path, kind: str, model: Any) -> list[str]:
+    """The warning that text files beside a binary model say something else, if they do.
+
+    Args:
+        folder: of the model. kind: suffix of the files that were read. model: what they hold.
+    """
+    if kind != ".bin" or not all((folder / f"{name}.txt").exists() for name in ("cameras", "images")):
+        return []
+    try:
+        differ = _differing(model, load_model(folder, ".txt"))
+    except PolarguideError as error:
+        return [f"The text model beside {folder / 'images.bin'} is not used, and cannot be read: {error}"]
+    if not differ:
+        return []
+    return [
+        f"{folder} holds two models: images.txt has other poses or cameras than images.bin ({listed(differ)}). "
+        "The binary files are used; remove them if the text is right."
+    ]
+
+
+def _differing(model: Any, other: Any) -> list[str]:
+    """Names of the images that only one of two models has, or whose poses or cameras are others."""
+    placed, again = (
+        {
+            image.name: (image.cam_from_world(), m.cameras[image.camera_id])
+            for image in m.images.values()
+            if image.has_pose
+        }
+        for m in (model, other)
+    )
+    reach = max((float(np.abs(pose.translation).max()) for pose, _ in placed.values()), default=0.0)
+
+    def alike(name: str) -> bool:
+        (pose, camera), (pose_again, camera_again) = placed[name], again[name]
+        return (
+            camera.model_name == camera_again.model_name
+            and np.allclose(camera.params, camera_again.params, rtol=_DIGITS)
+            and np.allclose(pose.rotation.matrix(), pose_again.rotation.matrix(), rtol=0, atol=_DIGITS)
+            and np.allclose(pose.translation, pose_again.translation, rtol=0, atol=_DIGITS * reach)
+        )
+
+    both = placed.keys() & again.keys()
+    return sorted((placed.keys() ^ again.keys()) | {name for name in both if not alike(name)})
 
 
 @contextlib.contextmanager
@@ -312,7 +312,7 @@ def view_of_name(name: str, views: Collection[str] = ()) -> str:
     Suffixes without one are no kinds of files: ``./train/r_0.5`` is called so. Nor is what follows a point in the name
     of one of ``views``: Metashape's labels have no suffix.
     """
-    path = PurePosixPath(name.replace("\\", "/"))
+    path = PurePosixPath(canonical(name).replace("\\", "/"))
     if path.name in views:
         return path.name
     return path.stem if any(sign.isalpha() for sign in path.suffix) else path.name

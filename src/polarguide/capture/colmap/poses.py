@@ -23,6 +23,7 @@ from polarguide.capture.colmap.model import (
     is_pinhole,
     is_sound,
     load_model,
+    other_text_model,
     posed_images,
 )
 from polarguide.capture.filter.develop import remapped_mask
@@ -162,9 +163,14 @@ class Poses:
         views, missing: names of the views with a pose, and without.
         folder, files: where the model is from.
         assumed_sizes: views whose cameras came without a size, and have that of the pictures.
+        held_out: views that their origin keeps for tests.
+        notes, warnings: what the user should know of their origin.
     """
 
     assumed_sizes: frozenset[str] = frozenset()
+    held_out: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def __init__(self, model: Any, where: Path, views: list[str], files: Sequence[Path] = ()) -> None:
         """Match the images of a model with views by stem.
@@ -214,7 +220,10 @@ class Poses:
         """
         folder, kind = find_model(path, points=False)
         files = [folder / (name + kind) for name in MODEL_FILES]
-        return cls(load_model(folder, kind), folder, views, [file for file in files if file.exists()])
+        model = load_model(folder, kind)
+        poses = cls(model, folder, views, [file for file in files if file.exists()])
+        poses.warnings = tuple(other_text_model(folder, kind, model))
+        return poses
 
     @classmethod
     def of_cameras(

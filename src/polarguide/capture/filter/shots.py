@@ -19,6 +19,7 @@ from polarguide.capture.exposures import (
     Line,
     angle_text,
     angles_of_names,
+    files_of,
     folders_of_angles,
     parse_angle,
     read_table,
@@ -39,6 +40,7 @@ from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.view_reader import require_alike
 from polarguide.core.errors import PolarguideError
+from polarguide.core.text import canonical, stem_of
 
 SHOT_SUFFIXES = (*SUFFIXES, *CAMERA_RAW)
 Candidates = dict[str, dict[int, list[Path]]]
@@ -113,7 +115,7 @@ def list_shots(root: Path, *, nested: bool = False) -> tuple[Candidates, list[Pa
     shots: Candidates = {}
     for angle, folder in folders.items():
         for path in list_files(folder, SHOT_SUFFIXES):
-            shots.setdefault(path.stem, {}).setdefault(angle, []).append(path)
+            shots.setdefault(stem_of(path), {}).setdefault(angle, []).append(path)
     if not shots:
         _refuse_strangers(folders.values())
     return shots, []
@@ -149,13 +151,13 @@ def group_files(files: Sequence[Path]) -> tuple[Candidates, list[Path]]:
     others: list[Path] = []
     for folder in dict.fromkeys(path.parent for path in files):
         inside = [path for path in files if path.parent == folder]
-        alone = all(_BARE.fullmatch(path.stem) for path in inside)
+        alone = all(_BARE.fullmatch(stem_of(path)) for path in inside)
         for path in inside:
-            match = (_BARE if alone else _SUFFIX).fullmatch(path.stem)
+            match = (_BARE if alone else _SUFFIX).fullmatch(stem_of(path))
             if match is None:
                 others.append(path)
                 continue
-            view = folder.resolve().name if alone else match["view"]
+            view = canonical(folder.resolve().name) if alone else match["view"]
             shots.setdefault(view, {}).setdefault(int(match["angle"]), []).append(path)
     return {view: dict(sorted(of_view.items())) for view, of_view in shots.items()}, others
 
@@ -323,10 +325,12 @@ def find_single_shots(
             for stem, path in index_files(folder, SHOT_SUFFIXES).items()
         ]
         return _checked(root, shots), []
-    names = angles_of_names([path.stem for path in files])
+    names = angles_of_names([stem_of(path) for path in files])
     alone = all(name is not None and not name[0] for name in names)
     named = {
-        path: None if name is None or not (name[0] or alone) else (name[0] or root.resolve().name, name[1])
+        path: None
+        if name is None or not (name[0] or alone)
+        else (name[0] or canonical(root.resolve().name), name[1])
         for path, name in zip(files, names, strict=True)
     }
     without = [path.name for path, shot in named.items() if shot is None]
@@ -362,7 +366,7 @@ def _all_alike(root: Path, angles: str, each: int) -> list[SingleShot]:
         )
     repeated = [repeating[number % len(repeating)] for number in range(len(files))]
     return [
-        SingleShot(path, files[number - number % each].stem, angle)
+        SingleShot(path, stem_of(files[number - number % each]), angle)
         for number, (path, angle) in enumerate(zip(files, repeated, strict=True))
         if angle is not None
     ]
@@ -377,8 +381,7 @@ def _by_table(root: Path, table: Path, lines: Sequence[Line]) -> list[SingleShot
     base = root.resolve()
     shots: list[SingleShot] = []
     alone: dict[str, Path] = {}
-    for line in lines:
-        path = root / line.file
+    for line, path in zip(lines, files_of(root, table, lines), strict=True):
         if not path.resolve().is_relative_to(base):
             raise PolarguideError(
                 table, expected=f"files in {root}", found=line.file, remedy="Copy the file there."
@@ -397,11 +400,12 @@ def _by_table(root: Path, table: Path, lines: Sequence[Line]) -> list[SingleShot
                 found=line.file,
                 remedy="Remove its line from the table, or convert the file to one of these formats.",
             )
-        if line.view is None and path.stem in alone:
-            raise ambiguous(root, f"one photograph called {path.stem}", alone[path.stem], path)
+        stem = stem_of(path)
+        if line.view is None and stem in alone:
+            raise ambiguous(root, f"one photograph called {stem}", alone[stem], path)
         if line.view is None:
-            alone[path.stem] = path
-        shots.append(SingleShot(path, line.view or path.stem, line.angle, line.gain))
+            alone[stem] = path
+        shots.append(SingleShot(path, line.view or stem, line.angle, line.gain))
     taken = {shot.path.resolve() for shot in shots}
     without = [path.name for path in list_files(root, SHOT_SUFFIXES) if path.resolve() not in taken]
     if without:

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
+import msgspec
 from torch import Tensor
 
 from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.records import decode
 from polarguide.results.evaluation.target import ViewTarget
 
 Layers = Mapping[str, Tensor | None]
@@ -69,6 +71,8 @@ class Metric:
 
 
 GROUP = "polarguide.metrics"
+_REMEDY = "Update or uninstall the package that brings it."
+_KINDS = get_type_hints(Metric) | {"digits": Annotated[int, msgspec.Meta(ge=0, le=10)]}
 
 
 def plugged_metrics(known: Collection[str]) -> tuple[Metric, ...]:
@@ -95,17 +99,55 @@ def _loaded(entry: EntryPoint) -> tuple[Metric, ...]:
         loaded: Any = entry.load()
         loaded = loaded() if callable(loaded) else loaded
         metrics = (loaded,) if isinstance(loaded, Metric) else tuple(loaded)
-    except Exception as error:  # another package may fail in any way
+    except (Exception, SystemExit) as error:  # another package may fail in any way
         raise _unusable(entry, "metrics", f"{type(error).__name__}: {error}") from error
     for metric in metrics:
         if not isinstance(metric, Metric):
             raise _unusable(entry, "metrics", repr(metric))
-        if metric.measure is None or metric.of != "view" or not metric.key.isidentifier():
+        if not callable(metric.measure) or metric.of != "view" or not _is_name(metric.key):
             raise _unusable(entry, "a metric of views with a measure, its key a name", repr(metric.key))
-    return metrics
+        for name in ("label", "unit", "digits", "better", "shown", "timed", "factor"):
+            where = f"plug-in {entry.name} ({entry.value}), {metric.key} ({name})"
+            decode(getattr(metric, name), _KINDS[name], where, remedy=_REMEDY)
+    return tuple(
+        replace(metric, measure=_Guarded(entry, metric.measure)) for metric in metrics if metric.measure
+    )
+
+
+def _is_name(key: object) -> bool:
+    return isinstance(key, str) and key.isidentifier()
+
+
+class _Guarded:
+    """A measure of another package: where it fails, there is no value, and one warning; scores do not depend on it."""
+
+    def __init__(self, entry: EntryPoint, measure: Measure) -> None:
+        self._entry = entry
+        self._measure = measure
+        self._failed = False
+
+    def __call__(self, target: ViewTarget, layers: Layers) -> Tensor | None:
+        """The value as a tensor [] on the target's device; None where there is none."""
+        found = ""
+        try:
+            value: Any = self._measure(target, layers)
+            if value is None:
+                return None
+            if not isinstance(value, Tensor):
+                found = type(value).__name__
+            elif value.ndim or value.is_complex():
+                found = f"a tensor {list(value.shape)} of {value.dtype}"
+            else:
+                return value.detach().to(target.photograph.device)
+        except (Exception, SystemExit) as error:
+            found = f"{type(error).__name__}: {error}"
+        if not self._failed:
+            self._failed = True
+            fault = _unusable(self._entry, "a real tensor [] or None from its measure", found)
+            warnings.warn(f"{fault} It has no value.", PolarguideWarning, stacklevel=2)
+        return None
 
 
 def _unusable(entry: EntryPoint, expected: str, found: str) -> PolarguideError:
     where = f"plug-in {entry.name} ({entry.value})"
-    remedy = "Update or uninstall the package that brings it."
-    return PolarguideError(where, expected=expected, found=found, remedy=remedy)
+    return PolarguideError(where, expected=expected, found=found, remedy=_REMEDY)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 
@@ -17,6 +18,8 @@ FORMAT = 2
 PERCENTILES = (1, 5, 50, 95, 99)
 DIFFERENCE_PERCENTILE = 99
 Value = int | float | str | None
+
+Status = Literal["measured", "within", "beyond", "unread"]
 
 
 @dataclass(frozen=True)
@@ -203,3 +206,17 @@ def faults(figures: Mapping[str, Value], bounds: Mapping[str, Bound]) -> list[st
         elif high is not None and value > high:
             beyond.append(f"{field} {value:.5g} over {high:g}")
     return beyond
+
+
+def verdict(beyond: Sequence[str], bounds: Mapping[str, Bound]) -> dict[str, Value]:
+    """The fields that say how a region compares with its limits."""
+    return {
+        "status": "beyond" if beyond else "within" if bounds else "measured",
+        "why": ", ".join(beyond),
+    }
+
+
+def worst(regions: Sequence[Mapping[str, Value]]) -> Status:
+    """The worst status of regions."""
+    statuses = [figures["status"] for figures in regions]
+    return "beyond" if "beyond" in statuses else "within" if "within" in statuses else "measured"

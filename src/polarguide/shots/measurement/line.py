@@ -22,7 +22,17 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.shots.develop import check_files
 from polarguide.shots.exposures import find_shots, require_elsewhere
 from polarguide.shots.maps import ShotMaps
-from polarguide.shots.measurement.fields import FORMAT, KEYS, NO_LIMITS, Value, faults, read_limits
+from polarguide.shots.measurement.fields import (
+    FORMAT,
+    KEYS,
+    NO_LIMITS,
+    Status,
+    Value,
+    faults,
+    read_limits,
+    verdict,
+    worst,
+)
 from polarguide.shots.measurement.pictures import difference_picture, regions_picture
 from polarguide.shots.measurement.regions import (
     WHOLE,
@@ -35,7 +45,7 @@ from polarguide.shots.measurement.regions import (
     placed,
     region_figures,
 )
-from polarguide.shots.measurement.table import Entry, FileStamp, Status, Table, stamps
+from polarguide.shots.measurement.table import Entry, FileStamp, Table, stamps
 from polarguide.shots.options import MeasureOptions, ShotOptions
 from polarguide.shots.read import NAME, UNREADABLE, array_shot, fault_of, is_array, read_shot, stacked_array
 from polarguide.shots.sets import ExposureSet
@@ -78,9 +88,9 @@ class Measurer:
         self._options = options
         self._regions = parse_regions(options.roi)
         names = [region.name for region in self._regions] or [WHOLE]
-        self._limits = NO_LIMITS
+        self.limits = NO_LIMITS
         if options.limits is not None:
-            self._limits = read_limits(options.limits, names, reference=options.reference is not None)
+            self.limits = read_limits(options.limits, names, reference=options.reference is not None)
         self.reference = None
         if options.reference is not None:
             self.reference = Reference.read(options.reference, self._reading)
@@ -109,10 +119,7 @@ class Measurer:
         regions = placed(self._regions, maps.whole or maps.size, shot.where)
         differences = None if self.reference is None else self.reference.differences(maps)
         measured = [self._region(maps, region, differences) for region in regions]
-        statuses = [str(figures["status"]) for _, figures, _ in measured]
-        status: Status = (
-            "beyond" if "beyond" in statuses else "within" if "within" in statuses else "measured"
-        )
+        status = worst([figures for _, figures, _ in measured])
         beyond = [(region, which) for region, _, which in measured] if status == "beyond" else []
         return MeasuredShot(maps, differences, tuple(figures for _, figures, _ in measured), status, beyond)
 
@@ -131,19 +138,26 @@ class Measurer:
             **region_figures(maps, local, self._options.threshold),
             **difference_figures(differences, local),
         }
-        bounds = self._limits.of(region.name)
+        bounds = self.limits.of(region.name)
         beyond = faults(figures, bounds)
-        status = "beyond" if beyond else "within" if bounds else "measured"
         head: dict[str, Value] = {
             "region": region.name,
             "x": region.x,
             "y": region.y,
             "width": region.width,
             "height": region.height,
-            "status": status,
-            "why": ", ".join(beyond),
+            **verdict(beyond, bounds),
         }
         return region, {**head, **figures}, beyond
+
+    def judged(self, entry: Entry) -> Entry:
+        """A line of a table by the limits; its figures do not change."""
+        regions = []
+        for figures in entry.regions:
+            bounds = self.limits.of(str(figures["region"]))
+            regions.append({**figures, **verdict(faults(figures, bounds), bounds)})
+        status = worst(regions) if regions else entry.status
+        return msgspec.structs.replace(entry, status=status, regions=tuple(regions))
 
     def settings(self) -> dict[str, Any]:
         """The settings that the figures depend on, as JSON."""
@@ -162,7 +176,7 @@ class Measurer:
                     for region in self._regions
                 ],
                 "threshold": self._options.threshold,
-                "limits": self._limits,
+                "limits": self.limits,
                 "reference": stamps(self.reference_files),
             },
             enc_hook=str,
@@ -238,7 +252,9 @@ class Line:
         self.measurer = Measurer(options, reading)
         self.out = out
         require_inside(out, out / BEYOND, out / DIFFERENCES)
-        self.table = Table(out, self.measurer.settings(), overwrite=options.overwrite)
+        self.table = Table(
+            out, self.measurer.settings(), overwrite=options.overwrite, judged=self.measurer.judged
+        )
 
     def __enter__(self) -> Line:
         return self
@@ -282,15 +298,31 @@ class Line:
             return ""
         name = self.table.picture_name(maps.name)
         if measured.beyond:
-            maps = maps if maps.whole is None else self.measurer.read(shot, whole=True)
-            make_folder(self.out / BEYOND)
-            write_png(self.out / BEYOND / f"{name}.png", regions_picture(maps, measured.beyond))
+            self._draw_beyond(shot, measured, name)
         reference = self.measurer.reference
         if differences is not None and reference is not None:
             make_folder(self.out / DIFFERENCES)
             picture = difference_picture(differences, maps.name, reference.name)
             write_png(self.out / DIFFERENCES / f"{name}.png", picture)
         return name
+
+    def _draw_beyond(self, shot: ExposureSet, measured: MeasuredShot, name: str) -> None:
+        maps = measured.maps if measured.maps.whole is None else self.measurer.read(shot, whole=True)
+        picture = regions_picture(maps, measured.beyond, self.measurer.limits, measured.differences)
+        make_folder(self.out / BEYOND)
+        write_png(self.out / BEYOND / f"{name}.png", picture)
+
+    def follow_judgment(self, shot: ExposureSet, entry: Entry) -> None:
+        """Draw the picture of a shot that other limits than before call beyond, or remove that of one within.
+
+        Raises:
+            PolarguideError, OSError, MemoryError: the shot cannot be read again, or the picture not written.
+        """
+        if entry.status == "beyond":
+            measured = self.measurer.measured(shot, self.measurer.read(shot))
+            self._draw_beyond(shot, measured, entry.picture)
+        elif entry.picture:
+            (self.out / BEYOND / f"{entry.picture}.png").unlink(missing_ok=True)
 
 
 Source = PathLike | ExposureSet | Array | Sequence[Array]
@@ -339,6 +371,8 @@ def measure_shots(
     with contextlib.ExitStack() as stack:
         line = stack.enter_context(Line(Path(out), options, reading)) if out is not None else None
         measurer = line.measurer if line is not None else Measurer(options, reading)
+        if line is not None and line.table.judged_again:
+            reporter.say(f"{out}: {line.table.judged_again} shots judged by other limits; their figures stay")
         advance = stack.enter_context(reporter.track("measure", total))
         for number, shot in enumerate(shots, 1):
             if line is None:
@@ -361,9 +395,14 @@ def _measured_into(line: Line, shot: ExposureSet, heard: Heard) -> tuple[bool, S
     files: tuple[FileStamp, ...] = ()
     with contextlib.suppress(OSError):
         files = stamps(shot.paths)
-    status = line.table.status_of(files) if files else None
-    if status is not None:
-        return True, status
+    known = line.table.entry_of(files) if files else None
+    if known is not None:
+        if line.table.judged_again:
+            with contextlib.suppress(*UNREADABLE):  # its line is there; only the picture is not
+                line.follow_judgment(shot, known)
+            if known.status == "beyond":
+                heard(known)
+        return True, known.status
     try:
         entry = line.measure(shot, files)
     except UNREADABLE as error:

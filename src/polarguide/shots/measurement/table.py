@@ -13,10 +13,10 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, Literal
+from typing import Annotated, Any, BinaryIO
 
 import msgspec
 from msgspec import Meta
@@ -34,12 +34,11 @@ from polarguide.core.files import (
 from polarguide.core.records import decode, first_difference, read_record, shortened, to_json
 from polarguide.core.system import only_writer
 from polarguide.core.text import csv_lines
-from polarguide.shots.measurement.fields import FORMAT, KEYS, Value
+from polarguide.shots.measurement.fields import FORMAT, KEYS, Status, Value
 
 LINES, CSV, SETTINGS, LOCK = "table.jsonl", "table.csv", "measure.json", ".lock"
 _LAST = 2**63 - 1
 """Of the nanoseconds that a time may lie from 1970, 292 years; some disks have later ones."""
-Status = Literal["measured", "within", "beyond", "unread"]
 _ANEW = "Give another --out, or --overwrite to begin this table anew."
 
 
@@ -104,11 +103,19 @@ class Entry(msgspec.Struct, frozen=True):
 class Table:
     """A table that is open for more lines. Close it, or use it as a context."""
 
-    def __init__(self, folder: Path, settings: Mapping[str, Any], *, overwrite: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        settings: Mapping[str, Any],
+        *,
+        overwrite: bool = False,
+        judged: Callable[[Entry], Entry] | None = None,
+    ) -> None:
         """Open the table of a folder, or begin one.
 
         Args:
             folder: is made. settings: all that the figures depend on; a table has the same for all of its shots.
+            judged: a line by the limits of the settings, where the table was made with other limits alone.
             overwrite: begin anew where it was made with others; so is a table without a single measured shot.
 
         Raises:
@@ -118,7 +125,9 @@ class Table:
         check_out(folder)
         make_folder(folder)
         self.folder = folder
-        self._done: dict[bytes, Status] = {}
+        self.judged_again = 0
+        """Lines that were judged by other limits than before."""
+        self._done: dict[bytes, Entry] = {}
         self._pictures: set[str] = set()
         self._files: list[BinaryIO] = []
         self._stack = contextlib.ExitStack()
@@ -130,7 +139,7 @@ class Table:
                     found="another polarguide measure at work on it",
                 )
             )
-            self._begin({"format": FORMAT, **settings}, overwrite)
+            self._begin({"format": FORMAT, **settings}, overwrite, judged)
             for name in (LINES, CSV):
                 with writing(folder / name):
                     self._files.append(stack.enter_context(open(folder / name, "ab", buffering=0)))
@@ -148,6 +157,11 @@ class Table:
 
     def status_of(self, files: tuple[FileStamp, ...]) -> Status | None:
         """The status in the line of these files as they are, None where there is no such line."""
+        entry = self.entry_of(files)
+        return None if entry is None else entry.status
+
+    def entry_of(self, files: tuple[FileStamp, ...]) -> Entry | None:
+        """The line of these files as they are, with figures where it is beyond; None where there is no such line."""
         return self._done.get(_key(files))
 
     def picture_name(self, shot: str) -> str:
@@ -192,11 +206,14 @@ class Table:
                 )
 
     def _note(self, entry: Entry) -> None:
-        self._done[_key(entry.files)] = entry.status
+        short = entry if entry.status == "beyond" else msgspec.structs.replace(entry, regions=(), notes=())
+        self._done[_key(entry.files)] = short
         if entry.picture:
             self._pictures.add(entry.picture.casefold())
 
-    def _begin(self, settings: dict[str, Any], overwrite: bool) -> None:
+    def _begin(
+        self, settings: dict[str, Any], overwrite: bool, judged: Callable[[Entry], Entry] | None
+    ) -> None:
         """Make what there is whole again, or begin anew."""
         path = self.folder / SETTINGS
         lines = self.folder / LINES
@@ -208,6 +225,19 @@ class Table:
             before = read_record(path, dict[str, Any], remedy=_ANEW) if not overwrite else None
             now: dict[str, Any] = json.loads(to_json(settings))
             if before == now:
+                self._mend()
+                return
+            if (
+                judged is not None
+                and before is not None
+                and {**before, "limits": None} == {**now, "limits": None}
+            ):
+                write_whole(path, to_json({**now, "limits": None}))  # until all lines are by the same
+                self._mend()
+                self._judge(judged)
+                write_whole(path, to_json(settings))
+                self._done.clear()
+                self._pictures.clear()
                 self._mend()
                 return
             if before is not None and _holds_measurements(lines):
@@ -246,6 +276,18 @@ class Table:
             with writing(path), open(path, "r+b") as file:
                 file.truncate(whole)
                 os.fsync(file.fileno())
+
+    def _judge(self, judged: Callable[[Entry], Entry]) -> None:
+        """Write all lines anew, as other limits judge them."""
+        path = self.folder / LINES
+        with atomic(path) as temporary, open(temporary, "wb") as new, open(path, "rb") as lines:
+            for number, line in enumerate(lines, 1):
+                entry = judged(decode(line, Entry, f"{path} (line {number})", remedy=_ANEW))
+                if entry.status == "beyond" and not entry.picture:
+                    entry = msgspec.structs.replace(entry, picture=self.picture_name(entry.shot))
+                    self._pictures.add(entry.picture.casefold())
+                new.write(json.dumps(msgspec.to_builtins(entry)).encode() + b"\n")
+                self.judged_again += 1
 
 
 def _append(path: Path, file: BinaryIO, data: bytes) -> None:
