@@ -108,7 +108,7 @@ def test_only_ply_has_fields(trained: Path, refused, tmp_path: Path) -> None:  #
 def test_splats_are_upright_and_of_the_subject(
     kind: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What most cameras have in their pictures, of which the command says how many, with up where GLB has it."""
+    """Exported is the part that most cameras see; the command prints its size, and up is where GLB has it."""
     forge = pytest.importorskip("gaussforge").GaussForge()
     exported(trained, tmp_path, kind)
     data = forge.read((tmp_path / f"splats.{kind}").read_bytes(), kind)["data"]

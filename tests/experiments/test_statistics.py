@@ -256,7 +256,7 @@ LUCK = (0.0, 2.0, 4.0)
         ("psnr", {"best": {0: 30.0, 1: 33.0, 2: 33.0}, "one": {0: 30.0}}, False, set()),
         ("psnr", {"best": {0: 30.0, 1: 33.0, 2: 33.0}, "one": {0: 29.0}}, False, {"best"}),
         ("psnr", {"best": {0: 30.0, 1: 33.0, 2: 33.0}, "apart": {9: 31.9}}, False, set()),
-        # Of a metric of unknown scatter, fewer than three seeds tell nothing, however far apart.
+        # With an unknown scatter, fewer than three seeds decide nothing, however far apart they are.
         ("lpips", {"a": {0: 0.100}, "b": {0: 0.102}, "c": {0: 0.1001}}, False, set()),
         ("lpips", {"a": {0: 0.2, 1: 0.2}, "b": {0: 0.4, 1: 0.6}, "c": {0: 0.3, 1: 0.3}}, False, set()),
         (

@@ -339,7 +339,7 @@ def _stating(folder, kind, values, full):
     [("pgm", 127), ("pgm", 1023), ("pgm", 16383), ("tif", 1023), ("tif", 127), ("png", 1023), ("png", 63)],
 )
 def test_the_full_scale_that_a_file_states_is_used(tmp_path, kind, full):
-    """Of mosaics and photographs: what is at it is saturated, and the rest is a share of it."""
+    """In mosaics and photographs, values at full scale are saturated, and the others are shares of it."""
     ramp = np.random.default_rng(3).permutation(np.linspace(1, full, 64 * 64)).reshape(64, 64)
     values = ramp.round().astype(np.uint8 if full < 256 else np.uint16)
     path = _stating(tmp_path, kind, values, full)

@@ -128,7 +128,7 @@ SIX, THREE = (10, 40, 70, 100, 130, 160), (0, 60, 120)
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".jpg"])
 @pytest.mark.parametrize("encode", [srgb_encode, lambda light: light])
 def test_pairs_at_right_angles_tell_the_encoding(tmp_path, suffix, encode):
-    """Of any set that has two: three of six angles, in ``priors`` and in ``prepare``."""
+    """Any set with two pairs is enough: three pairs of six angles, in ``priors`` and in ``prepare``."""
     pictures, degree = light(SIX)
     for angle, picture in zip(SIX, pictures, strict=True):
         write(tmp_path / f"cup_a{angle}{suffix}", encode(picture))

@@ -243,7 +243,8 @@ def pair_slopes(
     sums, squares = (first + second) / s0, ((first - second) / s0) ** 2
     found = []
     for one, other in itertools.combinations(range(len(pairs)), 2):
-        q, r = squares[one] - squares[other], sums[one] - sums[other]
+        q = squares[one] - squares[other]
+        r = sums[one] - sums[other]
         if len(q):
             q, r = q - q.mean(), r - r.mean()
         found.append(np.array([len(q), 0.0, 0.0, q @ q, q @ r]))

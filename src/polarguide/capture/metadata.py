@@ -166,7 +166,7 @@ def mount_of(path: Path, data: bytes) -> Mount:
 
 
 def keeps_gains(path: Path, data: bytes) -> bool:
-    """Whether the scene was prepared with ``--gains none``, which leaves exposures as they are.
+    """True where the scene was prepared with ``--gains none``, which leaves exposures as they are.
 
     Args:
         path: ``scene.json``, for messages. data: its content.

@@ -134,7 +134,9 @@ def source_stamp(folder: Path) -> tuple[int, int, int]:
             OSError, ValueError
         ):  # it has gone meanwhile, or has a name that no file can have
             state = os.stat(path)
-            count, size, newest = count + 1, size + state.st_size, max(newest, state.st_mtime_ns)
+            count += 1
+            size += state.st_size
+            newest = max(newest, state.st_mtime_ns)
     return count, size, newest
 
 

@@ -245,7 +245,7 @@ def scatter_on(record: Record, scenes: Iterable[str], column: Metric) -> list[fl
 def told_apart(
     values: Values, best: int, other: int, sign: float, scatter: Sequence[float | None]
 ) -> bool | None:
-    """Whether the lead of one recipe over another, at the seeds that both have on every scene, is beyond noise.
+    """True where the lead of one recipe over another, at the seeds that both have on every scene, is beyond noise.
 
     None where that cannot be tested: no seeds are paired, or too few without a known scatter.
     """

@@ -56,7 +56,8 @@ def orbit(
     radius = max(float(level.norm(dim=1).median()), 1e-6 * around.distance)
     if distance is not None:
         nearer = distance / math.hypot(radius, height)
-        radius, height = nearer * radius, nearer * height
+        radius *= nearer
+        height *= nearer
     path = []
     for k in range(frames):
         angle = 2 * math.pi * k / frames

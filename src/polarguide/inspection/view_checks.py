@@ -27,7 +27,8 @@ STEP = 1 / 3
 
 def view_exposure_check(capture: Capture) -> Check:
     """Check whether the views were exposed and white-balanced alike."""
-    key, title = "view_exposure", "Equal exposure of the views"
+    key = "view_exposure"
+    title = "Equal exposure of the views"
     exposures = capture.exposures
     if exposures is None or not np.isfinite(exposures.logs).any():
         return Check(key, title, "n/a", "No points that views have in common are stored in the model.")
@@ -71,7 +72,8 @@ def view_exposure_check(capture: Capture) -> Check:
 
 def lens_check(capture: Capture) -> Check:
     """Check whether each view alone agrees with the focal length that the model has for it."""
-    key, title = "focal_lengths", "Focal lengths"
+    key = "focal_lengths"
+    title = "Focal lengths"
     if capture.model is None:
         return Check(key, title, "n/a", "There are no poses.")
     found = {

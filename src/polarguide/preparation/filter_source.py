@@ -89,7 +89,7 @@ class ShotsSource(Source):
 
     cameras = None
     assumed: tuple[str, ...] = ()
-    """What was taken for granted, in sentences for the user."""
+    """Assumptions about the capture, in sentences for the user."""
     _root: Path
 
     def __init__(self, paths: list[Path], views: dict[str, list[Path]], settings: PrepareSettings) -> None:
@@ -241,7 +241,8 @@ class FilterSource(ShotsSource):
         """The transfer of the capture, from a few views spread over it."""
         self._require_memory("four shots")
         settings = self._settings
-        gains, notes = settings.calibration.gains, [*self.assumed]
+        gains = settings.calibration.gains
+        notes = [*self.assumed]
         levels, counted = levels_of_shots(self._shots, self._white, self._settings)
         decision = self._decided(levels)
         notes += [*counted, decision.note]

@@ -72,7 +72,8 @@ class MosaicFiles:
                 found="none",
                 remedy="Name it; color and monochrome sensors have different patterns.",
             )
-        self._settings, self._sensor = settings, settings.sensor
+        self._settings = settings
+        self._sensor = settings.sensor
         self._raw = RawFormat(settings.width, settings.height, settings.packing)
         pattern = sensor_pattern(settings.sensor).shifted(settings.offset_x, settings.offset_y)
         self.crop = pattern.cell_corner()
@@ -111,7 +112,8 @@ class MosaicFiles:
         flip = self._settings.flip
         if flip in QUARTER_TURNS:
             return np.rot90(values, -1 if flip == "90" else 1)
-        size, across = SENSOR_SIZES[self._sensor], values.shape
+        size = SENSOR_SIZES[self._sensor]
+        across = values.shape
         if across[0] > size[1] and across[0] <= size[0] and across[1] <= size[1]:
             raise PolarguideError(
                 where,

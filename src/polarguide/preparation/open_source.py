@@ -92,7 +92,8 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
             kind = "filter" if several else "mosaic"
             if kind == "mosaic" and settings.sensor is None:
                 _require_photographs(root)
-                kind, settings = "singles", replace(settings, angles="none")
+                kind = "singles"
+                settings = replace(settings, angles="none")
                 assumed = (_ORDINARY,)
     check_format(settings, kind)
     if kind == "filter":
@@ -194,7 +195,7 @@ def _require_photographs(root: Path) -> None:
 
 
 def _is_colored(path: Path) -> bool:
-    """Whether a picture has colors, which mosaics have not."""
+    """True where a picture has colors. Mosaics have none."""
     if is_camera_raw(path):
         return True
     pixels = decode_picture(path, read_picture(path))

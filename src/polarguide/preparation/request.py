@@ -26,7 +26,7 @@ _BLOCK = 1 << 20
 
 
 class FileStamp(msgspec.Struct, frozen=True, array_like=True):
-    """What is noted of a file.
+    """Identity of a file.
 
     Attributes:
         size: bytes. time: of its last change (ns); one that is unchanged is not read again.
@@ -59,7 +59,7 @@ def request_of(
     paths: Iterable[Path],
     model: Iterable[Path],
 ) -> dict[str, Any]:
-    """What must not change between the calls that write one scene.
+    """Values that must not change between the calls that write one scene.
 
     Args:
         root: folder of the capture. earlier: records of earlier calls, whose digests of unchanged files are taken.
@@ -94,7 +94,8 @@ def _stamps(files: Mapping[str, Path], known: Mapping[str, FileStamp]) -> dict[s
     stamps = {}
     for name, path in files.items():
         status, before = path.stat(), known.get(name)
-        size, time = status.st_size, status.st_mtime_ns
+        size = status.st_size
+        time = status.st_mtime_ns
         unchanged = before is not None and before.digest and (before.size, before.time) == (size, time)
         digest = before.digest if before is not None and unchanged else _digest(path)
         stamps[name] = msgspec.to_builtins(FileStamp(size, time, digest))
@@ -123,7 +124,8 @@ def first_difference(before: dict[str, Any], now: dict[str, Any]) -> tuple[str, 
             continue
         if part not in (*_PARTS, "settings"):
             return part, str(old.get(part)), str(new.get(part))
-        of_old, of_new = old[part], new[part]
+        of_old = old[part]
+        of_new = new[part]
         keys = sorted(of_old.keys() | of_new.keys())
         key = next(k for k in keys if (k in of_old) != (k in of_new) or of_old[k] != of_new[k])
         if part == "settings":

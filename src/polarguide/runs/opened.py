@@ -202,12 +202,12 @@ class OpenedRun:
 
     @property
     def scene_is_there(self) -> bool:
-        """Whether the scene is at hand, or in its folder."""
+        """True where the scene is in memory or in its folder."""
         return self._holds_scene or self.scene_folder.is_dir()
 
     @property
     def new_place(self) -> str:
-        """What to do where the scene was moved, for people."""
+        """The remedy for a scene that was moved."""
         return f"If it was moved, say where it is: {command('present', self.folder, '--scene', 'NEWPLACE')}."
 
     def point_to(self, scene: PathLike) -> None:
@@ -265,7 +265,7 @@ class OpenedRun:
 
     @property
     def has_masks(self) -> bool:
-        """Whether the scene has masks of the foreground.
+        """True where the scene has masks of the foreground.
 
         Raises:
             PolarguideError: the scene is not there any more.

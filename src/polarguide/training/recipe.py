@@ -199,7 +199,7 @@ class Method(ABC):
         return self
 
     def differs(self, data: Mapping[str, Any]) -> bool:
-        """Whether a value is another than in what a run's folder has of the recipe, as far as that goes.
+        """True where a value differs from the one that a run's folder records; values that it lacks count as equal.
 
         Its description is no value.
         """
@@ -271,7 +271,7 @@ class Recipe(Method):
         ]
         wrong_rates = [f"{name} = {rate!r}" for name, rate in factors if not _is_rate(rate)]
         named = {name for stage in self.stages for name in stage.rate_factors}
-        where, remedy = f"recipe {self.name}", _REMEDY
+        where = f"recipe {self.name}"
         for wrong, expected, found in (
             (abs(share - 1) > 1e-6, "stages whose fractions add up to 1", f"{share:g}"),
             ("means" not in self.rates, "a rate of the means", f"{[*self.rates]}"),
@@ -288,7 +288,7 @@ class Recipe(Method):
             ),
         ):
             if wrong:
-                raise PolarguideError(where, expected=expected, found=found, remedy=remedy)
+                raise PolarguideError(where, expected=expected, found=found, remedy=_REMEDY)
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:

@@ -54,7 +54,7 @@ REACH = 1e4  # how far a camera goes from the scene, as a multiple of the camera
 
 
 EVERYWHERE = ("0.0.0.0", "::")
-"""What stands for all addresses of the machine."""
+"""Hosts that stand for all addresses of the machine."""
 
 
 def viewing_address(host: str, port: int) -> str:

@@ -101,7 +101,7 @@ _LONGEST_NAME = 4096
 def check_model_files(folder: Path, kind: str) -> None:
     """Check the files of a model, of suffix ``kind``; missing files are skipped.
 
-    Of text files, which pycolmap checks itself, only decimal commas and the colors of points are looked for.
+    pycolmap checks text files itself. Only decimal commas and the colors of points are searched for there.
 
     Raises:
         PolarguideError: a file is truncated, damaged, or has trailing bytes.

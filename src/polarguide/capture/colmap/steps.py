@@ -83,7 +83,8 @@ def place(
     options = _pipeline_options(seed)
     options.min_model_size = LEAST_VIEWS
     if weak:
-        options.min_num_matches, options.mapper.init_min_num_inliers = _WEAK_PAIR, _WEAK_START
+        options.min_num_matches = _WEAK_PAIR
+        options.mapper.init_min_num_inliers = _WEAK_START
         options.mapper.abs_pose_min_num_inliers = _WEAK_POSE
     options.ba_refine_focal_length = options.ba_refine_extra_params = free
     placed: list[None] = []

@@ -354,7 +354,8 @@ def camera_groups(paths: Mapping[str, Path]) -> dict[str, Lens]:
     alike: list[Lens] = []
     groups: dict[str, Lens] = {}
     for view in sorted(lenses, key=lambda view: (lenses[view].camera, lenses[view].focal or 0.0, view)):
-        lens, last = lenses[view], alike[-1] if alike else None
+        lens = lenses[view]
+        last = alike[-1] if alike else None
         same = last is not None and lens.camera == last.camera
         if same and last is not None and lens.focal and last.focal:
             same = lens.focal < (1 + _FOCAL_AGREES) * last.focal

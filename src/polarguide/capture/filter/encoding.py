@@ -27,7 +27,7 @@ from polarguide.capture.formats.pictures import is_lossy, linear_codes, read_pic
 from polarguide.core.errors import PolarguideError, optional_import
 
 SRGB_EXPONENT = 2.22
-"""Of sRGB at half scale."""
+"""Exponent of sRGB at half scale."""
 _CHARACTERISTICS = {
     **dict.fromkeys((1, 6, 7, 13, 14, 15), SRGB_EXPONENT),
     4: 2.2,
@@ -64,7 +64,9 @@ def stated_encoding(data: bytes) -> Encoding | None:
     TransferFunction of TIFF, else gamma and color space of EXIF: a more specific statement goes first, as in the
     standard of PNG.
     """
-    characteristics, profile, rest = None, None, None
+    characteristics = None
+    profile = None
+    rest = None
     # A statement that cannot be read states nothing: Pillow, tifffile and pillow-heif raise what they please.
     with contextlib.suppress(Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -88,7 +90,7 @@ def stated_encoding(data: bytes) -> Encoding | None:
 
 
 def _of_png(info: Mapping[str | tuple[int, int], Any]) -> Encoding | None:
-    """What the chunks sRGB and gAMA say, as Pillow reads them."""
+    """The encoding that the chunks sRGB and gAMA state, as Pillow reads them."""
     if "srgb" in info:
         return Encoding(SRGB_EXPONENT, "an sRGB chunk")
     gamma = info.get("gamma")

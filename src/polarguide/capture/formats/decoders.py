@@ -367,7 +367,8 @@ def tiff_full_scale(file: tifffile.TiffFile) -> int | None:
     value that occurs.
     """
     page = file.pages.first
-    kind, bits = page.dtype, int(page.bitspersample)
+    kind = page.dtype
+    bits = int(page.bitspersample)
     if kind is None or kind.kind != "u" or bits == 1 or page.photometric == _PALETTE:
         return None
     stated = page.tags.valueof(_LARGEST, 0)

@@ -301,7 +301,7 @@ def is_lossy(path: Path) -> bool:
 
 
 def _loses_detail(data: bytes) -> bool:
-    """Whether the compression of a picture changes its values; by its content, whatever its suffix."""
+    """True where the compression of a picture changes its values. The content decides, not the suffix."""
     if is_webp(data):
         return any(kind == b"VP8 " for kind, _, _ in webp_chunks(data))
     if data[:4] in (*TIFF, *BIG_TIFF):

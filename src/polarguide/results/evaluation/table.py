@@ -251,7 +251,7 @@ def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> li
 
 
 def explained(record: Mapping[str, Any]) -> list[str]:
-    """What is more to say of metrics that a table calls "n/a", a line each."""
+    """Explanations of metrics that a table calls "n/a", a line each."""
     lines = []
     for metric in METRICS:
         more = str(record.get(f"{metric.key}_reason") or "").partition(": ")[2]

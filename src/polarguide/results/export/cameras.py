@@ -25,7 +25,8 @@ def write_cameras(run: OpenedRun, presented: Presented, folder: Path, reporter: 
     Raises:
         PolarguideError: pictures or a model of somebody else lie there.
     """
-    model, images = folder / "sparse" / "0", folder / IMAGES
+    model = folder / "sparse" / "0"
+    images = folder / IMAGES
     for place in (model, images):
         require_inside(folder, place)
         if place.is_dir() and holds_files(place) and not (folder / TRANSFORMS).exists():
@@ -35,7 +36,8 @@ def write_cameras(run: OpenedRun, presented: Presented, folder: Path, reporter: 
                 found="other files",
                 remedy="Give another --out.",
             )
-    scene, placement = run.scene, presented.placement
+    scene = run.scene
+    placement = presented.placement
     make_folder(images)
     color = presented.presentation.color
     with reporter.track("photographs", len(scene.views)) as advance:

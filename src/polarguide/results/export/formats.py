@@ -131,7 +131,7 @@ def export(
         raise PolarguideError("fields", expected=expected, found=fields, remedy="Leave it out.")
     if format in SPLATS:
         run.gaussian_model(f"format {format}")
-    # What shows no Gaussians says nothing of how many there are.
+    # Formats without Gaussians print no number of them.
     heard = SILENT if format in ("environment", "cameras") else reporter
     presented = Presented(run, axes=axes, masked=model.masked, reporter=heard)
     make_folder(folder)

@@ -96,7 +96,7 @@ def asset_record(placement: Placement, origin: Origin) -> dict[str, Any]:
 
 
 DIELECTRIC = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-"""Of glTF: what shows vertex colors as a diffuse surface."""
+"""Material of glTF that shows vertex colors as a diffuse surface."""
 OPAQUE = 0.5
 FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
     (name, "u1") for name in ("red", "green", "blue")

@@ -80,7 +80,8 @@ class Presented:
 
     def _choose(self, model: GaussianModel, run: OpenedRun, reporter: Reporter) -> None:
         """Take the Gaussians of the subject."""
-        gaussians, footprints = model.state.gaussians, model.state.footprints
+        gaussians = model.state.gaussians
+        footprints = model.state.footprints
         inside = self.subject.holds(gaussians["means"])
         kept = int(inside.sum())
         if not kept:

@@ -204,7 +204,7 @@ LAYERS = ("final", "diffuse", "specular", "base", "strength", "normal", "metalne
 
 
 class Words(NamedTuple):
-    """What the page says of a layer: its name on the button, a sentence, and what the ends of its colors mean."""
+    """Texts of a layer on the page: the name on its button, a sentence, and the meaning of both ends of its colors."""
 
     label: str
     sentence: str

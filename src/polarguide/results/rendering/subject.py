@@ -25,7 +25,7 @@ Inside = Callable[[NDArray[Any]], NDArray[np.bool_]]
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What is shown of a scene.
+    """The part of a scene that is shown.
 
     Attributes:
         inside: what belongs to it; None: everything. words: what that is, for people.
@@ -94,7 +94,7 @@ def subject_of(run: OpenedRun, *, masked: bool = False) -> Subject:
 
 
 def part_shown(run: OpenedRun, reporter: Reporter) -> Within | None:
-    """What a film shows of a run, as renderings take it; None: all, as of a field, of which every ray asks.
+    """The part of a run that a film shows, as renderings take it; None: all, as for a field.
 
     Args:
         run: the run. reporter: receives the line of ``Subject``.
