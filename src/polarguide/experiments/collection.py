@@ -151,6 +151,8 @@ def source_digest(folder: Path, earlier: Request | None, stamp: tuple[int, int, 
         return earlier.digest
     whole = hashlib.sha256()
     for path in sorted(_files_below(folder)):
+        if not os.path.isfile(path):
+            continue  # reading a pipe may never end
         with contextlib.suppress(OSError), open(path, "rb") as file:
             whole.update(f"{canonical(os.path.relpath(path, folder))}\0".encode("utf-8", "surrogateescape"))
             while block := file.read(_BLOCK):

@@ -103,10 +103,16 @@ def _stamps(files: Mapping[str, Path], known: Mapping[str, FileStamp]) -> dict[s
 
 
 def _digest(path: Path) -> str:
+    """SHA-256 of a file; "" of a pipe, a device and an unreadable file, which its reader refuses."""
     digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        while block := file.read(_BLOCK):
-            digest.update(block)
+    if not path.is_file():
+        return ""
+    try:
+        with open(path, "rb") as file:
+            while block := file.read(_BLOCK):
+                digest.update(block)
+    except OSError:
+        return ""
     return digest.hexdigest()
 
 
