@@ -57,7 +57,7 @@ class Listener(polarguide.Reporter):
     @contextlib.contextmanager
     def track(self, label: str, total: int | None) -> Iterator[Advance]:
         def advance(
-            done: int, *, total: int | None = None, note: str = "", left: float | None = None
+            done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
         ) -> None:
             self.tracked[label] = (done, note)
 

@@ -16,7 +16,17 @@ from rich.console import Console
 from polarguide import __version__
 from polarguide.cli import console
 from polarguide.cli.app import VERBS, function_of, options_of, run
-from polarguide.cli.console import ConsoleReporter, JobReporter, Lines, bars, say, size_text, warnings_printed
+from polarguide.cli.console import (
+    UNKNOWN_TIME,
+    ConsoleReporter,
+    JobReporter,
+    Lines,
+    Rate,
+    bars,
+    say,
+    size_text,
+    warnings_printed,
+)
 from polarguide.cli.runs import _errors, print_scores
 from polarguide.core.errors import PolarguideWarning
 from polarguide.core.text import printable
@@ -141,13 +151,13 @@ def test_eighty_columns_hold_step_total_and_time_left(monkeypatch: pytest.Monkey
     terminal = Console(file=screen, force_terminal=True, width=80, highlight=False, color_system=None)
     monkeypatch.setattr(console, "console", terminal)
     display = bars()
-    task = display.add_task("training stage all of them", total=50000, note="")
+    task = display.add_task("training stage all of them", total=50000, note="", left=UNKNOWN_TIME)
     display.update(task, completed=100, note="all  loss 0.0312  31,415 Gaussians  step 0.123 s  and more yet")
     terminal.print(display.get_renderable())
     (line,) = [line for line in screen.getvalue().splitlines() if line.strip()]
     assert len(line) <= 80
     assert "100/50000" in line
-    assert "-:--:--" in line  # nothing is known of the speed yet
+    assert "-:--:--" in line
     assert "loss 0.0312" in line
 
 
@@ -164,16 +174,29 @@ def test_without_a_terminal_a_line_every_so_often(capsys: pytest.CaptureFixture[
     assert said[-1] == "training 1000/1000  loss 1000"
 
 
-def test_the_time_left_follows_from_the_last_minutes(capsys: pytest.CaptureFixture[str]) -> None:
-    """As of a training whose second half looks at pictures of four times the size."""
+@pytest.mark.parametrize("first", [0, 500])
+def test_a_constant_rate_tells_the_time_left_from_a_twentieth_on(first: int) -> None:
+    """Also of a training that is resumed."""
+    rate = Rate(None)
+    total = first + 1000
+    found = {
+        done: rate.left(done, total=total, seconds=40.0 + 0.2 * (done - first))
+        for done in range(first, total + 1, 10)
+    }
+    for done, left in found.items():
+        expected = None if done < first + 50 else pytest.approx(0.2 * (total - done))
+        assert left == expected, done
+
+
+def test_lines_tell_no_time_left_before_a_twentieth(capsys: pytest.CaptureFixture[str]) -> None:
     now = [0.0]
     told = Lines("training", 2000, clock=lambda: now[0])
-    for step in range(0, 1501, 10):
-        now[0] = min(step, 1000) / 10 + max(0, step - 1000)
-        told(step)
+    for step in range(0, 151, 10):
+        now[0] = 3.0 * step
+        told(step, seconds=2.0 * step)  # a third of the time was a pause
     said = capsys.readouterr().out.splitlines()
-    assert "training 900/2000, 0:01:50 left" in said
-    assert said[-1] == "training 1490/2000, 0:08:30 left"
+    assert said[8] == "training 90/2000"
+    assert said[9] == "training 100/2000, 1:03:20 left"
 
 
 # Fields that a verb sets by other options of its own.

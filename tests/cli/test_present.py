@@ -75,7 +75,7 @@ def test_a_scene_s_holds_for_its_runs_which_may_have_others(
 def test_white_is_picked_in_a_photograph_or_is_their_mean(scene: Path) -> None:
     view = polarguide.load_scene(scene, views=["v000"]).views[0]
     gains = torch.tensor(present(scene, "--white-balance", "v000,60.5,80.5").white_balance)
-    color = picking.photograph_color(view, 60.5, 80.5, "")
+    color = picking.photograph_color(view, 60.5, 80.5)
     torch.testing.assert_close(color * gains, color[1].expand(3))
     views = polarguide.load_scene(scene).train_views
     gains = torch.tensor(present(scene, "--white-balance", "gray").white_balance)

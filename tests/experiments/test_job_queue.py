@@ -98,7 +98,7 @@ class Watch(Reporter):
         self.open.add(label)
 
         def advance(
-            done: int, *, total: int | None = None, note: str = "", left: float | None = None
+            done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
         ) -> None:
             assert label in self.open
             self.most = max(self.most, len(self.open) - 1)

@@ -26,7 +26,7 @@ class Heard(Reporter):
         self.tracked.append((label, total, progress))
 
         def advance(
-            done: int, *, total: int | None = None, note: str = "", left: float | None = None
+            done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
         ) -> None:
             progress.append(done)
 

@@ -3,9 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from faults import Fault
@@ -14,17 +12,13 @@ from torch import Tensor
 
 from polarguide.capture import Scene
 from polarguide.core.options import Exposures, SceneOptions, gibibytes
-from polarguide.core.progress import SILENT
 from polarguide.fields.recipe import NeuralRecipe
 from polarguide.fields.state import FieldState
-from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
-from polarguide.runs import forecast as forecasts
+from polarguide.runs import memory_plan
 from polarguide.runs import train as training
-from polarguide.runs.folder import MOST_GAUSSIANS, RunLog, resolve
-from polarguide.runs.forecast import GIBIBYTE, MemoryPlan, plan_field_memory, plan_memory
-from polarguide.training.flat import Flat
-from polarguide.training.recipe import Recipe
+from polarguide.runs.folder import MOST_GAUSSIANS, resolve
+from polarguide.runs.memory_plan import GIBIBYTE, MemoryPlan, plan_field_memory, plan_memory
 from polarguide.training.settings import STEPS, ResolvedSettings, TrainSettings
 
 STOKES = RECIPES["polarguide-stokes"]
@@ -40,7 +34,7 @@ def least(pixels: list[int], gaussians: int) -> float:
 
 
 def test_the_least_that_is_named_suffices_and_less_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forecasts, "resident_memory", lambda: 400_000_000)
+    monkeypatch.setattr(memory_plan, "resident_memory", lambda: 400_000_000)
     for pixels, gaussians in ((SMALL, 100_000), (LARGE, 50_000), (LARGE, MOST_GAUSSIANS)):
         size = least(pixels, gaussians)
         plan = plan_memory(pixels, STOKES, gaussians, limit=size)
@@ -49,7 +43,7 @@ def test_the_least_that_is_named_suffices_and_less_does_not(monkeypatch: pytest.
 
 
 def test_pictures_leave_memory_before_targets_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forecasts, "resident_memory", lambda: 400_000_000)
+    monkeypatch.setattr(memory_plan, "resident_memory", lambda: 400_000_000)
     plans = [plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=limit) for limit in (3.7, 5.0, 8.0, 30.0)]
     assert not plans[0].hold
     assert plans[-1] == MemoryPlan(True, None, plans[-1].peak)
@@ -60,10 +54,10 @@ def test_pictures_leave_memory_before_targets_do(monkeypatch: pytest.MonkeyPatch
 
 
 def test_without_a_limit_what_is_free_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forecasts, "resident_memory", lambda: 400_000_000)
-    monkeypatch.setattr(forecasts, "free_memory", lambda: 10**9)
+    monkeypatch.setattr(memory_plan, "resident_memory", lambda: 400_000_000)
+    monkeypatch.setattr(memory_plan, "free_memory", lambda: 10**9)
     assert not plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=None).hold
-    monkeypatch.setattr(forecasts, "free_memory", lambda: None)
+    monkeypatch.setattr(memory_plan, "free_memory", lambda: None)
     assert plan_memory(LARGE, STOKES, MOST_GAUSSIANS, limit=None).view_bytes is None
 
 
@@ -115,72 +109,6 @@ def test_zero_is_no_setting(name: str) -> None:
     Fault(name, "", "0").raised_by(TrainSettings, **{name: 0})
 
 
-def test_a_forecast_leaves_no_trace_and_a_short_training_has_none(tiny_scene: Scene) -> None:
-    settings = resolve(TrainSettings(600, gaussians=10**6), tiny_scene, STOKES)
-    backend = choose_backend("cpu")
-    found = forecasts.forecast(tiny_scene, STOKES, settings, backend, 10**9)
-    assert 0 < found.seconds < 600
-    assert found.most == 16 * found.gaussians
-    assert "1.0 GB" in found.sentence()
-    assert (
-        forecasts.forecast(tiny_scene, STOKES, resolve(TrainSettings(60), tiny_scene, STOKES), backend, 10**9)
-        is None
-    )
-    assert [forecasts.in_words(s) for s in (3.4, 300, 5400, 7260)] == [
-        "3 s",
-        "5 min",
-        "1 h 30 min",
-        "2 h 01 min",
-    ]
-
-
-def test_the_time_left_follows_stages_priors_growth_and_looks() -> None:
-    """A machine half as fast as forecast, where an event of a minute comes at the tenth part. The Gaussians grow
-    faster at first, reach the limit at four tenths, and three in ten go at the half; looks take seconds."""
-    steps, first, most, limit = 5000, 1000, 9000, 10_000
-    assert isinstance(STOKES, Recipe)
-    priors = np.zeros(steps, bool)
-    priors[500:560] = priors[2500:2560] = True
-    least = np.where(np.arange(steps) < 500, 0.01, 0.02) + 0.05 * priors
-    looks = np.isin(np.arange(steps), (2000, 3000, 3500))
-    costs = np.stack([least + looks, 2 * least + 9 * looks])
-    expected = forecasts.Forecast(0, 0, first, most, limit, 0, costs, priors)
-    added = np.cumsum(120 * np.minimum(np.arange(1, 26), 5))
-    grown = np.minimum(first + np.append(0, added)[np.arange(steps) // 100 % 26], limit)
-    grown[2500:] = 0.7 * grown[2499]
-    true = 2 * (costs[0] + (costs[1] - costs[0]) * (grown - first) / (most - first))
-    left = forecasts.TimeLeft(expected, STOKES)
-    for done in range(10, steps, 10):
-        event = 60.0 if done == 510 else 0.0
-        found = left.take(done, int(grown[done - 1]), float(true[done - 10 : done].sum()) + event)
-        if done > 100:  # one round of the density control was seen
-            assert found == pytest.approx(true[done:].sum(), rel=0.1), done
-
-
-def test_what_is_found_once_of_all_views_is_found_once(
-    tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The forecast finds it, the training takes it over and counts its seconds."""
-    clock, calls = 0.0, 0
-
-    def slow(views: object, index: float, rules: object) -> dict[str, Flat]:
-        nonlocal clock, calls
-        clock += 1000.0
-        calls += 1
-        return {}
-
-    monkeypatch.setattr("polarguide.training.feed.flat_surfaces", slow)
-    ticking = SimpleNamespace(perf_counter=lambda: clock, process_time=lambda: clock)
-    monkeypatch.setattr(forecasts, "time", ticking)
-    monkeypatch.setattr(forecasts, "LEAST_STEPS", 30)
-    lines: list[str] = []
-    reporter = SimpleNamespace(say=lines.append, warn=lines.append, track=SILENT.track)
-    training.train(tiny_scene, tmp_path / "run", recipe=STOKES, settings=TrainSettings(40), reporter=reporter)  # type: ignore[arg-type]
-    assert calls == 1
-    assert [line for line in lines if line.startswith("took 17 min")]
-    assert RunLog(tmp_path / "run").elapsed()[0] == 1000.0
-
-
 def test_options_take_a_limit() -> None:
     assert SceneOptions(memory=2.5).memory == 2.5
     assert SceneOptions().memory is None
@@ -188,7 +116,7 @@ def test_options_take_a_limit() -> None:
 
 
 def test_a_field_is_planned_for_by_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forecasts, "resident_memory", lambda: 400_000_000)
+    monkeypatch.setattr(memory_plan, "resident_memory", lambda: 400_000_000)
     field = RECIPES["gnerp"]
     assert isinstance(field, NeuralRecipe)
     learned = 4 * field.numbers
@@ -219,12 +147,3 @@ def test_other_exposures_leave_the_pictures_in_their_files(
         assert held == [hold] * len(held)
         means.append(run.gaussians["means"])
     assert torch.equal(*means)
-
-
-def test_priors_are_counted_by_step() -> None:
-    """Where the size changes they are all made once more."""
-    settings = ResolvedSettings(steps=1000, refractive_index=1.5)
-    whole = forecasts._priors_made(STOKES, settings, 10, 0)
-    halved = forecasts._priors_made(STOKES, settings, 10, 430)
-    assert sum(halved[:430]) > 0
-    assert sum(halved) == sum(whole) + 10

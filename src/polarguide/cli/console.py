@@ -7,16 +7,14 @@ import importlib
 import re
 import time
 import warnings
-from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Column
-from rich.text import Text
 
 import polarguide
 from polarguide.core.errors import PolarguideWarning
@@ -82,27 +80,53 @@ def use_threads(threads: int) -> None:
 
 LINE_SECONDS = 15.0
 """Between two lines of progress where there is no terminal."""
-SPEED_SECONDS = 180.0
-"""The speed of so long tells the time left: of a training whose pictures grow, the steps of the beginning are cheap."""
+MEASURED = 0.05
+"""Share of the steps that is measured before their rate tells the time left."""
+UNKNOWN_TIME = "-:--:--"
 
 
-class _RemainingTime(TimeRemainingColumn):
-    """The time left as the work itself says, or by its speed."""
+class Rate:
+    """Measures how fast a piece of work advances, from the first report on.
 
-    def render(self, task: Task) -> Text:
-        """A time as of the superclass."""
-        left = task.fields.get("left")
-        return super().render(task) if left is None else Text(_clock(left), style="progress.remaining")
+    Args:
+        total: how much there is to do; None where that is not known yet.
+        clock: gives the seconds of a report that does not state them.
+
+    Attributes:
+        total: as above, or as a report has stated since.
+    """
+
+    def __init__(self, total: int | None, clock: Callable[[], float] = time.monotonic) -> None:
+        self.total, self._clock = total, clock
+        self._first: tuple[float, int] | None = None
+
+    def left(self, done: int, total: int | None = None, seconds: float | None = None) -> float | None:
+        """Seconds that the remaining steps take at the rate so far; None before it is measured.
+
+        Args:
+            done, total, seconds: see ``core.progress.Advance``.
+        """
+        self.total = total or self.total
+        now = self._clock() if seconds is None else seconds
+        if self._first is None:  # a training that is resumed does not begin at step 0
+            self._first = (now, done)
+        begin, first = self._first
+        steps = done - first
+        if self.total is None or steps <= 0 or steps < MEASURED * (self.total - first):
+            return None
+        return (now - begin) / steps * max(0, self.total - done)
 
 
-def _clock(seconds: float) -> str:
+def _clock(seconds: float | None) -> str:
     """Hours, minutes and seconds."""
+    if seconds is None:
+        return UNKNOWN_TIME
     whole = round(seconds)
     return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 
 
-def bars(memory_seconds: float = 30.0) -> Progress:
-    """A display of progress bars; the time left follows from the speed of the last seconds.
+def bars() -> Progress:
+    """A display of progress bars; a bar has the fields ``note`` and ``left``.
 
     Step, total and time left are always shown; label and note share what room is left, and are cut.
     """
@@ -112,12 +136,11 @@ def bars(memory_seconds: float = 30.0) -> Progress:
         TextColumn("{task.description}", markup=False, table_column=label),
         BarColumn(bar_width=10),
         MofNCompleteColumn(table_column=Column(no_wrap=True)),
-        _RemainingTime(table_column=Column(no_wrap=True)),
+        TextColumn("{task.fields[left]}", style="progress.remaining", table_column=Column(no_wrap=True)),
         TextColumn("{task.fields[note]}", markup=False, table_column=note),
         console=console,
         transient=True,
         expand=True,
-        speed_estimate_period=memory_seconds,
     )  # fmt: skip
 
 
@@ -125,27 +148,19 @@ class Lines:
     """Progress of one piece of work as lines, for logs: not more often than every ``LINE_SECONDS``."""
 
     def __init__(self, label: str, total: int | None, clock: Callable[[], float] = time.monotonic) -> None:
-        self._label, self._total, self._clock = label, total, clock
+        self._label, self._clock = label, clock
+        self._rate = Rate(total, clock)
         self._last = clock()
-        self._progress: deque[tuple[float, int]] = deque()  # when how much was done, about once a second
         self._line = ""
 
     def __call__(
-        self, done: int, *, total: int | None = None, note: str = "", left: float | None = None
+        self, done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
     ) -> None:
         """See ``core.progress.Advance``."""
         now = self._clock()
-        self._total = total or self._total
-        if not self._progress or now - self._progress[-1][0] >= 1:
-            self._progress.append((now, done))
-        while len(self._progress) > 2 and now - self._progress[1][0] >= SPEED_SECONDS:
-            self._progress.popleft()
-        begin, first = self._progress[0]  # a training that goes on does not begin at 0
-        finished = self._total is not None and done >= self._total
-        if left is None and self._total is not None and done > first:
-            left = (now - begin) * (self._total - done) / (done - first)
-        time_left = "" if left is None or finished else f", {_clock(left)} left"
-        of = "" if self._total is None else f"/{self._total}"
+        left = self._rate.left(done, total, seconds)
+        time_left = f", {_clock(left)} left" if left else ""
+        of = "" if self._rate.total is None else f"/{self._rate.total}"
         self._line = f"{self._label} {done}{of}{time_left}" + (f"  {note}" if note else "")
         if now - self._last >= LINE_SECONDS:
             self._last = now
@@ -182,12 +197,14 @@ class ConsoleReporter(Reporter):
                 yield tell
             return
         with bars() as progress:
-            task = progress.add_task(label, total=total, note="", left=None)
+            task = progress.add_task(label, total=total, note="", left=UNKNOWN_TIME)
+            rate = Rate(total)
 
             def advance(
-                done: int, *, total: int | None = None, note: str = "", left: float | None = None
+                done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
             ) -> None:
                 progress.live.transient = not note
+                left = _clock(rate.left(done, total, seconds))
                 progress.update(task, completed=done, total=total, note=note, left=left)
 
             yield advance
@@ -199,10 +216,10 @@ def lines(label: str, total: int | None) -> Iterator[Advance]:
     printer = Lines(label, total)
     noted = False
 
-    def advance(done: int, *, total: int | None = None, note: str = "", left: float | None = None) -> None:
+    def advance(done: int, *, total: int | None = None, note: str = "", seconds: float | None = None) -> None:
         nonlocal noted
         noted = bool(note)
-        printer(done, total=total, note=note, left=left)
+        printer(done, total=total, note=note, seconds=seconds)
 
     try:
         yield advance
@@ -210,16 +227,12 @@ def lines(label: str, total: int | None) -> Iterator[Advance]:
         printer.close(last=noted)
 
 
-# Trainings log every tenth step and recipes differ in speed: a long memory keeps the time left from jumping.
-MEMORY_SECONDS = 300.0
-
-
 class JobReporter(ConsoleReporter):
     """Prints as ``ConsoleReporter``, with one display for all bars that are open together."""
 
     def __init__(self) -> None:
         self._open = 0
-        self._progress = bars(MEMORY_SECONDS)
+        self._progress = bars()
 
     @contextlib.contextmanager
     def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
@@ -231,11 +244,13 @@ class JobReporter(ConsoleReporter):
         if not self._open:
             self._progress.start()
         self._open += 1
-        task = self._progress.add_task(label, total=total, note="", left=None)
+        task = self._progress.add_task(label, total=total, note="", left=UNKNOWN_TIME)
+        rate = Rate(total)
 
         def advance(
-            done: int, *, total: int | None = None, note: str = "", left: float | None = None
+            done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
         ) -> None:
+            left = _clock(rate.left(done, total, seconds))
             self._progress.update(task, completed=done, total=total, note=note, left=left)
 
         try:

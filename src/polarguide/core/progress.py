@@ -11,14 +11,15 @@ class Advance(Protocol):
     """Records how much of a piece of work is done."""
 
     def __call__(
-        self, done: int, *, total: int | None = None, note: str = "", left: float | None = None
+        self, done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
     ) -> None:
-        """``done`` so far, of ``total`` if that has become known, and a few words about it; ``left``: the seconds that
-        it still takes, where more is known of them than the speed so far.
+        """``done`` so far, of ``total`` if that has become known, and a few words about it.
+
+        ``seconds``: on a clock that stands still during pauses; None: there are no pauses.
         """
 
 
-def _ignore(done: int, *, total: int | None = None, note: str = "", left: float | None = None) -> None:
+def _ignore(done: int, *, total: int | None = None, note: str = "", seconds: float | None = None) -> None:
     pass
 
 

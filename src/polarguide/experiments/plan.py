@@ -32,7 +32,7 @@ from polarguide.results.evaluation.record import code_digest, model_digest, read
 from polarguide.results.evaluation.target import SceneFacts
 from polarguide.runs.families import family_of
 from polarguide.runs.folder import CONFIGURATION, RunConfiguration, compared_steps, trained_steps
-from polarguide.runs.forecast import pixels_of
+from polarguide.runs.memory_plan import pixels_of
 from polarguide.runs.opened import read_scene
 from polarguide.runs.train import expected_memory
 from polarguide.training.recipe import Method, Recipe

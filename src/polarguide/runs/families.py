@@ -23,8 +23,8 @@ from polarguide.fields.recipe import NeuralRecipe
 from polarguide.fields.trainer import FieldTrainer
 from polarguide.raster import Backend
 from polarguide.runs.folder import CHECKPOINT, PLY
-from polarguide.runs.forecast import Forecast, MemoryPlan, forecast, plan_field_memory, plan_memory
 from polarguide.runs.health import Evidence, Polarization
+from polarguide.runs.memory_plan import MemoryPlan, plan_field_memory, plan_memory
 from polarguide.runs.model import GaussianModel, Model, write_run_ply
 from polarguide.runs.painted import FOLDER
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers, predicts_filters
@@ -225,12 +225,6 @@ class Family(ABC):
     ) -> AnyTrainer:
         """The trainer; it reports its assumptions about the scene."""
 
-    def forecast(
-        self, scene: Scene, method: Any, settings: ResolvedSettings, backend: Backend, peak: int
-    ) -> Forecast | None:
-        """The expected time of the training; None: it is not estimated."""
-        return None
-
     @abstractmethod
     def model(self, state: Any, method: Any, settings: ResolvedSettings, backend: Backend) -> Model:
         """The trained model, for scoring and viewing."""
@@ -299,12 +293,6 @@ class GaussianFamily(Family):
         if trainer.polarizers.ignored:
             reporter.warn(_ignored(method))
         return trainer
-
-    def forecast(
-        self, scene: Scene, method: Recipe, settings: ResolvedSettings, backend: Backend, peak: int
-    ) -> Forecast | None:
-        """See ``Family``."""
-        return forecast(scene, method, settings, backend, peak)
 
     def model(
         self, state: Any, method: Recipe, settings: ResolvedSettings, backend: Backend

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import time
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
@@ -22,7 +21,7 @@ from polarguide.core.files import check_out, make_folder
 from polarguide.core.options import PathLike, SceneOptions, SessionOptions
 from polarguide.core.progress import SILENT, Advance, Reporter
 from polarguide.core.records import first_difference
-from polarguide.core.system import MemoryBound, return_freed_memory
+from polarguide.core.system import MEBIBYTE, MemoryBound, peak_memory_mib, return_freed_memory
 from polarguide.raster import Backend, use_threads
 from polarguide.recipes import recipe_named
 from polarguide.runs.families import AnyTrainer, Family, family_of
@@ -37,11 +36,11 @@ from polarguide.runs.folder import (
     save_checkpoint,
     writing_to,
 )
-from polarguide.runs.forecast import MemoryPlan, Stopwatch, TimeLeft, pixels_of
 from polarguide.runs.health import examine
+from polarguide.runs.memory_plan import MemoryPlan, in_gigabytes, pixels_of
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.runs.painted import read_painted
-from polarguide.training.angles.trainer import AngleTrainer
+from polarguide.runs.stopwatch import Stopwatch, in_words
 from polarguide.training.distributed import Ranks, backend_of, process_group
 from polarguide.training.feed import ViewStore
 from polarguide.training.losses import refuse_diverged
@@ -144,12 +143,7 @@ def train(
                 family.go_back(state, chosen, resolved, out, reporter)
                 if state is not None and leads:
                     save_checkpoint(out, state)  # before run.json says that what was painted is in it
-        expected = None
-        if ranks.world == 1 and not resume:
-            expected = family.forecast(loaded, chosen, resolved, backend, plan.peak)
-            if expected is not None:
-                reporter.say(expected.sentence())
-        return_freed_memory()  # of decoded files, and of what was only measured
+        return_freed_memory()  # of decoded files
         store = locked.enter_context(closing(_store(plan, backend, out, reporter)))
         bound = MemoryBound(plan.peak)
         trainer = family.trainer(loaded, chosen, resolved, backend, state, ranks, store, reporter, bound)
@@ -161,14 +155,9 @@ def train(
                     if problem := _unsuitable(out, resume):  # another training has begun meanwhile
                         raise problem
                 configuration.save(out)
-            left = None
-            if expected is not None and isinstance(trainer, AngleTrainer) and not trainer.begins_again:
-                left = TimeLeft(expected, trainer.recipe)
-                trainer.flat.update(expected.flat)
-            seconds = _Loop(trainer, out, session, reporter, should_stop, look, bound, left).run()
+            seconds = _Loop(trainer, out, session, reporter, should_stop, look, bound).run()
         model = family.model(trainer.state, chosen, resolved, backend)
-        if expected is not None:
-            reporter.say(expected.truth(seconds))
+        reporter.say(_taken(seconds, plan.peak))
         if leads:
             finished = _Warned(reporter)
             family.finish(out, trainer, model, finished)
@@ -180,6 +169,13 @@ def train(
             health.save(out)
             reporter.say(f"{health.summary}; polarization: {health.polarization.text}")
     return OpenedRun(out, configuration, chosen, model, scene=whole, reporter=reporter)
+
+
+def _taken(seconds: float, planned: int) -> str:
+    """Time and memory that a training took, and the bytes of memory that were planned."""
+    peak = peak_memory_mib()
+    memory = "" if peak is None else f" and {in_gigabytes(int(peak * MEBIBYTE))} of memory"
+    return f"took {in_words(seconds)}{memory} (planned: up to {in_gigabytes(planned)})"
 
 
 class _Warned(Reporter):
@@ -207,23 +203,21 @@ class _Loop:
         should_stop: Ends,
         look: Look | None,
         memory: MemoryBound,
-        left: TimeLeft | None,
     ) -> None:
-        self._left = left
         self._trainer, self._out, self._session, self._memory = trainer, out, session, memory
         self._reporter, self._should_stop, self._look = reporter, should_stop, look
         self._log = RunLog(out) if trainer.ranks.rank == 0 else None
         if self._log is not None:
             self._log.cut(trainer.state.step)
         seconds, alone = self._log.elapsed() if self._log else (0.0, True)
-        self._stopwatch = Stopwatch(seconds + (left.expected.spent if left else 0.0), alone)
+        self._stopwatch = Stopwatch(seconds, alone)
 
     def run(self) -> float:
         """Train; see ``train``. Returns the seconds that it took."""
         trainer = self._trainer
         with self._reporter.track("training", trainer.total) as advance:
-            meter = _Meter(advance, self._log, self._stopwatch, self._left)
-            advance(trainer.done)
+            meter = _Meter(advance, self._log, self._stopwatch)
+            advance(trainer.done, seconds=self._stopwatch.read()[0])
             try:
                 stopped = self._steps(meter)
             except KeyboardInterrupt:
@@ -269,13 +263,10 @@ class _Meter:
     Reports are looked at ten at a time: on a GPU, looking waits for it.
     """
 
-    def __init__(
-        self, advance: Advance, log: RunLog | None, stopwatch: Stopwatch, left: TimeLeft | None
-    ) -> None:
-        self._advance, self._log, self._stopwatch, self._left = advance, log, stopwatch, left
-        self._read = stopwatch.read()[0]
+    def __init__(self, advance: Advance, log: RunLog | None, stopwatch: Stopwatch) -> None:
+        self._advance, self._log, self._stopwatch = advance, log, stopwatch
         self._loss = self._psnr = math.nan
-        self._began, self._first = time.perf_counter(), -1
+        self._began, self._first = stopwatch.read()[0], -1
         self._waiting: list[StepReport] = []
 
     def take(self, report: StepReport) -> None:
@@ -316,14 +307,11 @@ class _Meter:
             keep = 0.0 if math.isnan(self._loss) else 0.98
             self._loss = loss if keep == 0 else keep * self._loss + (1 - keep) * loss
             self._psnr = psnr if keep == 0 else keep * self._psnr + (1 - keep) * psnr
-        rate = (last.done - self._first) / max(1e-9, time.perf_counter() - self._began)
+        seconds, _ = self._stopwatch.read()
+        rate = (last.done - self._first) / max(1e-9, seconds - self._began)
         count = "" if last.gaussians is None else f"{last.gaussians:,} Gaussians  "
         note = f"{last.stage}  loss {self._loss:.4f}  PSNR {self._psnr:.2f} dB  {count}{rate:.1f} it/s"
-        left = None
-        if self._left is not None and last.gaussians is not None:
-            before, self._read = self._read, self._stopwatch.read()[0]
-            left = self._left.take(last.done, last.gaussians, self._read - before)
-        self._advance(last.done, note=note, left=left)
+        self._advance(last.done, note=note, seconds=seconds)
         return loss, psnr
 
 
@@ -350,7 +338,7 @@ def expected_memory(
     """Bytes that the process of a training takes at most, as far as headers tell.
 
     Args:
-        pixels: of each view, as ``forecast.pixels_of`` reads them. recipe, settings, reading: of the training.
+        pixels: of each view, as ``memory_plan.pixels_of`` reads them. recipe, settings, reading: of the training.
 
     Raises:
         PolarguideError: the limit in ``reading`` is too small.

@@ -260,9 +260,6 @@ class Feed:
         store: keeps what is computed of the views. views: that are trained on. steps: steps of the training.
         black: whether nothing is behind the subject.
         memory: gives back what was freed before and after the priors of a view are made.
-
-    Attributes:
-        flat: flat surfaces of all views, as far as they have been needed, by the size of the pictures.
     """
 
     def __init__(
@@ -281,7 +278,7 @@ class Feed:
         self._store, self._memory, self._until = store, memory, coarse_steps(recipe, views, steps)
         small = SmallerViews(views, recipe.coarse.factor) if self._until else views
         self._views = {"small ": small, "": views}
-        self.flat: dict[str, dict[str, Flat]] = {}
+        self._flat: dict[str, dict[str, Flat]] = {}  # by the size of the pictures, as far as needed
         self._partial: dict[tuple[str, str], PartialView] = {}
 
     def _size(self, step: int) -> str:
@@ -381,12 +378,12 @@ class Feed:
 
     def _flat_surfaces(self, size: str) -> dict[str, Flat]:
         """Flat surfaces of all views, found when the first priors are needed."""
-        if size not in self.flat:
+        if size not in self._flat:
             views = self._views[size] if self._settings.flat else ()
             # On the CPU, so that it is the same wherever one trains.
             surfaces = flat_surfaces(self._memory.between(views), self._index, self._settings.flat_rules)
-            self.flat[size] = {name: flat.to(self._backend.device) for name, flat in surfaces.items()}
-        return self.flat[size]
+            self._flat[size] = {name: flat.to(self._backend.device) for name, flat in surfaces.items()}
+        return self._flat[size]
 
 
 def coarse_steps(recipe: Recipe, views: Sequence[View], steps: int) -> int:

@@ -25,7 +25,6 @@ from polarguide.shading.result import COLOR_CHANNELS, RenderResult
 from polarguide.training.actions import DensityControl, outward_directions, propagate_normals, reset_opacity
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.feed import Feed, ViewStore
-from polarguide.training.flat import Flat
 from polarguide.training.losses import step_loss
 from polarguide.training.metals.observations import index_offsets, numbers_in
 from polarguide.training.metals.search import MetalSearch, refreshes
@@ -92,17 +91,6 @@ class Trainer:
         self._reach = orbit(scene.points.double().numpy(), centers.double().numpy())[1]
         self._rate = math.sqrt(settings.views_per_step)
         self._use_batch_rates()
-
-    @property
-    def flat(self) -> dict[str, dict[str, Flat]]:
-        """Flat surfaces that have been found, as of ``Feed``; what is put there is not looked for."""
-        return self._feed.flat
-
-    def looks(self, step: int) -> tuple[bool, bool, bool]:
-        """Whether a step looks for metals, for the outer sides of normals, and for faint Gaussians."""
-        stage, actions = (position := self.schedule.at(step)).stage, position.actions
-        metals = "refresh_priors" in actions and self._metals.is_due(step)
-        return metals, "orient_normals" in actions, stage.densify and not self._densifies(step + 1)
 
     def undecided(self) -> Tensor | None:
         """Gaussians [N] bool of which polarization cannot tell whether they are metals; see ``MetalSearch``."""

@@ -31,8 +31,8 @@ from polarguide.results.evaluation.scores import ErrorsByObject, ViewScores, sco
 from polarguide.results.evaluation.target import SceneFacts, ViewTarget
 from polarguide.results.rendering.mesh import RESOLUTION, Surface, fused_surface, implicit_surface
 from polarguide.runs.folder import RunLog
-from polarguide.runs.forecast import Stopwatch
 from polarguide.runs.opened import OpenedRun
+from polarguide.runs.stopwatch import Stopwatch
 from polarguide.shading.result import RenderResult
 from polarguide.training.angles.fit import fit_angle
 from polarguide.visualization import figures

@@ -61,16 +61,16 @@ def surface_at(result: RenderResult, camera: Camera, x: float, y: float) -> Surf
     return SurfacePoint(camera.center + depth * ray, normal, color)
 
 
-def photograph_color(view: View, x: float, y: float, where: str) -> Tensor:
+def photograph_color(view: View, x: float, y: float) -> Tensor:
     """The mean color [3] of a photograph's valid pixels around a place, see ``surface_at``.
 
     Raises:
-        PolarguideError: the place lies outside, or no pixel there is valid; ``where`` names the option.
+        PolarguideError: the place lies outside, or no pixel there is valid.
     """
     camera = view.camera
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         raise PolarguideError(
-            where,
+            "white_balance",
             expected=f"a place in {view.name}, which is {camera.width} x {camera.height}",
             found=f"{x:g},{y:g}",
             remedy="Count pixels from the top left corner.",
@@ -79,7 +79,7 @@ def photograph_color(view: View, x: float, y: float, where: str) -> Tensor:
     valid = ~_patch(view.invalid | view.saturated, row, column)
     if not bool(valid.any()):
         raise PolarguideError(
-            where,
+            "white_balance",
             expected="pixels that are neither saturated nor invalid",
             found=f"none around {x:g},{y:g} of {view.name}",
             remedy="Pick a place that is gray or white, but not too bright.",
@@ -93,17 +93,17 @@ def _patch(picture: Tensor, row: int, column: int) -> Tensor:
     return picture[top : row + PATCH + 1, left : column + PATCH + 1]
 
 
-def gains_of(color: Tensor, where: str = "white_balance") -> Vector:
+def gains_of(color: Tensor) -> Vector:
     """Gains that make a linear color [3] gray and leave green as it is, as cameras state their white balance.
 
     Raises:
-        PolarguideError: the color is too dark, clips, or is no gray under any usual light; ``where`` names the option.
+        PolarguideError: the color is too dark, clips, or is no gray under any usual light.
     """
     values = [float(value) for value in color]
     if not (min(values) > 0 and max(values) >= DARKEST and max(values) <= BRIGHTEST):
         listed = ", ".join(f"{value:.3g}" for value in values)
         raise PolarguideError(
-            where,
+            "white_balance",
             expected=f"a color of {DARKEST:g} to {BRIGHTEST:g} of full scale in its brightest channel, none of them 0",
             found=f"R, G, B {listed}",
             remedy="Pick a place that is gray or white, neither dark nor clipped.",
@@ -111,7 +111,7 @@ def gains_of(color: Tensor, where: str = "white_balance") -> Vector:
     gains = [values[1] / value for value in values]
     if not all(LEAST_GAIN <= gain <= MOST_GAIN for gain in gains):
         raise PolarguideError(
-            where,
+            "white_balance",
             expected=f"gains of {LEAST_GAIN:g} to {MOST_GAIN:g}",
             found=", ".join(f"{gain:.3g}" for gain in gains),
             remedy="Pick a place that is gray or white.",

@@ -233,7 +233,7 @@ def _white_balance(text: str, place: _Place) -> Vector | None:
         return gray_world(place.scene.train_views)
     if (pixel := place.pixel(text)) is not None:
         name, x, y = pixel
-        return gains_of(photograph_color(place.scene.view(name), x, y, "white_balance"))
+        return gains_of(photograph_color(place.scene.view(name), x, y))
     expected = "none, gray, three gains such as 1.9,1,1.6, or VIEW,X,Y"
     red, green, blue = _require_numbers(text, 3, "white_balance", expected)
     return red, green, blue

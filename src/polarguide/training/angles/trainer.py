@@ -17,7 +17,6 @@ from polarguide.shading.model import ShadingModel
 from polarguide.training.angles.polarizers import Polarizers, search_steps
 from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.feed import ViewStore
-from polarguide.training.flat import Flat
 from polarguide.training.recipe import Recipe, Schedule
 from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.state import TrainingState
@@ -100,11 +99,6 @@ class AngleTrainer:
     def state(self) -> TrainingState:
         """The state of the current search, or of the training."""
         return self._trainer.state
-
-    @property
-    def flat(self) -> dict[str, dict[str, Flat]]:
-        """As of ``Trainer``."""
-        return self._trainer.flat
 
     def undecided(self) -> Tensor | None:
         """As of ``Trainer``."""

@@ -1,0 +1,155 @@
+"""The memory of a training, planned from the headers of its files before a picture is decoded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from polarguide.capture.layout import (
+    GIBIBYTE,
+    KEPT,
+    MASKS,
+    READ,
+    SHARE,
+    find_layout,
+    select_views,
+    stated_pixels,
+)
+from polarguide.core.errors import PolarguideError
+from polarguide.core.system import free_memory, resident_memory
+from polarguide.fields.recipe import NeuralRecipe
+from polarguide.training.recipe import Recipe
+
+GIGABYTE = 10**9
+# Estimates by the tensors that there are: one training (24 steps, 1224 x 1024 x 60, 4 GB) took 12 % less than they say.
+# benchmarks/speed/memory.py measures.
+PROCESS = 250_000_000
+"""Bytes that a process takes beside what it holds before training: of libraries, and what the allocator splits."""
+STEP = 780
+"""Bytes a pixel of a step: targets, G-buffer, layers, terms, and their gradients."""
+PRIORS = 900
+"""Bytes a pixel while the priors of a view are computed."""
+PRIORS_KEPT, SHOWN_KEPT, UNGUIDED_KEPT = 44, 8, 13
+"""Bytes a pixel of what is kept of a view: targets, photograph with masks, and what of the targets needs no guide."""
+COPIES, WRITTEN = 5, 4
+"""Of a Gaussian's parameters: values, gradients, two moments, frozen; and those in the file that is written."""
+SPLAT = 600
+"""Bytes a Gaussian of what a rasterizer makes of it."""
+FILLED = 0.88
+"""Of a limit, up to which views are kept in memory; the rest is for gaps between what is used."""
+FIELD_COPIES = 5
+"""Of what a field learns: values, gradients, two moments, and those in the file that is written."""
+SAMPLE, READ_VIEW, TARGET_KEPT = 14_000, 60, 10
+"""Bytes a sample of a field's step, a pixel of the view it looks at, and a pixel of what is kept of each view."""
+
+
+@dataclass(frozen=True)
+class MemoryPlan:
+    """How a training stays within its memory.
+
+    Attributes:
+        hold: whether the pictures stay in memory; otherwise views decode theirs again.
+        view_bytes: of what is computed of the views and stays in memory, the rest lies in a file; None: all stays.
+        peak: bytes that the process takes at most.
+    """
+
+    hold: bool
+    view_bytes: int | None
+    peak: int
+
+
+def plan_memory(
+    pixels: Sequence[int], recipe: Recipe, gaussians: int, *, limit: float | None, in_memory: bool = False
+) -> MemoryPlan:
+    """Share out memory among a training's step, its Gaussians and its views.
+
+    Args:
+        pixels: pixels of each view as it is trained on. recipe: the method. gaussians: most that there may be.
+        limit: GiB that the process may take; None: what is free, but a fifth.
+        in_memory: whether the pictures are in memory already.
+
+    Raises:
+        PolarguideError: a limit that was given is too small; the message has the least that suffices.
+    """
+    largest = max(pixels, default=0)
+    floats = sum(math.prod(shape) for shape in recipe.shapes.values())
+    guided = any(stage.weights.priors for stage in recipe.stages)
+    of_view = SHOWN_KEPT + (PRIORS_KEPT + UNGUIDED_KEPT if guided else 0)
+    step = (max(STEP, PRIORS) if guided else STEP) * largest + SPLAT * gaussians
+    own = PROCESS + 4 * floats * COPIES * gaussians + max(step, 4 * floats * WRITTEN * gaussians)
+    what = f" and up to {gaussians:,} Gaussians"
+    return _shared(pixels, own, of_view, limit, in_memory, what, "fewer --gaussians, or ")
+
+
+def plan_field_memory(
+    pixels: Sequence[int], recipe: NeuralRecipe, *, limit: float | None, in_memory: bool = False
+) -> MemoryPlan:
+    """The same for a field: ``plan_memory``."""
+    largest = max(pixels, default=0)
+    own = PROCESS + 4 * recipe.numbers * FIELD_COPIES + SAMPLE * recipe.sampling.samples + READ_VIEW * largest
+    return _shared(pixels, own, TARGET_KEPT, limit, in_memory, "", "")
+
+
+def _shared(
+    pixels: Sequence[int], own: int, of_view: int, limit: float | None, in_memory: bool, what: str, less: str
+) -> MemoryPlan:
+    """Share out memory: ``own`` is what a training takes beside its views, ``of_view`` a pixel of what it keeps of
+    them.
+
+    Raises:
+        PolarguideError: a limit that was given is too small; ``what`` it is for beside pictures, ``less`` helps, too.
+    """
+    largest, total = max(pixels, default=0), sum(pixels)
+    now = resident_memory() or 0
+    work = now + own
+    pictures = 0 if in_memory else (KEPT - MASKS) * total
+    masks = 0 if in_memory else (MASKS - 3) * total
+    # The photograph of one view, decoded again, and its targets.
+    least = work + masks + (KEPT + of_view) * largest
+    least = max(least, now + PROCESS + MASKS * total + 4 * READ * largest)
+    whole = work + masks + pictures + of_view * total
+    if limit is not None:
+        allowed = int(limit * GIBIBYTE)
+        if allowed < least:
+            raise too_little(least, allowed, what, less)
+    else:
+        free = free_memory()
+        if free is None:
+            return MemoryPlan(True, None, whole)
+        allowed = now + int(SHARE * free)
+    if whole <= allowed:
+        return MemoryPlan(True, None, whole)
+    filled = int(FILLED * allowed)
+    hold = in_memory or (
+        work + masks + pictures + of_view * largest <= filled and of_view * total <= pictures
+    )
+    room = filled - work - masks - (pictures if hold and not in_memory else KEPT * largest)
+    return MemoryPlan(hold, max(0, room), max(least, min(allowed, whole)))
+
+
+def pixels_of(folder: Path, downscale: int) -> list[int]:
+    """Pixels of each view of a scene at the size that is trained on, as the headers of its files state.
+
+    Raises:
+        PolarguideError: the folder is no scene.
+    """
+    layout = find_layout(folder)
+    return [count // downscale**2 for count in stated_pixels(layout, select_views(layout, None))]
+
+
+def too_little(least: int, allowed: int, what: str, less: str) -> PolarguideError:
+    """The error that a limit is too small for pictures and ``what``; ``less`` helps, too."""
+    return PolarguideError(
+        "memory",
+        expected=f"at least {in_gigabytes(least)} for pictures of this size{what}",
+        found=in_gigabytes(allowed, up=False),
+        remedy=f"Give --memory {in_gigabytes(least).replace(' ', '')}, {less}--downscale 2.",
+    )
+
+
+def in_gigabytes(count: int, *, up: bool = True) -> str:
+    """Bytes as gigabytes with one digit, rounded up, so that the stated number suffices."""
+    tenths = count * 10 / GIGABYTE
+    return f"{(math.ceil(tenths) if up else math.floor(tenths)) / 10:.1f} GB"
