@@ -22,8 +22,9 @@ from polarguide.capture.filter.encoding import (
     slope_of_shots,
     stated_encoding,
     stated_transfer,
+    transfer_of_set,
 )
-from polarguide.capture.filter.shots import Shots
+from polarguide.capture.filter.shots import Shots, read_stack
 from polarguide.capture.formats.pictures import decode_mask, decode_picture
 from polarguide.capture.sensor.demosaic import defects
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
@@ -316,6 +317,21 @@ def test_a_tone_curve_that_is_neither_is_doubted(encode, transfer, doubtful):
     slope = slope_of_shots([Shots(pictures, 1, none, none[0])], [(0, 45, 90, 135)])
     found = decide_transfer(LOSSY, None, eight=False, slope=slope)
     assert (found.transfer, bool(found.doubt)) == (transfer, doubtful)
+
+
+@pytest.mark.parametrize(("encode", "transfer"), [(lambda light: light, "linear"), (srgb_encode, "srgb")])
+@pytest.mark.parametrize("times", [(100, 100, 100, 100), (100, 50, 100, 100), (200, 100, 50, 100)])
+def test_the_encoding_is_measured_whatever_exposures_the_files_state(tmp_path, encode, transfer, times):
+    paths = []
+    for angle, light, time in zip((0, 45, 90, 135), four(), times, strict=True):
+        image = Image.fromarray(np.rint(encode(light * 50 / time) * 255).astype(np.uint8))
+        exif = image.getexif()
+        exif.get_ifd(0x8769)[0x829A] = IFDRational(1, time)
+        paths.append(tmp_path / f"v_{angle}.jpg")
+        image.save(paths[-1], quality=100, exif=exif)
+    found = transfer_of_set(paths, "auto", read_stack(paths), (0, 45, 90, 135))
+    assert (found.transfer, found.doubt) == (transfer, "")
+    assert "curvature" in found.note
 
 
 def _stating(folder, kind, values, full):

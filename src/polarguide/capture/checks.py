@@ -227,12 +227,18 @@ def right_pairs(angles: Sequence[object]) -> list[tuple[int, int]]:
 
 
 def pair_slopes(
-    codes: NDArray[np.uint16], usable: NDArray[np.bool_], pairs: Sequence[tuple[int, int]]
+    codes: NDArray[np.uint16],
+    usable: NDArray[np.bool_],
+    pairs: Sequence[tuple[int, int]],
+    *,
+    alike: bool = True,
 ) -> list[NDArray[np.float64]]:
-    """Sums of the regression described in ``Measures`` for every two of a view's pairs, about their own means.
+    """Sums of the regression described in ``Measures`` for every two of a view's pairs.
 
     Args:
         codes: linear codes [K, H, W, C] of a sample of the view. usable: [H, W]. pairs: of ``right_pairs``.
+        alike: whether the pictures have one exposure. Others add shares of I0 - I90 and I45 - I135 to the difference
+            of the sums (to first order, and before a curve, too), so that a fit of both is taken off.
     """
     if len(pairs) < 2:
         return []
@@ -240,13 +246,13 @@ def pair_slopes(
     gray = gray[:, usable & (gray.min(axis=0) > _LOW_CODE)]
     first, second = (gray[[pair[side] for pair in pairs]] for side in (0, 1))
     s0 = (first + second).mean(axis=0)
-    sums, squares = (first + second) / s0, ((first - second) / s0) ** 2
+    sums, polarized = (first + second) / s0, (first - second) / s0
     found = []
     for one, other in itertools.combinations(range(len(pairs)), 2):
-        q = squares[one] - squares[other]
-        r = sums[one] - sums[other]
-        if len(q):
-            q, r = q - q.mean(), r - r.mean()
+        level = np.ones_like(s0)
+        taken_off = np.stack([level] if alike else [level, polarized[one], polarized[other]], axis=1)
+        both = np.stack([polarized[one] ** 2 - polarized[other] ** 2, sums[one] - sums[other]], axis=1)
+        q, r = (both - taken_off @ np.linalg.lstsq(taken_off, both, rcond=None)[0]).T
         found.append(np.array([len(q), 0.0, 0.0, q @ q, q @ r]))
     return found
 

@@ -19,7 +19,13 @@ from PIL import Image
 
 from polarguide.capture import checks
 from polarguide.capture.exposures import Angle
-from polarguide.capture.filter.camera_files import is_camera_raw, number_of, tags_of
+from polarguide.capture.filter.camera_files import (
+    is_camera_raw,
+    missing_tags,
+    number_of,
+    read_exposure_data,
+    tags_of,
+)
 from polarguide.capture.filter.shots import Shots
 from polarguide.capture.formats.decoders import HIGH_RANGE, heif_colors, is_heif
 from polarguide.capture.formats.integrity import BIG_TIFF, PNG, TIFF, png_chunk
@@ -329,19 +335,33 @@ def decide_transfer(
     return TransferDecision(usual, note, _doubt(slope, usual))
 
 
-def slope_of_shots(shots: Sequence[Shots], angles: Sequence[Sequence[Angle]]) -> Slope:
+def exposed_alike(paths: Sequence[Path]) -> bool:
+    """Whether the pictures of a view have one exposure as far as their files state it (EXIF)."""
+    taken = {path: read_exposure_data(path) for path in paths}
+    logs = [math.log(light) for data in taken.values() if (light := data.light) is not None]
+    return bool(missing_tags(taken)) or not logs or max(logs) - min(logs) < checks.OTHER_EXPOSURE
+
+
+def slope_of_shots(
+    shots: Sequence[Shots], angles: Sequence[Sequence[Angle]], files: Sequence[Sequence[Path]] = ()
+) -> Slope:
     """The curvature of the response over some views.
 
     Args:
         shots: of each view, aligned well enough (as from a tripod). angles: of each view's pictures.
+        files: of each view's pictures; none of pictures in memory.
     """
+    alike = [exposed_alike(paths) for paths in files] or [True] * len(shots)
     pairs = [checks.right_pairs(mine) for mine in angles]
     samples = [checks.sampled(view.pictures) for view in shots]
     usable = [checks.sampled(~(view.clipped.any(axis=0) | view.dark)[None])[0] for view in shots]
 
     def slope(transfer: str) -> float | None:
-        views = zip(samples, usable, pairs, strict=True)
-        each = (checks.pair_slopes(linear_codes(view, transfer), *rest) for view, *rest in views)
+        views = zip(samples, usable, pairs, alike, strict=True)
+        each = (
+            checks.pair_slopes(linear_codes(view, transfer), valid, at, alike=one)
+            for view, valid, at, one in views
+        )
         return checks.slope(list(itertools.chain.from_iterable(each)))
 
     return slope
@@ -365,13 +385,19 @@ def transfer_of_set(
         return given
     stated = stated_video_transfer(video) if video else stated_transfer(paths) if paths else None
     eight = shots.pictures.dtype == np.uint8
-    return decide_transfer(kind, stated, eight=eight, slope=slope_of_shots([shots], [angles]))
+    files = [paths] if paths and video is None else []
+    return decide_transfer(kind, stated, eight=eight, slope=slope_of_shots([shots], [angles], files))
 
 
 def _doubt(slope: Slope | None, transfer: str) -> str:
-    """The warning where the chosen transfer leaves the response curved, as a camera's own tone curve does."""
+    """The warning where the chosen transfer leaves the response curved, as a camera's own tone curve does.
+
+    Tone curves leave a negative curvature in files that are read as linear. Light that drifts between the shots can
+    leave a positive one, which is no sign of a tone curve.
+    """
     left = None if slope is None else slope(transfer)
-    if left is None or checks.ENCODED[0] <= left <= checks.DECODED[0]:
+    highest = math.inf if transfer == "linear" else checks.DECODED[0]
+    if left is None or checks.ENCODED[0] <= left <= highest:
         return ""
     return (
         f"Read as {transfer}, the response still has a curvature of {left:+.2f} (0 if it is linear): the files have "
