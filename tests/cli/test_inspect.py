@@ -59,7 +59,7 @@ def test_a_capture_without_poses(unposed: Path, tmp_path: Path, capsys: pytest.C
     verdicts = {check["key"]: check["verdict"] for check in record["checks"]}
     assert record["schema"] == 2
     assert record["scene"]["posed_views"] == 0
-    for key in ("poses", "coverage"):
+    for key in ("poses", "coverage", "view_exposure", "focal_lengths"):
         assert verdicts.pop(key) == "n/a"
     for key in ("angle_order", "handedness", "zero_offset"):
         assert verdicts.pop(key) == "not verified"
@@ -94,8 +94,8 @@ def test_a_capture_without_poses(unposed: Path, tmp_path: Path, capsys: pytest.C
 def test_a_capture_with_poses_and_points_alone(whole_demo: Path, tmp_path: Path) -> None:
     record, _ = inspected(whole_demo, tmp_path / "out", "--normals", "points")
     verdicts = {check["key"]: check["verdict"] for check in record["checks"]}
-    assert verdicts["angle_order"] == "not verified"  # its few small views leave too few observations
-    assert record["angles"]["sources"][0]["usable"] is False
+    assert verdicts["angle_order"] == "ok"
+    assert record["angles"]["sources"][0]["usable"] is True
     assert verdicts["coverage"] == "ok"
     assert record["scene"]["posed_views"] == 50
     assert not (tmp_path / "out" / "short_run").exists()

@@ -45,7 +45,8 @@ def test_views_on_automatic_exposure_are_named_and_made_even(
     even = polarguide.load_scene(whole_demo, downscale=2)
     true = np.log2(np.array(list(gains.values())))
     found = np.log2(np.array([view.gains for view in scene.views]))
-    assert np.sqrt(((found - true + true.mean(axis=0)) ** 2).mean()) < 0.1 < true.std()
+    # Gains that are not significant stay 1: half of the third of a stop by which cameras set exposures may remain.
+    assert np.sqrt(((found - true + true.mean(axis=0)) ** 2).mean()) < 1 / 6 < true.std()
     view, before = scene.views[7], even.views[7]
     expected = before.photograph().numpy() * 0.7 * 2.0 ** (true[7] - found[7])
     np.testing.assert_allclose(view.photograph().numpy(), expected, atol=2e-4)

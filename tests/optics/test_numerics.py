@@ -39,6 +39,7 @@ CALLS: dict[str, tuple[Any, ...]] = {
     "conductor": (SHARE, SHARE + np.float32(0.5)),
     "conductor_dolp_slope": (SHARE, SHARE + 1, SHARE + 2),
     "conductor_index": (SHARE + np.float32(0.5),),
+    "conductor_oblique_share": (SHARE, SHARE + 1, SHARE + 2),
     "conductor_reflectances": (SHARE, SHARE + 1, SHARE + 2),
     "diffuse_dolp": (ANGLE,),
     "diffuse_dolp_limit": (SHARE + 1,),

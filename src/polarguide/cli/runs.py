@@ -171,7 +171,7 @@ def render(
     /,
     *,
     views: str = "test",
-    layers: str = "",
+    layers: str | None = None,
     path: str = "",
     frames: int = FRAMES,
     size: str = "",
@@ -238,7 +238,8 @@ def render(
             remedy="Leave one of the two out.",
         )
     pixels = picture_size(size) if size else None
-    layers = layers or ("final" if path else LAYERS)
+    if layers is None:
+        layers = "final" if path else LAYERS
     names = [name.strip() for name in layers.split(",") if name.strip()]
     trained, reporter = opened(run, compute)
     trained.relight(environment, rotate_environment, reporter=reporter)
