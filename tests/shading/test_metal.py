@@ -134,7 +134,7 @@ def test_the_point_cloud_says_what_metals_are(tmp_path: Path) -> None:
     state, shading = random_state("polarguide-stokes", 40)
     metal = torch.arange(40) < 15
     state.gaussians.overwrite("metalness", metal.float())
-    write_run_ply(tmp_path / "run.ply", state, shading)
+    write_run_ply(tmp_path / "run.ply", state, shading, own_fields=True)
     read = read_ply(tmp_path / "run.ply")["extra"]
     assert torch.equal(read["metalness"] > 0, metal)
     expected = reflectance(state.gaussians["reflectance_logits"]).detach()

@@ -108,7 +108,7 @@ def test_it_renders_and_is_evaluated(trained: Trainer) -> None:
 
 
 def test_it_is_exported(trained: Trainer, tmp_path: Path) -> None:
-    write_run_ply(tmp_path / "run.ply", trained.state, trained.shading)
+    write_run_ply(tmp_path / "run.ply", trained.state, trained.shading, own_fields=True)
     read = read_ply(tmp_path / "run.ply")
     assert set(read["extra"]) == {"linear_dc", "linear_rest"}
     # Display colors, reflections included: brighter than the base color alone.

@@ -112,7 +112,7 @@ class Rate:
             self._first = (now, done)
         begin, first = self._first
         steps = done - first
-        if self.total is None or steps <= 0 or steps < MEASURED * (self.total - first):
+        if self.total is None or steps < max(1, MEASURED * (self.total - first)):
             return None
         return (now - begin) / steps * max(0, self.total - done)
 

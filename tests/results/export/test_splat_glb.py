@@ -79,12 +79,13 @@ def means(colors: np.ndarray) -> np.ndarray:
 
 def test_both_variants_show_the_same_upright_and_balanced(trained: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(trained, tmp_path / "copy"))
-    write_presentation(copy, Presentation(up_axis=(0.0, 0.3, 1.0), meters_per_unit=0.5))
+    write_presentation(copy, Presentation(up_axis=(0.0, 0.3, 1.0), meters_per_unit=0.5, whole=True))
     read = {}
     for name, gains in (("as it is", None), ("balanced", (1.0, 0.5, 1.0))):
         if gains:
             write_presentation(
-                copy, Presentation(white_balance=gains, up_axis=(0.0, 0.3, 1.0), meters_per_unit=0.5)
+                copy,
+                Presentation(white_balance=gains, up_axis=(0.0, 0.3, 1.0), meters_per_unit=0.5, whole=True),
             )
         out = tmp_path / name
         polarguide.open_run(copy).export("splat-glb", out)

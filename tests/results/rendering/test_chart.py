@@ -151,7 +151,7 @@ def exported(folder: Path, out: Path) -> dict[str, torch.Tensor]:
     for kind in ("ply", "mesh", "points", "environment"):
         trained.export(kind, out, resolution=24)
     trained.write_pictures(out, views="v001", layers=["final", "dolp"])
-    mesh = trimesh.load(out / "mesh.glb", force="mesh").visual.vertex_colors[:, :3]
+    mesh = trimesh.load(out / "mesh.glb", force="mesh").visual.vertex_attributes["color"][:, :3]
     points = PlyData.read(out / "points.ply")["vertex"]
     splats = read_ply(out / "splats.ply")
     shown = 0.5 + sh_basis(torch.tensor([[0.0, 0, 1]]), 3) @ torch.cat(

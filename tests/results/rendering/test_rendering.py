@@ -199,7 +199,7 @@ def test_a_mesh_of_the_sphere(tmp_path) -> None:  # type: ignore[no-untyped-def]
     assert len(glb.faces) == len(mesh.surface.faces)
     upright = mesh.surface.vertices @ around.panorama_axes().numpy()
     np.testing.assert_allclose(np.sort(glb.vertices[:, 1]), np.sort(upright[:, 1]), atol=1e-5)
-    assert np.median(glb.visual.vertex_colors[:, 0]) == pytest.approx(0.8 * 255, abs=3)  # linear
+    assert np.median(glb.visual.vertex_attributes["color"][:, 0]) == pytest.approx(0.8 * 255, abs=3)  # linear
 
 
 def test_nothing_to_see_is_said() -> None:
