@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import struct
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from glb_files import read_glb
 from random_runs import random_state
 
 import polarguide
@@ -30,21 +30,6 @@ validator.validateBytes(new Uint8Array(file), { maxIssues: 0 }).then((r) => cons
 """
 UNKNOWN = "MESH_PRIMITIVE_INVALID_ATTRIBUTE"
 """The validator's code for attributes of an extension that it does not know."""
-
-
-def read_glb(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The tree, and the values of the only primitive by attribute."""
-    data = path.read_bytes()
-    length = struct.unpack("<I", data[12:16])[0]
-    tree, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
-    columns = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-    values = {}
-    for name, number in tree["meshes"][0]["primitives"][0]["attributes"].items():
-        accessor = tree["accessors"][number]
-        view = tree["bufferViews"][accessor["bufferView"]]
-        part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
-        values[name] = np.frombuffer(part, "<f4").reshape(accessor["count"], columns[accessor["type"]])
-    return tree, values
 
 
 @pytest.mark.parametrize("encoding", COLOR_SPACES)

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-import trimesh
 from faults import Fault
+from glb_files import read_glb
 from plyfile import PlyData
 from skimage.color import lab2xyz
 
@@ -151,7 +151,7 @@ def exported(folder: Path, out: Path) -> dict[str, torch.Tensor]:
     for kind in ("ply", "mesh", "points", "environment"):
         trained.export(kind, out, resolution=24)
     trained.write_pictures(out, views="v001", layers=["final", "dolp"])
-    mesh = trimesh.load(out / "mesh.glb", force="mesh").visual.vertex_attributes["color"][:, :3]
+    mesh = read_glb(out / "mesh.glb")[1]["COLOR_0"][:, :3]
     points = PlyData.read(out / "points.ply")["vertex"]
     splats = read_ply(out / "splats.ply")
     shown = 0.5 + sh_basis(torch.tensor([[0.0, 0, 1]]), 3) @ torch.cat(
