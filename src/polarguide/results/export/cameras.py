@@ -38,6 +38,10 @@ def write_cameras(run: OpenedRun, presented: Presented, folder: Path, reporter: 
             )
     scene = run.scene
     placement = presented.placement
+    cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
+    about = {**presented.origin.record(), **placement.record()}
+    # First, because it says to a repeated command that the rest is of an export that was stopped.
+    write_transforms(folder / TRANSFORMS, cameras, about)
     make_folder(images)
     color = presented.presentation.color
     with reporter.track("photographs", len(scene.views)) as advance:
@@ -45,9 +49,6 @@ def write_cameras(run: OpenedRun, presented: Presented, folder: Path, reporter: 
             picture = figures.radiance_to_rgb(colored(view.photograph(), color))
             figures.write_png(images / f"{view.name}{SUFFIX}", picture)
             advance(number + 1)
-    cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
     points = placement.points(scene.points)
     write_colmap(model, cameras, points, scene.point_colors, comments=presented.comments)
-    about = {**presented.origin.record(), **placement.record()}
-    write_transforms(folder / TRANSFORMS, cameras, about)
     return [model, folder / TRANSFORMS, images]
