@@ -129,7 +129,7 @@ def misnamed(folder: Path) -> None:
 
 INPUTS: dict[str, dict[str, Callable[[Path], object]]] = {
     "calibrate": {"SHOTS": polarizer_shots},
-    "prepare": {"RAW": raw_mosaics, "SHOTS": write_relief},
+    "prepare": {"RAW": raw_mosaics, "SHOTS": write_relief, "PHOTOS": single_shots},
     "prepare --angles": {"SHOTS": single_shots, "PHOTOS": single_shots},
     "inspect --fix": {"SCENE": misnamed},
     "priors": {"part.png": one_part},
