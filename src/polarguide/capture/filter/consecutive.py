@@ -20,7 +20,7 @@ from polarguide.core.progress import Reporter
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 MOST_SHOTS = 12
-"""Shots of one place that are looked for: every 15 degrees of half a turn."""
+"""Largest number of shots of one place, one every 15 degrees of half a turn."""
 _SAMPLED = 24
 _SIDE = 96
 _BLUR = 4.0
