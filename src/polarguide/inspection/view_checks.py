@@ -19,10 +19,10 @@ from polarguide.inspection.settings import Check, Verdict
 FEWEST = 50
 """Points from which on a focal length is estimated."""
 FOCAL_DIFFERS, FOCAL_WRONG = 0.01, 0.05
-"""Differences of the logarithm of a focal length: 1 % turns a ray at 30 degrees by 0.25 degrees."""
+"""Differences of the logarithm of a focal length; 1 % turns a ray at 30 degrees by 0.25 degrees."""
 TO_DEVIATION = 1.4826
 STEP = 1 / 3
-"""Stops by which cameras set exposures: with a larger error, equal exposures are not confirmed."""
+"""Stops by which cameras set exposures; with a larger error, equal exposures are not confirmed."""
 
 
 def view_exposure_check(capture: Capture) -> Check:

@@ -68,7 +68,7 @@ def _difference(first: NDArray[np.float32], second: NDArray[np.float32]) -> floa
 
 
 FRAMES_A_SECOND = 2.0
-"""Frames that are taken of a video: walking around a subject within a minute, the camera turns by 3 degrees."""
+"""Frames that are taken of a video; walking around a subject within a minute, the camera turns by 3 degrees."""
 LEAST_FRAMES, MOST_FRAMES = 24, 120
 _RECORD = "video.txt"
 
@@ -140,7 +140,7 @@ _MANY = 100
 """Pictures of which all pairs are compared, 4950, whatever their names."""
 _NUMBERED = re.compile(r"(?P<name>.*?)(?P<number>\d+)")
 _NEIGHBORS = 20
-"""Pictures that COLMAP compares each with: the next ten, and some at distances of powers of two."""
+"""Pictures that COLMAP compares each with; the next ten, and some at distances of powers of two."""
 
 
 def chosen_matching(views: Sequence[str], matching: str, reporter: Reporter) -> str:
