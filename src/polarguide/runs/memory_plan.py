@@ -34,13 +34,13 @@ PRIORS = 900
 PRIORS_KEPT, SHOWN_KEPT, UNGUIDED_KEPT = 44, 8, 13
 """Bytes a pixel of what is kept of a view: targets, photograph with masks, and what of the targets needs no guide."""
 COPIES, WRITTEN = 5, 4
-"""Of a Gaussian's parameters: values, gradients, two moments, frozen; and those in the file that is written."""
+"""Copies of the parameters of a Gaussian in memory and in the written file; values, gradients, moments, frozen."""
 SPLAT = 600
 """Bytes a Gaussian of what a rasterizer makes of it."""
 FILLED = 0.88
-"""Of a limit, up to which views are kept in memory; the rest is for gaps between what is used."""
+"""Share of a limit up to which views are kept in memory; the rest is for gaps between what is used."""
 FIELD_COPIES = 5
-"""Of what a field learns: values, gradients, two moments, and those in the file that is written."""
+"""Copies of the parameters of a field: values, gradients, two moments, and those in the file that is written."""
 SAMPLE, READ_VIEW, TARGET_KEPT = 14_000, 60, 10
 """Bytes a sample of a field's step, a pixel of the view it looks at, and a pixel of what is kept of each view."""
 

@@ -336,7 +336,7 @@ def decide_transfer(
 
 
 def exposed_alike(paths: Sequence[Path]) -> bool:
-    """Whether the pictures of a view have one exposure as far as their files state it (EXIF)."""
+    """True where no file states (EXIF) that the pictures of a view differ in exposure."""
     taken = {path: read_exposure_data(path) for path in paths}
     logs = [math.log(light) for data in taken.values() if (light := data.light) is not None]
     return bool(missing_tags(taken)) or not logs or max(logs) - min(logs) < checks.OTHER_EXPOSURE
