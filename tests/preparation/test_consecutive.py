@@ -206,6 +206,9 @@ class Impatient(Reporter):
 
 
 def test_a_step_of_colmap_ends_with_the_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    waiting = tmp_path / "waiting.py"
+    waiting.write_text("import sys\nsys.stdin.read()\n")  # the input stays open as long as the call lasts
+    monkeypatch.setitem(run_step.__globals__, "_PROGRAM", waiting)
     started = []
     popen = run_step.__globals__["subprocess"].Popen
     monkeypatch.setattr(
@@ -214,7 +217,7 @@ def test_a_step_of_colmap_ends_with_the_call(tmp_path: Path, monkeypatch: pytest
         lambda *a, **k: started.append(popen(*a, **k)) or started[-1],
     )
     with pytest.raises(KeyboardInterrupt):
-        run_step("match", {"database": "x", "matching": "exhaustive"}, 0, Impatient(), "matching")
+        run_step("match", {}, 0, Impatient(), "matching")
     assert [process.returncode for process in started] == [-9]
 
 

@@ -160,7 +160,7 @@ def exported(folder: Path, out: Path) -> dict[str, torch.Tensor]:
     shades = torch.from_numpy(np.stack([points[name] for name in ("red", "green", "blue")], axis=1)) / 255
     final = cv2.imread(str(out / "v001_final.png"))[..., ::-1].reshape(-1, 3) / 255
     return {
-        "mesh": torch.from_numpy(np.asarray(mesh)).float() / 255,
+        "mesh": torch.tensor(np.asarray(mesh)).float() / 255,
         "splats": srgb_decode(shown[:, 0].clamp(0, 1)),
         "points": srgb_decode(shades),
         "light": read_panorama(out / "environment.hdr").reshape(-1, 3),
