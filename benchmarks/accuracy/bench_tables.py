@@ -19,8 +19,8 @@ import msgspec
 from scipy import stats
 
 from polarguide.core.errors import PolarguideError
-from polarguide.experiments.record import read_results
 from polarguide.results.evaluation.table import METRICS, OBJECT_METRICS
+from polarguide_bench.record import read_results
 
 BY_KEY = {metric.key: metric for metric in METRICS}
 COLUMNS = {

@@ -22,8 +22,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "helpers"
 from made_sensor import MadeSensor, dolp_aolp, made_sensor, polarizer_light, write_polarizer_shots
 
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration
-from polarguide.shots.calibration.calibrate import calibrate_sensor
-from polarguide.shots.calibration.settings import CalibrateSettings
+from polarguide_shots.calibration.calibrate import calibrate_sensor
+from polarguide_shots.calibration.settings import CalibrateSettings
 
 SIZE = (128, 192)
 TWELVE = [15.0 * index for index in range(12)]

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from polarguide.experiments.tables import MINUS
+from polarguide_bench.tables import MINUS
 
 METRICS = ("psnr", "normal_mae_deg", "specular_psnr", "diffuse_psnr")
 WHOLE = "all"

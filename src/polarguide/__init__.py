@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from polarguide import optics
-    from polarguide.api.captures import calibrate, inspect, measure, prepare, present, priors, shot_priors
+    from polarguide.api.captures import inspect, prepare, present
     from polarguide.api.runs import Run, demo_scene, open_run, train
     from polarguide.capture import Scene, load_scene
     from polarguide.capture.sensor.analyzer_file import read_analyzers
@@ -20,48 +20,50 @@ if TYPE_CHECKING:
     from polarguide.core.errors import PolarguideError, PolarguideWarning
     from polarguide.core.options import SceneOptions, SessionOptions
     from polarguide.core.progress import Reporter
-    from polarguide.experiments.compare import ablate, compare
-    from polarguide.experiments.options import CompareOptions
     from polarguide.geometry.camera import Camera
     from polarguide.inspection.settings import InspectSettings
     from polarguide.preparation.settings import PrepareSettings
     from polarguide.recipes.registry import recipe_names
-    from polarguide.shots.calibration.settings import CalibrateSettings
-    from polarguide.shots.exposures import find_shots
-    from polarguide.shots.maps import ShotMaps
-    from polarguide.shots.measurement.watch import watch_folder
-    from polarguide.shots.options import MeasureOptions, ShotOptions, WatchOptions
-    from polarguide.shots.read import SurfaceMaps, read_shot, surface_maps
     from polarguide.training.recipe import Recipe
     from polarguide.training.settings import TrainSettings
+    from polarguide_bench.compare import ablate, compare
+    from polarguide_bench.options import CompareOptions
+    from polarguide_shots.api import calibrate, measure, priors, shot_priors
+    from polarguide_shots.calibration.settings import CalibrateSettings
+    from polarguide_shots.exposures import find_shots
+    from polarguide_shots.maps import ShotMaps
+    from polarguide_shots.measurement.watch import watch_folder
+    from polarguide_shots.options import MeasureOptions, ShotOptions, WatchOptions
+    from polarguide_shots.read import SurfaceMaps, read_shot, surface_maps
 
     __version__: str
 
 _NAMES = {
-    "api.captures": ("calibrate", "inspect", "measure", "prepare", "present", "priors", "shot_priors"),
-    "api.runs": ("Run", "demo_scene", "open_run", "train"),
-    "capture": ("Scene", "load_scene"),
-    "capture.sensor.analyzer_file": ("read_analyzers",),
-    "capture.sensor.analyzers": ("AnalyzerCalibration",),
-    "core.errors": ("PolarguideError", "PolarguideWarning"),
-    "experiments.compare": ("ablate", "compare"),
-    "experiments.options": ("CompareOptions",),
-    "geometry.camera": ("Camera",),
-    "inspection.settings": ("InspectSettings",),
-    "shots.measurement.watch": ("watch_folder",),
-    "core.options": ("SceneOptions", "SessionOptions"),
-    "preparation.settings": ("PrepareSettings",),
-    "core.progress": ("Reporter",),
-    "recipes.registry": ("recipe_names",),
-    "shots.calibration.settings": ("CalibrateSettings",),
-    "shots.exposures": ("find_shots",),
-    "shots.maps": ("ShotMaps",),
-    "shots.options": ("MeasureOptions", "ShotOptions", "WatchOptions"),
-    "shots.read": ("SurfaceMaps", "read_shot", "surface_maps"),
-    "training.recipe": ("Recipe",),
-    "training.settings": ("TrainSettings",),
+    "polarguide.api.captures": ("inspect", "prepare", "present"),
+    "polarguide.api.runs": ("Run", "demo_scene", "open_run", "train"),
+    "polarguide.capture": ("Scene", "load_scene"),
+    "polarguide.capture.sensor.analyzer_file": ("read_analyzers",),
+    "polarguide.capture.sensor.analyzers": ("AnalyzerCalibration",),
+    "polarguide.core.errors": ("PolarguideError", "PolarguideWarning"),
+    "polarguide.core.options": ("SceneOptions", "SessionOptions"),
+    "polarguide.core.progress": ("Reporter",),
+    "polarguide.geometry.camera": ("Camera",),
+    "polarguide.inspection.settings": ("InspectSettings",),
+    "polarguide.preparation.settings": ("PrepareSettings",),
+    "polarguide.recipes.registry": ("recipe_names",),
+    "polarguide.training.recipe": ("Recipe",),
+    "polarguide.training.settings": ("TrainSettings",),
+    "polarguide_bench.compare": ("ablate", "compare"),
+    "polarguide_bench.options": ("CompareOptions",),
+    "polarguide_shots.api": ("calibrate", "measure", "priors", "shot_priors"),
+    "polarguide_shots.calibration.settings": ("CalibrateSettings",),
+    "polarguide_shots.exposures": ("find_shots",),
+    "polarguide_shots.maps": ("ShotMaps",),
+    "polarguide_shots.measurement.watch": ("watch_folder",),
+    "polarguide_shots.options": ("MeasureOptions", "ShotOptions", "WatchOptions"),
+    "polarguide_shots.read": ("SurfaceMaps", "read_shot", "surface_maps"),
 }
-"""The public names by the module below the package that defines them."""
+"""The public names by the module that defines them, of this package and of its neighbors."""
 _MODULES = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [
@@ -115,19 +117,24 @@ def __getattr__(name: str) -> Any:
     elif name == "optics":
         return importlib.import_module("polarguide.optics")
     elif name in _MODULES:
-        value = getattr(_imported(f"polarguide.{_MODULES[name]}"), name)
+        value = getattr(_imported(_MODULES[name], name), name)
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value
     return value
 
 
-def _imported(name: str) -> Any:
-    """A module. Its names stay, so that nobody has to look for cycles among them meanwhile (0.4 of 2.3 CPU seconds)."""
+def _imported(module: str, name: str) -> Any:
+    """Import the module of a public name, without garbage collection, which would take 0.4 of 2.3 CPU seconds.
+
+    Raises:
+        PolarguideError: the module belongs to a neighboring package that is not installed.
+    """
+    errors = importlib.import_module("polarguide.core.errors")
     collects = gc.isenabled()
     gc.disable()
     try:
-        return importlib.import_module(name)
+        return errors.import_part(module, name)
     finally:
         if collects:
             gc.enable()

@@ -24,8 +24,8 @@ from polarguide.core.system import free_memory
 from polarguide.preparation.mosaic_source import WORKED
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.shots.options import ShotOptions
-from polarguide.shots.read import read_shot
+from polarguide_shots.options import ShotOptions
+from polarguide_shots.read import read_shot
 
 
 @pytest.fixture

@@ -24,9 +24,9 @@ from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, packed_size,
 from polarguide.preparation.mosaic_source import sample_blocks
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.shots.calibration.settings import CalibrateSettings
-from polarguide.shots.options import ShotOptions
-from polarguide.synth.settings import SynthSettings
+from polarguide_shots.calibration.settings import CalibrateSettings
+from polarguide_shots.options import ShotOptions
+from polarguide_synth.settings import SynthSettings
 
 
 @pytest.mark.parametrize("packing", PACKINGS)

@@ -33,7 +33,7 @@ from polarguide.capture.filter.ring_scale import BAND, place, ring_scale
 from polarguide.geometry.polarizer import malus
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.synth.sensor import FilterShot, Sensor, behind_filter, exif_tags, filter_jpeg
+from polarguide_synth.sensor import FilterShot, Sensor, behind_filter, exif_tags, filter_jpeg
 
 PLAIN = PrepareSettings(poses="none", gains="none", align=False)
 UNIT = (1.0, 1.0, 1.0)

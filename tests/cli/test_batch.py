@@ -8,9 +8,9 @@ from faults import Fault
 
 from polarguide.cli import batch as verb
 from polarguide.cli.app import run
-from polarguide.experiments import batch as batches
-from polarguide.experiments.batch import Capture, Row
-from polarguide.experiments.options import BatchOptions
+from polarguide_bench import batch as batches
+from polarguide_bench.batch import Capture, Row
+from polarguide_bench.options import BatchOptions
 
 OPTIONS = BatchOptions(jobs=1, device="cpu")
 HEAD = "name,path,sensor,options\n"

@@ -11,7 +11,7 @@ from camera_files import write_mosaics
 
 from polarguide.cli.app import run
 from polarguide.geometry.polarizer import ANGLES
-from polarguide.shots.measurement.pictures import diverging
+from polarguide_shots.measurement.pictures import diverging
 from tests.shots.test_read import write_four
 
 SENSOR = ("--sensor", "IMX250MZR", "--bits", "12", "--threads", "1")

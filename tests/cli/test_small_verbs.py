@@ -18,14 +18,14 @@ from made_sensor import made_sensor, write_codes, write_polarizer_shots
 from polarguide.capture.filter.ring_scale import ring_scale
 from polarguide.cli.app import run
 from polarguide.core.errors import install_extra
-from polarguide.experiments.options import CompareOptions
-from polarguide.experiments.plan import Comparison, plan_runs, scene_entries
-from polarguide.experiments.record import read_results
 from polarguide.recipes import recipe_named
 from polarguide.runs.folder import CHECKPOINT, LOG
-from polarguide.synth.schema import SceneSpec
-from polarguide.synth.settings import Variant, choose_variant
 from polarguide.training.settings import TrainSettings
+from polarguide_bench.options import CompareOptions
+from polarguide_bench.plan import Comparison, plan_runs, scene_entries
+from polarguide_bench.record import read_results
+from polarguide_synth.schema import SceneSpec
+from polarguide_synth.settings import Variant, choose_variant
 
 
 def test_the_command_writes_it_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -81,8 +81,8 @@ def test_a_long_rendering_is_announced_and_asked_for_before_there_is_a_folder(
         started.append(out)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("polarguide.synth.settings.missing_llvm", lambda: "none was found")
-    monkeypatch.setattr("polarguide.synth.render.build_scene", build)
+    monkeypatch.setattr("polarguide_synth.settings.missing_llvm", lambda: "none was found")
+    monkeypatch.setattr("polarguide_synth.render.build_scene", build)
     monkeypatch.setattr("sys.stdin", Keyboard(typed) if terminal else io.StringIO(typed))
     monkeypatch.setattr("polarguide.cli.console.console._force_terminal", terminal)
     out = tmp_path / "x"

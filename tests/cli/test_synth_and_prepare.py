@@ -16,8 +16,8 @@ from polarguide import optics
 from polarguide.capture import load_scene
 from polarguide.capture.colmap.model import read_model
 from polarguide.cli.app import run
-from polarguide.synth.sensor import Sensor, behind_filter
-from polarguide.synth.settings import choose_variant
+from polarguide_synth.sensor import Sensor, behind_filter
+from polarguide_synth.settings import choose_variant
 from tests.synth.test_scene_folder import TINY
 
 

@@ -10,15 +10,14 @@ import pytest
 import torch
 from faults import Fault
 from other_device import BACKEND, OtherDevice, unfused_adam
+from polarguide.cli.compare import chosen_steps
 
 from polarguide.api.runs import Run, open_run
 from polarguide.capture import load_scene
 from polarguide.capture.presentation import Crop
 from polarguide.cli.app import run
-from polarguide.cli.compare import chosen_steps
 from polarguide.cli.runs import render
 from polarguide.core.options import ComputeOptions
-from polarguide.experiments.record import read_results
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.inspection.evidence import short_run, surface_of
 from polarguide.results.evaluation.metrics import HAZE_DEPTH
@@ -28,6 +27,7 @@ from polarguide.results.evaluation.target import SceneFacts, ViewTarget
 from polarguide.runs import opened as opening
 from polarguide.viewer import run_scenery
 from polarguide.viewer.scenery import Appearance, Painter
+from polarguide_bench.record import read_results
 
 
 @pytest.fixture

@@ -152,7 +152,7 @@ print(faults(), (64 << 20) // resource.getpagesize())
     [
         ("import polarguide.api.runs", False),
         ("from polarguide.__main__ import main; sys.argv[1:] = ['--version']; main()", True),
-        ("from polarguide.experiments.worker import main; main()", True),
+        ("from polarguide_bench.worker import main; main()", True),
     ],
 )
 def test_freed_memory_is_kept_by_the_command_and_the_children_of_a_comparison_alone(

@@ -10,7 +10,7 @@ import pytest
 import polarguide
 from polarguide.recipes import ABLATIONS, RECIPES
 from polarguide.results.evaluation.table import METRICS
-from polarguide.shots.measurement.fields import FORMAT, KEYS
+from polarguide_shots.measurement.fields import FORMAT, KEYS
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS, PACKAGE = ROOT / "docs", ROOT / "src" / "polarguide"

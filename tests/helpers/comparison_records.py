@@ -3,9 +3,9 @@
 from typing import Any
 
 from polarguide.core.records import decode
-from polarguide.experiments.record import FORMAT, Record
-from polarguide.experiments.results import Results
 from polarguide.results.evaluation.table import COLUMNS
+from polarguide_bench.record import FORMAT, Record
+from polarguide_bench.results import Results
 
 
 def run(scene: str, recipe: str, seed: int, **metrics: float | None) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from polarguide.geometry.camera import Camera, look_at, quaternion
-from polarguide.synth.sensor import FilterShot, Sensor, behind_filter, filter_jpeg
+from polarguide_synth.sensor import FilterShot, Sensor, behind_filter, filter_jpeg
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 110.0
 ORIENTATIONS = (1, 6, 8, 3)

@@ -8,11 +8,11 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import GroundTruth, Scene, View
-from polarguide.fields.field import MARGIN
 from polarguide.geometry.camera import Camera, look_at
 from polarguide.geometry.polarizer import ANGLES
 from polarguide.geometry.vectors import unit
 from polarguide.optics.color import srgb_decode
+from polarguide_bench.gnerp.field import MARGIN
 
 DISTANCE = 4.0
 OFFSET = (0.3, -0.2, 0.25)

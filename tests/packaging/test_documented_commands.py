@@ -39,7 +39,7 @@ SHOWN = re.compile(
 CHOICES = re.compile(r"# (\w+(?: \| \w+)+)")
 
 EXCLUDED = {
-    "polarguide batch captures --out results": "trains several captures: tests/experiments/test_collections.py",
+    "polarguide batch captures --out results": "trains several captures: tests/bench/test_collections.py",
     "polarguide prepare DATASET --out SCENE": "each dataset: tests/preparation/test_prepare_datasets.py",
     "make demo": "makes .venv, and runs polarguide demo there",
     "make test": "runs this test",

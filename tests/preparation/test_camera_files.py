@@ -34,8 +34,8 @@ from polarguide.preparation.filter_source import SinglesSource
 from polarguide.preparation.mosaic_source import MosaicFiles, MosaicSource
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.shot_exposures import exposures_of_view, stated_exposures
-from polarguide.shots.options import ShotOptions
-from polarguide.shots.read import read_shot
+from polarguide_shots.options import ShotOptions
+from polarguide_shots.read import read_shot
 
 
 def four(height=96, width=128):

@@ -17,8 +17,8 @@ from polarguide.core.errors import PolarguideWarning
 from polarguide.optics.color import srgb_encode_array as srgb_encode
 from polarguide.preparation.filter_source import SinglesSource
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.shots.options import ShotOptions
-from polarguide.shots.read import read_shot
+from polarguide_shots.options import ShotOptions
+from polarguide_shots.read import read_shot
 
 SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 

@@ -30,7 +30,7 @@ from polarguide.preparation import prepare as prepare_module
 from polarguide.preparation.filter_source import SinglesSource
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.synth.sensor import exif_tags
+from polarguide_synth.sensor import exif_tags
 
 PLAIN = PrepareSettings(poses="none", transfer="linear", align=False)
 

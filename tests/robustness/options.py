@@ -7,7 +7,7 @@ from pathlib import Path
 from base import COMPARE, EVAL, FLAGS, MEASURE, MOSAICS, ONE, READ, RENDER, SHOTS, TRAIN, export
 from case import Case, nothing, table
 
-from polarguide.experiments.options import BENCH
+from polarguide_bench.options import BENCH
 
 HELD_BACK = BENCH.held_back[0]
 CASES: list[Case] = []

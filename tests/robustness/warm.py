@@ -25,7 +25,7 @@ IMPORTED = (
     "typeguard",
     "polarguide.api.captures",
     "polarguide.api.runs",
-    "polarguide.experiments.compare",
+    "polarguide_bench.compare",
     "polarguide.preparation.prepare",
 )
 

@@ -20,7 +20,6 @@ import polarguide
 from polarguide.capture import Scene
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import SceneOptions, SessionOptions
-from polarguide.fields.recipe import NeuralRecipe
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import (
     CHECKPOINT,
@@ -36,6 +35,7 @@ from polarguide.runs.train import TrainingStopped
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import ResolvedSettings, TrainSettings
 from polarguide.training.state import TrainingState
+from polarguide_bench.gnerp.recipe import NeuralRecipe
 
 
 @pytest.fixture

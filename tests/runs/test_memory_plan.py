@@ -12,14 +12,14 @@ from torch import Tensor
 
 from polarguide.capture import Scene
 from polarguide.core.options import Exposures, SceneOptions, gibibytes
-from polarguide.fields.recipe import NeuralRecipe
-from polarguide.fields.state import FieldState
 from polarguide.recipes import RECIPES
 from polarguide.runs import memory_plan
 from polarguide.runs import train as training
 from polarguide.runs.folder import MOST_GAUSSIANS, resolve
 from polarguide.runs.memory_plan import GIBIBYTE, MemoryPlan, plan_field_memory, plan_memory
 from polarguide.training.settings import STEPS, ResolvedSettings, TrainSettings
+from polarguide_bench.gnerp.recipe import NeuralRecipe
+from polarguide_bench.gnerp.state import FieldState
 
 STOKES = RECIPES["polarguide-stokes"]
 LARGE = [1224 * 1024] * 60

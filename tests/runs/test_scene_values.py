@@ -17,13 +17,13 @@ from polarguide.capture.scene import chosen_views, far_from_training
 from polarguide.core.options import SceneOptions
 from polarguide.core.progress import Reporter
 from polarguide.core.system import MemoryBound
-from polarguide.experiments.options import CompareOptions
 from polarguide.recipes import recipe_named
 from polarguide.runs import train as training
 from polarguide.runs.folder import CONFIGURATION
 from polarguide.runs.train import TrainingStopped
 from polarguide.training.recipe import Schedule
 from polarguide.training.settings import TrainSettings
+from polarguide_bench.options import CompareOptions
 
 READING = SceneOptions(downscale=4)
 ASKED = TrainSettings(3)

@@ -17,9 +17,9 @@ from test_read import CUP, MONO, PLAIN, SHAPE, TINT, light, write_four, write_mo
 import polarguide
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.geometry.polarizer import malus
-from polarguide.shots.maps import ShotMaps
-from polarguide.shots.options import MeasureOptions, ShotOptions
-from polarguide.shots.read import read_shot
+from polarguide_shots.maps import ShotMaps
+from polarguide_shots.options import MeasureOptions, ShotOptions
+from polarguide_shots.read import read_shot
 
 ROI = MeasureOptions(roi=("pin=8,8,16,12", "rim=40,20,20,20"))
 

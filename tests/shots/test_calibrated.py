@@ -12,10 +12,10 @@ from heard import Heard
 from made_sensor import made_sensor, true_calibration, write_codes
 
 from polarguide.capture.sensor.analyzer_file import write_analyzers
-from polarguide.shots.measurement.line import measure_shots
-from polarguide.shots.options import ShotOptions
-from polarguide.shots.read import read_shot
-from polarguide.shots.write import write_shots
+from polarguide_shots.measurement.line import measure_shots
+from polarguide_shots.options import ShotOptions
+from polarguide_shots.read import read_shot
+from polarguide_shots.write import write_shots
 
 SIZE = (64, 96)
 

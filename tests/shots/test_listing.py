@@ -11,11 +11,11 @@ from faults import Fault
 
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.polarizer import ANGLES
-from polarguide.shots.exposures import find_shots
-from polarguide.shots.options import ShotOptions
-from polarguide.shots.read import read_shot
-from polarguide.shots.sets import ExposureSet
-from polarguide.shots.write import write_shots
+from polarguide_shots.exposures import find_shots
+from polarguide_shots.options import ShotOptions
+from polarguide_shots.read import read_shot
+from polarguide_shots.sets import ExposureSet
+from polarguide_shots.write import write_shots
 from tests.shots.test_read import CUP, MONO, PLAIN, write_four, write_mosaic
 
 BARE = tuple(f"I{angle}.png" for angle in ANGLES)

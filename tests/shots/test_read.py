@@ -17,10 +17,10 @@ from polarguide import optics
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.capture.write import write_view
 from polarguide.geometry.polarizer import ANGLES, malus
-from polarguide.shots.exposures import find_shots
-from polarguide.shots.maps import Reason, ShotMaps
-from polarguide.shots.options import ShotOptions
-from polarguide.shots.read import read_shot
+from polarguide_shots.exposures import find_shots
+from polarguide_shots.maps import Reason, ShotMaps
+from polarguide_shots.options import ShotOptions
+from polarguide_shots.read import read_shot
 
 SHAPE = (64, 96)
 TINT = (0.8, 1.2, 1.0)  # of the filters; their mean is 1

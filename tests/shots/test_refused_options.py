@@ -12,11 +12,11 @@ from faults import Fault
 
 import polarguide
 from polarguide.capture.calibration import Calibration
-from polarguide.shots.exposures import find_shots
-from polarguide.shots.options import ShotOptions
-from polarguide.shots.read import read_shot
-from polarguide.shots.sets import ExposureSet
-from polarguide.shots.write import write_shots
+from polarguide_shots.exposures import find_shots
+from polarguide_shots.options import ShotOptions
+from polarguide_shots.read import read_shot
+from polarguide_shots.sets import ExposureSet
+from polarguide_shots.write import write_shots
 from tests.helpers.heard import Heard
 from tests.shots.test_read import CUP, MONO, write_four, write_mosaic
 
@@ -102,7 +102,7 @@ def test_no_error_of_one_shot_stops_the_others(
             raise error
         return read_shot(shot, options)
 
-    monkeypatch.setattr("polarguide.shots.write.read_shot", read)
+    monkeypatch.setattr("polarguide_shots.write.read_shot", read)
     heard = Heard()
     done = write_shots([tmp_path], tmp_path / "out", MONO, formats=("npy",), reporter=heard)
     assert list(done.folders) == ["a", "c"]

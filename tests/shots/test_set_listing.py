@@ -13,12 +13,12 @@ from faults import Fault
 import polarguide
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.shots.exposures import find_shots, list_shots
-from polarguide.shots.measurement.fields import KEYS
-from polarguide.shots.options import ShotOptions, WatchOptions
-from polarguide.shots.read import read_shot
-from polarguide.shots.sets import ExposureSet
-from polarguide.shots.write import write_shots
+from polarguide_shots.exposures import find_shots, list_shots
+from polarguide_shots.measurement.fields import KEYS
+from polarguide_shots.options import ShotOptions, WatchOptions
+from polarguide_shots.read import read_shot
+from polarguide_shots.sets import ExposureSet
+from polarguide_shots.write import write_shots
 from tests.helpers.picture_sets import photographed, sphere, write_set
 
 SIX = (10, 40, 70, 100, 130, 160)

@@ -13,9 +13,9 @@ from faults import Fault
 
 from polarguide import optics
 from polarguide.capture.calibration import Calibration
-from polarguide.shots.maps import Reason, ShotMaps
-from polarguide.shots.options import ShotOptions
-from polarguide.shots.read import read_shot
+from polarguide_shots.maps import Reason, ShotMaps
+from polarguide_shots.options import ShotOptions
+from polarguide_shots.read import read_shot
 from tests.helpers.picture_sets import READ, WELL, photographed, plate, sphere, write_set
 
 SIX, ALL = range(10, 161, 30), range(0, 180, 5)

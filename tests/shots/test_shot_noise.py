@@ -11,9 +11,9 @@ import pytest
 
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.geometry.polarizer import ANGLES, malus
-from polarguide.shots.maps import Reason, interpolation_factors
-from polarguide.shots.options import ShotOptions
-from polarguide.shots.read import read_shot
+from polarguide_shots.maps import Reason, interpolation_factors
+from polarguide_shots.options import ShotOptions
+from polarguide_shots.read import read_shot
 
 FULL = 4095
 

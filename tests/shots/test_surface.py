@@ -14,11 +14,11 @@ import polarguide
 from polarguide import optics
 from polarguide.geometry.vectors import unit
 from polarguide.results.rendering.priors import resolving_normals
-from polarguide.shots.exposures import find_shots
-from polarguide.shots.maps import Developed, NoiseModel, ShotMaps
-from polarguide.shots.options import ShotOptions
-from polarguide.shots.read import TOWARD, camera_of, maps_of, parse_intrinsics, read_shot, surface_maps
-from polarguide.shots.sets import ExposureSet
+from polarguide_shots.exposures import find_shots
+from polarguide_shots.maps import Developed, NoiseModel, ShotMaps
+from polarguide_shots.options import ShotOptions
+from polarguide_shots.read import TOWARD, camera_of, maps_of, parse_intrinsics, read_shot, surface_maps
+from polarguide_shots.sets import ExposureSet
 
 VIEW = "v000"
 

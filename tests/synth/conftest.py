@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from polarguide.synth.settings import Variant, choose_variant
+from polarguide_synth.settings import Variant, choose_variant
 
 
 @pytest.fixture(scope="session", params=["compiled", "scalar"])
@@ -13,7 +13,7 @@ def variant(request: pytest.FixtureRequest) -> Iterator[Variant]:
     pytest.importorskip("mitsuba", reason="no Mitsuba -> pip install '.[synth]'")
     with pytest.MonkeyPatch.context() as patch:
         if request.param == "scalar":
-            patch.setattr("polarguide.synth.settings.missing_llvm", lambda: "not wanted here")
+            patch.setattr("polarguide_synth.settings.missing_llvm", lambda: "not wanted here")
         chosen = choose_variant("rgb", threads=1)
         if bool(chosen.note) != (request.param == "scalar"):
             pytest.skip("no LLVM for Mitsuba's compiled variants -> apt-get install libllvm19")

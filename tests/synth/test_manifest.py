@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from faults import Fault
 
-from polarguide.synth.folder import MANIFEST, folder_state, verify_scene
+from polarguide_synth.folder import MANIFEST, folder_state, verify_scene
 
 
 def scene(root: Path, listed: bytes = b"") -> Path:

@@ -21,13 +21,13 @@ from polarguide.capture.sensor.pattern import sensor_pattern
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.camera import Camera, look_at
 from polarguide.geometry.vectors import unit_array as unit
-from polarguide.synth.build import BuiltScene, _mesh, _user_mesh, build_scene
-from polarguide.synth.colmap import place_cameras
-from polarguide.synth.ground_truth import base_colors, ground_truth_maps, intersect
-from polarguide.synth.schema import parse_scene
-from polarguide.synth.sensor import LobeRadiance, Sensor, mosaic, noisy, render_lobes
-from polarguide.synth.settings import PRESETS, Variant, find_scene
-from polarguide.synth.transport import PathLimits
+from polarguide_synth.build import BuiltScene, _mesh, _user_mesh, build_scene
+from polarguide_synth.colmap import place_cameras
+from polarguide_synth.ground_truth import base_colors, ground_truth_maps, intersect
+from polarguide_synth.schema import parse_scene
+from polarguide_synth.sensor import LobeRadiance, Sensor, mosaic, noisy, render_lobes
+from polarguide_synth.settings import PRESETS, Variant, find_scene
+from polarguide_synth.transport import PathLimits
 
 INDEX = 1.5
 BALL = {

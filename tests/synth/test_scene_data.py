@@ -10,11 +10,11 @@ import plyfile
 import pytest
 from faults import Fault
 
-from polarguide.synth.build import area_light_dict, make_mesh
-from polarguide.synth.colmap import place_cameras
-from polarguide.synth.mesh import Mesh, write_ply
-from polarguide.synth.render import parse_sweep
-from polarguide.synth.schema import (
+from polarguide_synth.build import area_light_dict, make_mesh
+from polarguide_synth.colmap import place_cameras
+from polarguide_synth.mesh import Mesh, write_ply
+from polarguide_synth.render import parse_sweep
+from polarguide_synth.schema import (
     SceneSpec,
     only_fields,
     parse_scene,
@@ -24,8 +24,8 @@ from polarguide.synth.schema import (
     require_unicode,
     with_current_keys,
 )
-from polarguide.synth.settings import PRESETS, Overrides, find_scene
-from polarguide.synth.textures import ENVIRONMENTS, TEXTURES, directions, make_environment, make_texture
+from polarguide_synth.settings import PRESETS, Overrides, find_scene
+from polarguide_synth.textures import ENVIRONMENTS, TEXTURES, directions, make_environment, make_texture
 
 SMALL = {
     "name": "small",

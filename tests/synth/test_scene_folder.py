@@ -15,11 +15,11 @@ from tiny_capture import write_picture
 from polarguide import optics
 from polarguide.capture import load_scene
 from polarguide.core.progress import Reporter
-from polarguide.synth import render as runner
-from polarguide.synth.folder import MANIFEST, photograph, scene_digest, verify_scene
-from polarguide.synth.render import Sweep, sweep_scenes, synthesize
-from polarguide.synth.schema import SceneSpec, parse_scene
-from polarguide.synth.settings import (
+from polarguide_synth import render as runner
+from polarguide_synth.folder import MANIFEST, photograph, scene_digest, verify_scene
+from polarguide_synth.render import Sweep, sweep_scenes, synthesize
+from polarguide_synth.schema import SceneSpec, parse_scene
+from polarguide_synth.settings import (
     OLDEST_LLVM,
     Overrides,
     SynthSettings,
@@ -222,7 +222,7 @@ def test_members_of_a_sweep_sort_like_their_numbers(
 
 
 def test_without_llvm_the_scalar_variant_is_taken(variant: Variant, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("polarguide.synth.settings.missing_llvm", lambda: "none was found")
+    monkeypatch.setattr("polarguide_synth.settings.missing_llvm", lambda: "none was found")
     try:
         found = choose_variant("rgb")
         assert found.note

@@ -15,7 +15,6 @@ from textured_ball import textured_ball
 from viewer_scenes import frame_of_scene, photograph, shown
 
 from polarguide.capture.presentation import Crop
-from polarguide.fields.trainer import FieldTrainer
 from polarguide.geometry.camera import quaternion
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.trajectory import read_path
@@ -37,6 +36,7 @@ from polarguide.viewer.scenery import (
 from polarguide.viewer.server import view_run
 from polarguide.visualization import figures
 from polarguide.visualization.layers import polarization_picture
+from polarguide_bench.gnerp.trainer import FieldTrainer
 
 CAMERAS = ring()
 CAMERA = CAMERAS["v1"]

@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import difflib
 import functools
-import importlib
 import importlib.util
 import io
 import os
@@ -21,32 +20,32 @@ import tyro
 
 import polarguide
 from polarguide.cli.console import print_error, warnings_printed
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, import_part
 from polarguide.core.options import gibibytes
 from polarguide.core.system import check_variables, interrupts
 
 VERBS = {
-    "demo": ("runs", "demo"),
-    "calibrate": ("shots", "calibrate"),
-    "scale": ("shots", "scale"),
-    "prepare": ("captures", "prepare"),
-    "inspect": ("captures", "inspect"),
-    "train": ("runs", "train"),
-    "eval": ("runs", "evaluate"),
-    "render": ("runs", "render"),
-    "view": ("runs", "view"),
-    "present": ("captures", "present"),
-    "share": ("runs", "share"),
-    "export": ("runs", "export"),
-    "priors": ("shots", "priors"),
-    "measure": ("shots", "measure"),
-    "compare": ("compare", "compare"),
-    "ablate": ("compare", "ablate"),
-    "batch": ("batch", "batch"),
-    "synth": ("captures", "synth"),
-    "bench": ("compare", "bench"),
-    "tables": ("compare", "tables"),
-    "doctor": ("doctor", "doctor"),
+    "demo": ("polarguide.cli.runs", "demo"),
+    "calibrate": ("polarguide_shots.verbs", "calibrate"),
+    "scale": ("polarguide.cli.captures", "scale"),
+    "prepare": ("polarguide.cli.captures", "prepare"),
+    "inspect": ("polarguide.cli.captures", "inspect"),
+    "train": ("polarguide.cli.runs", "train"),
+    "eval": ("polarguide.cli.runs", "evaluate"),
+    "render": ("polarguide.cli.runs", "render"),
+    "view": ("polarguide.cli.runs", "view"),
+    "present": ("polarguide.cli.captures", "present"),
+    "share": ("polarguide.cli.runs", "share"),
+    "export": ("polarguide.cli.runs", "export"),
+    "priors": ("polarguide_shots.verbs", "priors"),
+    "measure": ("polarguide_shots.verbs", "measure"),
+    "compare": ("polarguide_bench.verbs.compare", "compare"),
+    "ablate": ("polarguide_bench.verbs.compare", "ablate"),
+    "batch": ("polarguide_bench.verbs.batch", "batch"),
+    "synth": ("polarguide_synth.verbs", "synth"),
+    "bench": ("polarguide_bench.verbs.compare", "bench"),
+    "tables": ("polarguide_bench.verbs.compare", "tables"),
+    "doctor": ("polarguide.cli.doctor", "doctor"),
 }
 """The module and the function of each verb. No module imports torch before a verb is called."""
 DESCRIPTION = (
@@ -58,7 +57,7 @@ DESCRIPTION = (
 def function_of(verb: str) -> Callable[..., Any]:
     """The function behind a verb; its signature and docstring are the verb's options and help."""
     module, name = VERBS[verb]
-    function: Callable[..., Any] = getattr(importlib.import_module(f"polarguide.cli.{module}"), name)
+    function: Callable[..., Any] = getattr(import_part(module, verb), name)
     # Options that several verbs share are the fields of dataclasses, and are called as these are.
     return tyro.conf.configure(tyro.conf.OmitArgPrefixes)(function)
 
@@ -72,14 +71,15 @@ def summary_of(verb: str) -> Callable[[], None]:
 
     def listed() -> None: ...
 
-    listed.__doc__ = _summaries(module)[name]
+    listed.__doc__ = _summaries(module).get(name, "(not installed)")
     return listed
 
 
 @functools.cache
 def _summaries(module: str) -> dict[str, str]:
     """First paragraphs of docstrings by function, of a module of verbs."""
-    spec = importlib.util.find_spec(f"polarguide.cli.{module}")
+    package, _, _ = module.partition(".")
+    spec = importlib.util.find_spec(module) if importlib.util.find_spec(package) else None
     source = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
     functions = [node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)]
     return {node.name: (ast.get_docstring(node) or "").partition("\n\n")[0] for node in functions}
@@ -176,7 +176,7 @@ def _while_loading(error: Exception) -> bool:
 
 
 _RUN_OUT = ("can't start new thread", "can't allocate memory", "not enough memory")
-_HOME = str(Path(__file__).parents[1]) + os.sep
+_HOME = str(Path(__file__).parents[1])  # also of the neighbors, whose names begin with it
 _SETTINGS = "Check the environment's variables for it (env), such as PYTORCH_JIT and TORCH_LOGS."
 _MORE_ROOM = "Check this shell's limits (ulimit -a) and what else runs; --threads 1 takes less."
 

@@ -140,6 +140,29 @@ def optional_import(module: str, what: str) -> Any:
             signal.signal(signal.SIGINT, before)
 
 
+def import_part(module: str, what: str) -> Any:
+    """Import a module of this package or of a neighbor, which is part of the same distribution.
+
+    Args:
+        module: its full name, such as "polarguide_shots.verbs". what: the verb or name that needs it, for the message.
+
+    Raises:
+        PolarguideError: the neighbor is not installed.
+    """
+    package = module.partition(".")[0]
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name != package:
+            raise
+        raise PolarguideError(
+            what,
+            expected=f"the package {package}, a part of polarguide",
+            found="that it is not installed",
+            remedy="Install polarguide again.",
+        ) from None
+
+
 def _missing(module: str, what: str) -> PolarguideError:
     return PolarguideError(
         what,

@@ -16,14 +16,13 @@ import numpy as np
 
 from polarguide.capture import Scene
 from polarguide.capture.exposures import Exposure, determine_stokes
+from polarguide.capture.picture_sets import SetSamples, chosen_pixels, judge
 from polarguide.capture.view import FULL_CODE, View, listed
 from polarguide.inspection.capture import Capture
 from polarguide.inspection.evidence import short_run
 from polarguide.inspection.settings import Check, Verdict
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
-from polarguide.shots.judge import chosen_pixels, judge
-from polarguide.shots.samples import SetSamples
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers
 from polarguide.training.recipe import Recipe
 from polarguide.training.trainer import StepReport

@@ -6,10 +6,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from polarguide.fields.recipe import FieldRates, FieldShape, NeuralRecipe, Sampling
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.directional import DirectionalShading
 from polarguide.training.recipe import Recipe, Repeat, Rounds, Stage, Weights
+from polarguide_bench.gnerp.recipe import FieldRates, FieldShape, NeuralRecipe, Sampling
 
 # Learning rates of the 3DGS release but for the geometry's, which belong to 30,000 steps: in some thousand, means and
 # scales have to learn twice as fast and rotations ten times. That of the means is times the scene's extent, and falls

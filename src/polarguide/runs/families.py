@@ -18,9 +18,6 @@ from polarguide.core.files import write_text
 from polarguide.core.progress import Reporter
 from polarguide.core.system import MemoryBound
 from polarguide.core.text import command
-from polarguide.fields.model import FieldModel
-from polarguide.fields.recipe import NeuralRecipe
-from polarguide.fields.trainer import FieldTrainer
 from polarguide.raster import Backend
 from polarguide.runs.folder import CHECKPOINT, PLY
 from polarguide.runs.health import Evidence, Polarization
@@ -37,6 +34,9 @@ from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.trainer import warn_of_unused_materials
 from polarguide.visualization.figures import contact_sheet, radiance_to_rgb, scalar_to_rgb, write_png
+from polarguide_bench.gnerp.model import FieldModel
+from polarguide_bench.gnerp.recipe import NeuralRecipe
+from polarguide_bench.gnerp.trainer import FieldTrainer
 
 METALS_PICTURE, METAL_VIEWS = "metals.png", 6
 """The picture of a run that shows what is metal, and how many training views it has at most."""

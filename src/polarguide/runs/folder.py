@@ -33,12 +33,12 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import atomic, in_utf8, make_folder, read_file, require_file, write_text, writing
 from polarguide.core.options import Transfer, index_of
 from polarguide.core.records import LARGEST_RECORD, decode
-from polarguide.fields.recipe import NeuralRecipe
-from polarguide.fields.state import FieldState
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.recipe import Method, Recipe
 from polarguide.training.settings import STEPS, Background, ResolvedSettings, TrainSettings
 from polarguide.training.state import TrainingState
+from polarguide_bench.gnerp.recipe import NeuralRecipe
+from polarguide_bench.gnerp.state import FieldState
 
 AnyState = TrainingState | FieldState
 CONFIGURATION = "run.json"

@@ -19,8 +19,8 @@ from polarguide.capture.layout import (
 )
 from polarguide.core.errors import PolarguideError
 from polarguide.core.system import free_memory, resident_memory
-from polarguide.fields.recipe import NeuralRecipe
 from polarguide.training.recipe import Recipe
+from polarguide_bench.gnerp.recipe import NeuralRecipe
 
 GIGABYTE = 10**9
 # Estimates by the tensors that there are: one training (24 steps, 1224 x 1024 x 60, 4 GB) took 12 % less than they say.

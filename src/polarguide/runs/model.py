@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from polarguide.capture.presentation import colored
-from polarguide.fields.model import FieldModel, Within
 from polarguide.gaussians.gaussians import CORE_SHAPES
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.ply import refit_sh, write_ply
@@ -27,6 +26,7 @@ from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.model import Light, Parameters, ShadingModel
 from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
 from polarguide.training.state import TrainingState
+from polarguide_bench.gnerp.model import FieldModel, Within
 
 
 def layers_of(shading: ShadingModel) -> tuple[str, ...]:

@@ -20,7 +20,6 @@ from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.options import DeviceName, PathLike, SceneOptions, check_choice
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.text import command
-from polarguide.fields.model import Within
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame, scene_frame
 from polarguide.raster import choose_backend
@@ -31,6 +30,7 @@ from polarguide.runs.health import Health
 from polarguide.runs.model import GaussianModel, Model
 from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
 from polarguide.training.recipe import Method
+from polarguide_bench.gnerp.model import Within
 
 Opened = TypeVar("Opened", bound="OpenedRun")
 

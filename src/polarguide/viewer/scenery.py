@@ -11,8 +11,6 @@ from torch import Tensor
 
 from polarguide.capture import View
 from polarguide.capture.presentation import Chart, Crop, Presentation, Vector, colored
-from polarguide.fields.model import FieldModel
-from polarguide.fields.trainer import FieldTrainer
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame
@@ -35,6 +33,8 @@ from polarguide.visualization.layers import (
     layer_scale,
     polarization_picture,
 )
+from polarguide_bench.gnerp.model import FieldModel
+from polarguide_bench.gnerp.trainer import FieldTrainer
 
 FIELD_SHARE = 4
 """A field is shown with so many times fewer pixels each way: it takes seconds for a picture of full size."""

@@ -10,9 +10,9 @@ import torch
 from known_scene import HEIGHT, WIDTH, known_scene, rendered
 
 from polarguide.capture.exposures import Exposure
-from polarguide.experiments.plan import black_share
 from polarguide.results.evaluation.scores import score_view, summarize
 from polarguide.results.evaluation.target import SceneFacts, ViewTarget, without_jumps
+from polarguide_bench.plan import black_share
 
 CPU = torch.device("cpu")
 SCENE = known_scene()

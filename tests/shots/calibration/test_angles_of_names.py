@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from faults import Fault
 
-from polarguide.shots.calibration.settings import CalibrateSettings
+from polarguide_shots.calibration.settings import CalibrateSettings
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,8 @@ from made_sensor import (
 from polarguide.capture.sensor.analyzer_file import read_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration
 from polarguide.core.progress import Reporter
-from polarguide.shots.calibration.calibrate import Calibrated, calibrate_sensor
-from polarguide.shots.calibration.settings import CalibrateSettings
+from polarguide_shots.calibration.calibrate import Calibrated, calibrate_sensor
+from polarguide_shots.calibration.settings import CalibrateSettings
 
 DEGREES = [float(angle) for angle in range(0, 180, 15)]
 DRIFT = list(1 + 0.15 * np.cos(2 * np.radians(np.array(DEGREES) - 25)))

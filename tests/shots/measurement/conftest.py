@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from camera_files import write_mosaics
 
-from polarguide.shots.maps import NoiseModel, Reason, ShotMaps
-from polarguide.shots.options import ShotOptions
+from polarguide_shots.maps import NoiseModel, Reason, ShotMaps
+from polarguide_shots.options import ShotOptions
 
 MONO = ShotOptions(sensor="IMX250MZR", bits=12)
 

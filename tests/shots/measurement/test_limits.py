@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from faults import Fault
 
-from polarguide.shots.maps import NoiseModel, Reason, ShotMaps
-from polarguide.shots.measurement.fields import Bound, Limits, faults, read_limits
-from polarguide.shots.measurement.pictures import _layers, _pixels_beyond, regions_picture
-from polarguide.shots.measurement.regions import Differences, Region, parse_regions, placed
 from polarguide.visualization.figures import LINE_HEIGHT
+from polarguide_shots.maps import NoiseModel, Reason, ShotMaps
+from polarguide_shots.measurement.fields import Bound, Limits, faults, read_limits
+from polarguide_shots.measurement.pictures import _layers, _pixels_beyond, regions_picture
+from polarguide_shots.measurement.regions import Differences, Region, parse_regions, placed
 
 
 def test_regions_with_and_without_names() -> None:

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from polarguide.shots.maps import Reason
-from polarguide.shots.measurement.fields import FIELDS, KEYS
-from polarguide.shots.measurement.regions import (
+from polarguide_shots.maps import Reason
+from polarguide_shots.measurement.fields import FIELDS, KEYS
+from polarguide_shots.measurement.regions import (
     Reference,
     Region,
     axial_mean,
     difference_figures,
     region_figures,
 )
-from polarguide.shots.sets import ExposureSet
+from polarguide_shots.sets import ExposureSet
 
 REGION = Region("part", 5, 7, 30, 21)
 

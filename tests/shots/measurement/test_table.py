@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from faults import Fault
 
-from polarguide.shots.measurement.fields import FORMAT, KEYS
-from polarguide.shots.measurement.line import measure_shots
-from polarguide.shots.measurement.table import CSV, LINES, Entry, FileStamp, Table, stamps
-from polarguide.shots.options import MeasureOptions, ShotOptions
+from polarguide_shots.measurement.fields import FORMAT, KEYS
+from polarguide_shots.measurement.line import measure_shots
+from polarguide_shots.measurement.table import CSV, LINES, Entry, FileStamp, Table, stamps
+from polarguide_shots.options import MeasureOptions, ShotOptions
 
 SETTINGS = {"threshold": 0.05}
 

@@ -16,10 +16,10 @@ import pytest
 
 from polarguide.core.progress import Reporter
 from polarguide.geometry.polarizer import ANGLES
-from polarguide.shots.measurement.line import measure_shots
-from polarguide.shots.measurement.table import CSV, LINES
-from polarguide.shots.measurement.watch import watch_folder
-from polarguide.shots.options import MeasureOptions, ShotOptions, WatchOptions
+from polarguide_shots.measurement.line import measure_shots
+from polarguide_shots.measurement.table import CSV, LINES
+from polarguide_shots.measurement.watch import watch_folder
+from polarguide_shots.options import MeasureOptions, ShotOptions, WatchOptions
 from tests.shots.test_read import PLAIN, write_four
 
 QUICK = WatchOptions(settle=0.1, patience=0.4, idle=0.2)
@@ -107,7 +107,7 @@ def test_a_whole_file_that_is_no_mosaic_is_not_waited_for(tmp_path: Path, readin
 def test_a_file_that_changes_while_it_is_read_is_measured_once(
     folder: Path, tmp_path: Path, reading: ShotOptions, monkeypatch
 ) -> None:
-    from polarguide.shots.measurement import line
+    from polarguide_shots.measurement import line
 
     read, touched = line.read_shot, []
 

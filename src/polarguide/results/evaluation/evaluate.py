@@ -21,7 +21,6 @@ from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import peak_memory_mib
-from polarguide.fields.model import FieldModel
 from polarguide.optics import Mount
 from polarguide.optics.color import shown
 from polarguide.results.evaluation.mesh import mesh_scores
@@ -37,6 +36,7 @@ from polarguide.shading.result import RenderResult
 from polarguide.training.angles.fit import fit_angle
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture, contact_sheet
+from polarguide_bench.gnerp.model import FieldModel
 
 ERRORS_FILE = "errors.png"
 MOST_VIEWS = 8

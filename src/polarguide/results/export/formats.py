@@ -31,7 +31,6 @@ from polarguide.core.options import (
     check_finite,
 )
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.fields.model import FieldModel
 from polarguide.optics.color import srgb_encode
 from polarguide.results.export.cameras import write_cameras
 from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
@@ -61,6 +60,7 @@ from polarguide.results.rendering.relight import (
 from polarguide.runs.model import write_run_ply
 from polarguide.runs.opened import OpenedRun
 from polarguide.visualization import figures
+from polarguide_bench.gnerp.model import FieldModel
 
 PANORAMA_HEIGHT = 512
 SPLATS = ("ply", "spz", "sog", "splat-glb", "splat-usdz", "points")

@@ -16,11 +16,11 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from polarguide.core.errors import PolarguideError, optional_import
-from polarguide.fields.model import FieldModel
 from polarguide.geometry.camera import Camera, seen_at
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.vectors import dot, unit
 from polarguide.shading.result import RenderResult
+from polarguide_bench.gnerp.model import FieldModel
 
 TRUNCATION = 4.0  # voxels
 _SLAB = 1 << 21  # voxels at a time

@@ -18,7 +18,6 @@ from polarguide.core.files import atomic, make_folder, require_inside, write_who
 from polarguide.core.options import PathLike, PictureFormat, check_choice
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import to_json
-from polarguide.fields.model import Within
 from polarguide.geometry.camera import Camera
 from polarguide.optics import luminance
 from polarguide.results.rendering.relight import write_exr
@@ -36,6 +35,7 @@ from polarguide.visualization.layers import (
     true_depths,
     true_name,
 )
+from polarguide_bench.gnerp.model import Within
 
 SHEET_VIEWS = 8
 CONTACT_SHEET = "contact_sheet.png"

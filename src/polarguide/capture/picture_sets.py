@@ -1,0 +1,277 @@
+"""Pictures of one place through a filter at known angles: which of them contradict the others.
+
+Wrong angles, other exposures and motion show in how far a picture is from what the others predict.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+from polarguide.capture.exposures import WELL_CONDITIONED, Exposure, conditioning, nominal
+from polarguide.capture.view import FULL_CODE
+
+Mask = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+MARKS = 2.0
+"""Degrees to which a ring is set by its marks: an angle that is off by less is not called wrong."""
+AGAINST = 4.0
+"""Times the typical difference of the other pictures from which on one contradicts them."""
+BRIGHTER = 0.03
+"""Share of the light from which on a picture that contradicts the others is called brighter, or darker."""
+MOST_PIXELS = 20_000
+"""Most pixels of a set that are compared."""
+FEWEST_PIXELS = 200
+"""Number of pixels from which on pictures are compared."""
+_TELLING = 1.0
+"""Degrees of standard error up to which the light tells a picture's angle."""
+_OVER_NOISE = 3.0
+"""Times what noise alone makes of it, from which on a variation of the polarization over the picture is one."""
+
+
+@dataclass(frozen=True, eq=False)
+class SetSamples:
+    """The pictures of a set, before anything is fitted.
+
+    Attributes:
+        labels: labels of the pictures, for messages.
+        values: [K, H, W, C] linear, uint16 codes or float32 intensities; C is 1 where all pictures are gray.
+        exposures: exposures of the pictures: the angle in degrees, counter-clockwise as displayed, and the gain.
+        lost: [K, H, W], samples at full scale.
+        dark: [H, W], 0 in all pictures. masked: [H, W].
+        step: one stored value as a share of full scale.
+        notes: for the user.
+    """
+
+    labels: tuple[str, ...]
+    values: NDArray[Any]
+    exposures: tuple[Exposure, ...]
+    lost: Mask
+    dark: Mask
+    masked: Mask
+    step: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def rows(self) -> NDArray[np.float32]:
+        """Malus's law as a matrix [K, 3]: the intensity of a picture is its row times the Stokes vector."""
+        pairs = nominal(self.exposures).numpy()
+        return np.asarray(np.concatenate((np.ones_like(pairs[:, :1]), pairs), axis=1) / 2, np.float32)
+
+    @property
+    def gains(self) -> NDArray[np.float32]:
+        """By what the samples of each picture are divided, [K]."""
+        return np.array([exposure.gain for exposure in self.exposures], np.float32)
+
+    def intensities(self, at: Any) -> NDArray[np.float32]:
+        """Linear intensities on one exposure of some pixels, [K, ..., C]; ``at`` indexes [H, W]."""
+        chosen = self.values[(slice(None), *at)] if isinstance(at, tuple) else self.values[:, at]
+        scale = np.float32(FULL_CODE) if self.values.dtype == np.uint16 else np.float32(1)
+        gains = self.gains.reshape(-1, *[1] * (chosen.ndim - 1))
+        return np.asarray(chosen.astype(np.float32) / (scale * gains))
+
+    def gray(self, at: Any) -> NDArray[np.float32]:
+        """The same of the luminance, the plain mean of the colors: [K, ...]."""
+        colors = self.intensities(at)
+        return luminance(colors)
+
+
+def luminance(colors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The plain mean of one or three colors [..., C], contiguous: [...]. Written out: NumPy's mean of three is slow."""
+    if colors.shape[-1] == 1:
+        return np.ascontiguousarray(colors[..., 0])
+    return np.asarray((colors[..., 0] + colors[..., 1] + colors[..., 2]) / np.float32(3))
+
+
+@dataclass(frozen=True)
+class PictureFit:
+    """One picture of a set, compared with what the others predict.
+
+    Attributes:
+        label: its file, and frame of a video.
+        angle: that was fitted with: as stated, after sense, zero and orientation, degrees.
+        gain: by which its samples were divided.
+        looks_like: angle at which the others predict it best, degrees; None where the light does not tell.
+        error: standard error of ``looks_like``, degrees; None with it.
+        residual: root mean square of what the others leave unexplained, in full scales.
+        left_out: whether it was left out of the fit.
+    """
+
+    label: str
+    angle: float
+    gain: float
+    looks_like: float | None
+    error: float | None
+    residual: float
+    left_out: bool
+
+
+@dataclass(frozen=True)
+class SetJudgment:
+    """The comparison of the pictures of a set with one another.
+
+    Attributes:
+        pictures: the comparison of each picture with the others.
+        used: [K] bool, the pictures that agree and are fitted.
+        notes: messages for the user.
+    """
+
+    pictures: tuple[PictureFit, ...]
+    used: NDArray[np.bool_]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Angle:
+    """Prediction of a picture from the others: apparent angle, its error (radians; None: undetermined), gain."""
+
+    angle: float | None
+    error: float
+    gain: float
+    residual: float
+
+
+def chosen_pixels(samples: SetSamples) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Rows and columns of pixels that are good in every picture, spread over the picture."""
+    good = ~(samples.dark | samples.masked)
+    for lost in samples.lost:
+        good &= ~lost
+    places = np.flatnonzero(good)
+    places = places[:: max(1, len(places) // MOST_PIXELS)]
+    return np.unravel_index(places, good.shape)  # type: ignore[return-value]
+
+
+def judge(samples: SetSamples, gray: Floats) -> SetJudgment:
+    """Compare the pictures of a set with one another, and choose those that are fitted.
+
+    Each picture is fitted with Malus's law at an unknown angle and gain to the Stokes vectors of the others, over all
+    pixels at once. The picture with the largest deviation is left out, as long as enough others agree without it.
+
+    Args:
+        samples: the set. gray: [K, N], its luminance at some pixels that are good in every picture.
+    """
+    rows, count = samples.rows.astype(np.float64), len(samples.labels)
+    used = np.ones(count, bool)
+    reasons: dict[int, str] = {}
+    while gray.shape[1] >= FEWEST_PIXELS:
+        predicted = {k: _predicted(rows, gray, used, k) for k in np.flatnonzero(used).tolist()}
+        # The picture without which least is left of the rest, and the one whose angle is off most.
+        doubtful = (
+            max(predicted, key=lambda k: predicted[k].residual),
+            max(predicted, key=lambda k: _off(samples, k, predicted[k])),
+        )
+        worst = next((k for k in doubtful if _contradicts(samples, gray, used, k, predicted)), None)
+        if worst is None:
+            break
+        used[worst], reasons[worst] = False, _reason(samples, worst, predicted[worst])
+    fits = tuple(_picture(samples, k, _predicted(rows, gray, used, k), bool(used[k])) for k in range(count))
+    notes = [reasons[k] for k in sorted(reasons)]
+    off_by = [abs(_apart(f.looks_like, f.angle)) for f in fits if f.looks_like is not None and not f.left_out]
+    if count > 3 and off_by and np.median(off_by) > MARKS:
+        notes.append(
+            f"The angles contradict one another by {np.median(off_by):.0f} degrees (median); "
+            f"{int(used.sum())} pictures do not tell which are wrong."
+        )
+    return SetJudgment(fits, used, tuple(notes))
+
+
+def _apart(angle: float, other: float) -> float:
+    """Difference of two angles in degrees modulo 180, in [-90, 90)."""
+    return (angle - other + 90.0) % 180.0 - 90.0
+
+
+def _off(samples: SetSamples, k: int, predicted: _Angle) -> float:
+    """How far a picture's angle is off, degrees; 0 where the light does not tell."""
+    if predicted.angle is None:
+        return 0.0
+    return abs(_apart(math.degrees(predicted.angle), samples.exposures[k].angle or 0.0))
+
+
+def _contradicts(
+    samples: SetSamples, gray: Floats, used: NDArray[np.bool_], worst: int, predicted: dict[int, _Angle]
+) -> bool:
+    """Whether the others agree with one another far better than a picture does with them, by angle or residual."""
+    rows, rest = samples.rows.astype(np.float64), used.copy()
+    rest[worst] = False
+    if rest.sum() < 4 or conditioning(torch.from_numpy(2 * rows[rest, 1:])) < WELL_CONDITIONED:
+        return False
+    others = {k: _predicted(rows, gray, rest, k) for k in np.flatnonzero(rest).tolist()}
+    typical = float(np.median([_off(samples, k, other) for k, other in others.items()]))
+    left = float(np.median([other.residual for other in others.values()]))
+    by_angle = _off(samples, worst, predicted[worst]) > max(MARKS, AGAINST * typical)
+    return by_angle or predicted[worst].residual > AGAINST * left
+
+
+def _reason(samples: SetSamples, k: int, predicted: _Angle) -> str:
+    """The reason why a picture is rejected, for the user."""
+    head = f"{samples.labels[k]} ({samples.exposures[k].angle or 0.0:g} degrees)"
+    if _off(samples, k, predicted) > MARKS:
+        looks = f"{math.degrees(predicted.angle or 0.0) % 180:.0f} degrees"
+        return f"{head} looks like {looks}: its angle is probably wrong. It is left out."
+    if abs(predicted.gain - 1) > BRIGHTER:
+        way = "brighter" if predicted.gain > 1 else "darker"
+        by = f"{abs(predicted.gain - 1):.0%} {way}"
+        return f"{head} is {by} than the others predict (exposure or light). It is left out."
+    return f"{head} contradicts the others (motion, light or a wrong angle). It is left out."
+
+
+def _predicted(rows: Floats, gray: Floats, used: NDArray[np.bool_], k: int) -> _Angle:
+    """One picture as the others predict it: by least squares over angle and gain.
+
+    With m = (1, cos 2t, sin 2t) / 2 times the Stokes vector, the angle t has the least sum of (I - g m)^2. Moments of
+    the Stokes vectors are taken without what noise adds to them, or unpolarized light would tell an angle.
+    """
+    if not gray.shape[1]:  # some picture clips everywhere
+        return _Angle(None, math.inf, 1.0, 0.0)
+    others = used.copy()
+    others[k] = False
+    inverse = np.linalg.pinv(rows[others])
+    stokes, picture = inverse @ gray[others], gray[k]
+    pixels = picture.size
+    left = gray[others] - rows[others] @ stokes
+    freedom = int(others.sum()) - 3
+    off = picture - rows[k] @ stokes
+    leverage = float(((rows[k] @ inverse) ** 2).sum())
+    residual = math.sqrt(float(np.mean(off**2)) / (1 + leverage))
+    # Robust: a few pixels that moved do not make all of them noisy. Without redundancy, the picture's own residual.
+    noise = residual**2 if freedom < 1 else typical_variance((left**2).sum(axis=0), freedom)
+    extra = noise * inverse @ inverse.T / 4
+    moments = stokes @ stokes.T / (4 * pixels) - extra
+    product = stokes @ picture / (2 * pixels)
+    turns = np.radians(np.arange(0.0, 180.0, 0.1))
+    forms = np.stack([np.ones_like(turns), np.cos(2 * turns), np.sin(2 * turns)])
+    along = np.maximum((forms * (moments @ forms)).sum(axis=0), 1e-30)
+    gain = product @ forms / along
+    best = int(np.argmax(np.where(gain > 0, gain * (product @ forms), -np.inf)))
+    form = forms[:, best]
+    slope = 2 * np.array([0.0, -form[2], form[1]])
+    spread = float(slope @ moments @ slope - (slope @ moments @ form) ** 2 / along[best])
+    certain = spread > _OVER_NOISE * float(slope @ extra @ slope) and spread > 0
+    error = math.sqrt(noise * (1 + leverage) / (pixels * spread)) / float(gain[best]) if certain else math.inf
+    determined = math.degrees(error) < _TELLING
+    return _Angle(float(turns[best]) if determined else None, error, float(gain[best]), residual)
+
+
+def typical_variance(squares: Floats, freedom: int) -> float:
+    """The variance of which sums of ``freedom`` squares are, by their median."""
+    return float(np.median(squares)) / float(2 * gammaincinv(freedom / 2, 0.5))
+
+
+def _picture(samples: SetSamples, k: int, angle: _Angle, used: bool) -> PictureFit:
+    exposure = samples.exposures[k]
+    determined = angle.angle is not None
+    return PictureFit(
+        label=samples.labels[k],
+        angle=exposure.angle or 0.0,
+        gain=exposure.gain,
+        looks_like=round(math.degrees(angle.angle or 0.0) % 180, 1) if determined else None,
+        error=math.degrees(angle.error) if determined else None,
+        residual=angle.residual,
+        left_out=not used,
+    )

@@ -1,1 +1,0 @@
-"""Comparisons and ablations: many runs, their tables and their report."""

@@ -1,0 +1,413 @@
+"""Train and score several recipes on several scenes, or a recipe and its ablations, and write what they score."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from datetime import datetime, timezone
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from polarguide import __version__
+from polarguide.capture.layout import refuse_scene
+from polarguide.capture.variants import count_of
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import check_out, make_folder, require_inside, write_text
+from polarguide.core.options import MOST, ComputeOptions, PathLike, check_choice, check_count
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.records import decode
+from polarguide.core.system import only_writer
+from polarguide.raster import choose_backend
+from polarguide.recipes import recipe_named
+from polarguide.recipes.registry import ABLATIONS, ablations_of
+from polarguide.results.evaluation.record import code_digest, commit
+from polarguide.results.evaluation.table import COLUMNS, PART_METRICS
+from polarguide.training.recipe import Method
+from polarguide.training.settings import TrainSettings
+from polarguide_bench.children import STDERR, Scoring, Task, Training
+from polarguide_bench.cluster import workers
+from polarguide_bench.job_queue import Job, run_job, run_jobs
+from polarguide_bench.options import MOST_SEEDS, CompareOptions
+from polarguide_bench.plan import (
+    Comparison,
+    PlannedRun,
+    SceneEntry,
+    jobs_at_a_time,
+    most_memory,
+    own_gpus,
+    plan_runs,
+    scene_entries,
+)
+from polarguide_bench.record import FORMAT, REMEDY, Record
+from polarguide_bench.report import exposure_svg, read_study, study_svg, write_report
+from polarguide_bench.results import Results
+from polarguide_bench.tables import write_tables
+
+LOCK = ".lock"
+BESIDE_OTHERS = "beside_others.txt"
+"""Marks a run folder whose training shared the machine, so that its seconds do not count."""
+
+
+def compare(
+    scenes: Sequence[PathLike],
+    recipes: Sequence[str | Method],
+    out: PathLike,
+    *,
+    settings: TrainSettings = TrainSettings(),
+    options: CompareOptions = CompareOptions(),
+    seeds_of: Mapping[str, int] = MappingProxyType({}),
+    steps_of: Mapping[str, int] = MappingProxyType({}),
+    command_line: str = "",
+    reporter: Reporter = SILENT,
+) -> Results:
+    """Train and score every recipe on every scene with every seed, each run in processes of its own.
+
+    Writes ``results.json``, ``.md``, ``.csv``, ``.tex`` and ``report.html`` to ``out``, and the runs to its ``runs/``;
+    paired differences go to ``differences.csv``, scores by object and material to ``parts.csv``, where there are any;
+    with ``options.exposures``, ``exposures.svg`` has the scores over the number of pictures taken.
+    Finished runs are found again and not repeated. KeyboardInterrupt is passed on after the runs at work have saved
+    their state; the same call goes on with them.
+
+    Args:
+        scenes: scene folders with names of their own.
+        recipes: the methods in the order of the tables, by name, or as they are registered.
+        out: folder to write.
+        settings: of each training; ``seed`` is the first of ``options.seeds``. None takes 5,000 steps, since those of
+            scenes of different sizes are to be comparable; the rest as ``train`` does for every scene.
+        options: how runs are trained, timed and shown.
+        seeds_of: by the name of a recipe, how many seeds where that is not ``options.seeds``.
+        steps_of: by the name of a recipe, how many steps where that is not ``settings.steps``.
+        command_line: for the record, if not ``polarguide compare``.
+        reporter: receives messages and progress.
+
+    Returns:
+        What was written, as data frames. A run that failed is in ``runs``, with its error; the others are not affected.
+
+    Raises:
+        PolarguideError: wrong input, or another comparison at work in ``out``.
+    """
+    comparison = Comparison(
+        scenes=tuple(_folder(scene) for scene in scenes),
+        recipes=_checked_recipes(recipes),
+        settings=settings,
+        options=options,
+        out=Path(out),
+        seeds_of=dict(seeds_of),
+        steps_of=dict(steps_of),
+        command_line=command_line,
+    )
+    names = [recipe.name for recipe in comparison.recipes]
+    for word, of, most in (("seeds_of", seeds_of, MOST_SEEDS), ("steps", steps_of, MOST)):
+        for name, count in of.items():
+            check_choice(word, name, names)
+            check_count(word, count, 1, most)
+    if not scenes:
+        raise PolarguideError("compare", expected="a scene", found="none", remedy="Name at least one scene.")
+    check_out(comparison.out)
+    refuse_scene(comparison.out)
+    if options.against is not None:
+        check_choice("against", options.against, [row.name for row in comparison.rows])
+    if options.local:
+        choose_backend(options.device)
+    entries = scene_entries(comparison, reporter)
+    plan = plan_runs(comparison, entries)
+    make_folder(comparison.out)
+    require_inside(comparison.out, *(run.folder for run in plan))
+    with locked(comparison.out):
+        failures = _train(comparison, entries, plan, reporter)
+        if options.speed:
+            _time(comparison, plan, reporter)
+        results = collect(comparison, entries, plan, failures)
+        write_tables(comparison.out, results)
+        write_report(comparison, entries, plan, results, reporter)
+        _write_charts(comparison, entries, results)
+    return results
+
+
+def ablate(
+    scenes: Sequence[PathLike],
+    base: str,
+    out: PathLike,
+    *,
+    only: Sequence[str] = (),
+    reference: Sequence[str | Method] = (),
+    settings: TrainSettings = TrainSettings(),
+    options: CompareOptions = CompareOptions(),
+    reporter: Reporter = SILENT,
+) -> Results:
+    """``compare`` with a recipe and its ablations; it shares runs with a comparison in the same folder.
+
+    Differences are to the recipe, unless ``options.against`` names another.
+
+    Args:
+        scenes, out, settings, options, reporter: as for ``compare``.
+        base: name of the recipe whose ablations to train.
+        only: names of the ablations to take, such as without-normals; all if empty.
+        reference: recipes to add as first rows.
+
+    Raises:
+        PolarguideError: as ``compare``; or a recipe without ablations, or an ablation that it does not have.
+    """
+    recipes = [*reference, *ablated(base, only)]
+    options = replace(options, against=options.against or base)
+    return compare(scenes, recipes, out, settings=settings, options=options, reporter=reporter)
+
+
+def _folder(scene: object) -> Path:
+    """The folder of a scene: runs are trained in other processes, which read it from there."""
+    if isinstance(scene, str | os.PathLike):
+        return Path(scene)
+    raise PolarguideError(
+        "scenes",
+        expected="paths of scene folders",
+        found=f"a {type(scene).__name__}",
+        remedy="Pass scene.root: other processes read the scene from its folder.",
+    )
+
+
+def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
+    """The names of a recipe and of its ablations, or of those of them that are in ``only``.
+
+    Args:
+        base: a recipe.
+        only: ablations with or without ``base:`` before the name; all if empty.
+
+    Raises:
+        PolarguideError: a recipe without ablations, or an ablation that it does not have.
+    """
+    names = [recipe.name.removeprefix(f"{base}:") for recipe in ablations_of(base)]
+    if not names:
+        expected = "a recipe with ablations: " + ", ".join(ABLATIONS)
+        remedy = "Take one of these, or use compare."
+        raise PolarguideError("base", expected=expected, found=base, remedy=remedy)
+    selected = [name.removeprefix(f"{base}:") for name in only]
+    for name in selected:
+        check_choice("only", name, names)
+    return (base, *(f"{base}:{name}" for name in names if name in selected or not only))
+
+
+def _checked_recipes(recipes: Sequence[str | Method]) -> tuple[Method, ...]:
+    """The recipes as they are registered: runs are trained in other processes, which know recipes by name."""
+    registered = tuple(recipe_named(recipe if isinstance(recipe, str) else recipe.name) for recipe in recipes)
+    for passed, own in zip(recipes, registered, strict=True):
+        if isinstance(passed, Method) and passed != own:
+            raise PolarguideError(
+                "recipes",
+                expected=f"the registered recipe {own.name}",
+                found="a recipe of this name with other values",
+                remedy="Give it another name, and register it under the entry points polarguide.recipes.",
+            )
+    if not registered:
+        remedy = "Name at least one recipe."
+        raise PolarguideError("compare", expected="a recipe", found="none", remedy=remedy)
+    names = [recipe.name for recipe in registered]
+    if len(set(names)) < len(names):
+        remedy = "Name each once."
+        raise PolarguideError(
+            "recipes", expected="no name more than once", found=" ".join(names), remedy=remedy
+        )
+    return registered
+
+
+def _train(
+    comparison: Comparison, scenes: Sequence[SceneEntry], plan: Sequence[PlannedRun], reporter: Reporter
+) -> dict[Path, str]:
+    """Train and score what is missing; the last words of what failed, by run folder."""
+    unfinished = [run for run in plan if run.state() != "done"]
+    reporter.say(f"runs: {len(plan)}, of them finished before: {len(plan) - len(unfinished)}")
+    failures: dict[Path, str] = {}
+    if not unfinished:
+        return failures
+    options = comparison.options
+    gpus = own_gpus(choose_backend(options.device)) if options.local else ()
+    memory = most_memory(unfinished)
+    parallel = jobs_at_a_time(options, len(unfinished), memory, gpus)
+    alone = options.local and parallel == 1
+    jobs = [_job(comparison, run, alone=alone) for run in unfinished]
+
+    def end(job: Job, error: str | None) -> None:
+        if error is None:
+            (job.folder / STDERR).unlink(missing_ok=True)
+        else:
+            failures[job.folder] = error
+        write_tables(comparison.out, collect(comparison, scenes, plan, failures))
+
+    try:
+        with workers(
+            options, count=parallel, threads=options.threads, memory=memory, gpus=gpus, reporter=reporter
+        ) as at:
+            run_jobs(jobs, at, reporter=reporter, on_end=end)
+    except KeyboardInterrupt:
+        reporter.say("The runs at work have saved their state: the same comparison goes on with them.")
+        raise
+    return failures
+
+
+def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
+    """The tasks that finish a run."""
+    compute, folder = _compute(comparison), str(run.folder.absolute())
+    training = Training(
+        scene=str(run.scene.path.absolute()),
+        folder=folder,
+        recipe=run.recipe.name,
+        settings=run.settings,
+        reading=run.reading,
+        compute=compute,
+    )
+    scoring = Scoring(folder, alone, compute)
+
+    def tasks() -> Sequence[Task]:
+        if run.state() not in ("new", "begun"):
+            return (scoring,)
+        if not alone:
+            make_folder(run.folder)
+            write_text(run.folder / BESIDE_OTHERS, "Trained beside other runs: its seconds do not count.\n")
+        return (training, scoring)
+
+    return run_job(run.label, run.folder, tasks, run.steps)
+
+
+def _compute(comparison: Comparison) -> ComputeOptions:
+    return ComputeOptions(comparison.options.threads, comparison.options.device)
+
+
+def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter) -> None:
+    """Time the pictures of finished runs that have not been timed alone, one after the other."""
+    untimed = [run for run in plan if (record := run.metrics()) is not None and record["fps"] is None]
+    if not untimed:
+        return
+    reporter.say(f"timing the pictures of {len(untimed)} runs, one after the other")
+    jobs = [_timing(comparison, run) for run in untimed]
+    options = comparison.options
+    gpus = own_gpus(choose_backend(options.device))
+    with workers(options, count=1, threads=options.threads, memory=0, gpus=gpus, reporter=reporter) as at:
+        run_jobs(jobs, at, reporter=reporter)
+    missed = [run for run in untimed if (record := run.metrics()) is None or record["fps"] is None]
+    if missed:
+        reporter.warn(f"no speed for {len(missed)} runs: they failed, or were not alone on the machine.")
+
+
+def _timing(comparison: Comparison, run: PlannedRun) -> Job:
+    """Score a run again, with its speed."""
+    scoring = Scoring(str(run.folder.absolute()), True, _compute(comparison))
+    return run_job(run.label, run.folder, lambda: (scoring,), run.steps)
+
+
+@contextlib.contextmanager
+def locked(folder: Path, what: str = "comparison") -> Iterator[None]:
+    """Keep two comparisons (or two of something else) out of an existing folder.
+
+    Children on this machine inherit the lock and hold it if the parent is killed, until they have saved their state.
+    """
+    with only_writer(
+        folder / LOCK,
+        expected="a folder that nobody is writing to",
+        found=f"another {what} at work in it",
+    ):
+        yield
+
+
+def collect(
+    comparison: Comparison,
+    scenes: Sequence[SceneEntry],
+    plan: Sequence[PlannedRun],
+    failures: Mapping[Path, str],
+) -> Results:
+    """The results of a comparison as far as its runs are.
+
+    Args:
+        comparison, scenes, plan: the requested comparison.
+        failures: last words of runs that failed, by their folders.
+    """
+    options, settings = comparison.options, comparison.settings
+    content = {
+        "format": FORMAT,
+        "provenance": {
+            "version": __version__,
+            "commit": commit(),
+            "sources": code_digest(),
+            "command": comparison.command,
+            "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        },
+        "settings": {
+            "steps": comparison.steps,
+            "seeds": options.seeds,
+            "downscale": options.downscale,
+            "transfer": options.transfer,
+            "refractive_index": settings.refractive_index,
+            "threads": options.threads,
+            "jobs": options.jobs,
+            "against": options.against,
+            "background": settings.background,
+            "materials": settings.materials,
+        },
+        "scenes": [_scene_record(scene, comparison) for scene in scenes],
+        "recipes": [
+            {"name": row.name, "about": row.about, "data": row.recipe.data()}
+            | ({} if row.steps is None else {"steps": row.steps})
+            for row in comparison.rows
+        ],
+        "runs": [_run_record(comparison, run, failures.get(run.folder)) for run in plan],
+    }
+    return Results(decode(content, Record, "results.json", remedy=REMEDY))
+
+
+def _scene_record(scene: SceneEntry, comparison: Comparison) -> dict[str, Any]:
+    record: dict[str, Any] = {key: getattr(scene, key) for key in ("name", "digest", "views", "black_share")}
+    record["test_views"] = list(scene.test_views)
+    if scene.warnings:
+        record["warnings"] = list(scene.warnings)
+    if comparison.settings.refractive_index is None:
+        record["refractive_index"] = comparison.index_of(scene)
+    return record
+
+
+def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) -> dict[str, Any]:
+    record: dict[str, Any] = {"scene": run.scene.name, "recipe": run.row.name, "seed": run.settings.seed}
+    record["folder"] = run.folder.relative_to(comparison.out).as_posix()
+    scores = run.metrics() if run.state() == "done" else None
+    if scores is None:
+        state = "missing" if failure is None else "failed"
+        record |= {"state": state, "error": failure, "metrics": None, "views": {}}
+        return {**record, "lpips_reason": None, "mesh_reason": None}
+    metrics = {metric.key: scores.get(metric.key) for metric in COLUMNS}
+    if (run.folder / BESIDE_OTHERS).exists():
+        metrics["train_seconds"] = None
+    parts = {
+        kind: {
+            name: {"material": part.get("material"), "pixels": part["pixels"], "views": part["views"]}
+            | {"metrics": {m.key: part[m.key] for m in PART_METRICS if m.key in part}}
+            for name, part in (scores.get(kind) or {}).items()
+        }
+        for kind in ("objects", "materials")
+    }
+    return {
+        **record,
+        "state": "done",
+        "error": None,
+        "metrics": metrics,
+        "lpips_reason": scores.get("lpips_reason"),
+        "mesh_reason": scores.get("mesh_fscore_1_reason"),
+        "views": {
+            name: {m.key: of[m.key] for m in COLUMNS if m.key in of} for name, of in scores["views"].items()
+        },
+        **parts,
+    }
+
+
+def _write_charts(comparison: Comparison, scenes: Sequence[SceneEntry], results: Results) -> None:
+    """Write ``study.svg`` of a family of scenes, and ``exposures.svg`` of several kinds of captures."""
+    drawn = {"study.svg": study_svg(results, {scene.name: read_study(scene.path) for scene in scenes})}
+    if len(comparison.options.exposures) > 1:
+        counts = {
+            (scene.name, row.name): count_of(row.exposures, scene.views - len(scene.test_views))
+            for scene in scenes
+            for row in comparison.rows
+        }
+        drawn["exposures.svg"] = exposure_svg(results, counts)
+    for name, text in drawn.items():
+        if text is not None:
+            write_text(comparison.out / name, text)

@@ -1,0 +1,165 @@
+"""A trained field, for whoever scores or shows it: it renders layers as every model does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import unit
+from polarguide.optics.color import srgb_decode
+from polarguide.shading.model import PLAIN, ShadingModel
+from polarguide.shading.result import RenderResult
+from polarguide_bench.gnerp.field import Field
+from polarguide_bench.gnerp.march import march, trace
+from polarguide_bench.gnerp.recipe import NeuralRecipe
+from polarguide_bench.gnerp.state import FieldState
+
+CHUNK = 4096
+"""Rays at a time."""
+Within = Callable[[Tensor], Tensor]
+"""Which places [N, 3] of the scene are shown, [N] bool."""
+
+
+class _RayPixels(NamedTuple):
+    """Of N rays: shown color [N, 3], normal [N, 3], opacity [N], and distance [N]."""
+
+    color: Tensor
+    normal: Tensor
+    opacity: Tensor
+    distance: Tensor
+
+
+class FieldModel:
+    """A trained field: a signed distance and colors.
+
+    Args:
+        state: state of the training. recipe: the method. device: where layers are rendered.
+        trained: whether its map of distances is to be brought up to date; a training does that itself.
+    """
+
+    shading: ShadingModel = PLAIN
+    """It has the layers of a scene without reflection."""
+
+    def __init__(
+        self, state: FieldState, recipe: NeuralRecipe, device: torch.device, *, trained: bool = True
+    ) -> None:
+        self.state, self.recipe, self.device = state, recipe, device
+        self.field: Field = state.field
+        if trained:
+            self.field.map_distances()
+
+    @property
+    def light(self) -> dict[str, Tensor]:
+        """None is learned."""
+        return {}
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the layers that it renders, in the order of ``LAYERS``."""
+        return ("final", "base", "normal", "depth", "alpha")
+
+    @property
+    def steps(self) -> int:
+        """How many steps it has been trained for."""
+        return self.state.step
+
+    @property
+    def gaussians(self) -> None:
+        """It has none."""
+
+    @property
+    def size(self) -> str:
+        """How large it is, for people."""
+        return f"{sum(values.numel() for values in self.field.parameters()):,} numbers"
+
+    @torch.no_grad()
+    def render(
+        self,
+        camera: Camera,
+        *,
+        normals: bool = True,
+        depth: bool = False,
+        surface: bool = False,
+        within: Within | None = None,
+    ) -> RenderResult:
+        """All layers; ``depth`` only on request.
+
+        Args:
+            camera: any. normals: they come with the colors. surface: its depth is that of the surface in any case.
+            within: see ``Within``; None: all, with what lies behind.
+        """
+        batches = [self._ray_pixels(*rays, depth, within) for rays in self._rays(camera)]
+        color, normal, opacity, distance = (torch.cat(parts) for parts in zip(*batches, strict=True))
+        size = (camera.height, camera.width)
+        final = srgb_decode(color).view(*size, 3)
+        rays = camera.rays(device=self.device)
+        return RenderResult(
+            final=final,
+            specular=None,
+            diffuse=None,
+            base=final,
+            reflection=None,
+            strength=None,
+            normal=normal.view(*size, 3) if normals else None,
+            depth=distance.view(size) * rays[..., 2] * self.field.region.unit if depth else None,
+            alpha=opacity.view(size),
+        )
+
+    def stokes(self, result: RenderResult, camera: Camera) -> None:
+        """It predicts an angle of polarization, and no Stokes vector."""
+
+    @torch.no_grad()
+    def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
+        """Share of each pixel's opacity [H, W] that lies nearer than a depth [H, W]; 0 where that is 0 or less."""
+        rays = camera.rays(device=self.device).view(-1, 3)
+        far = depth.to(rays).flatten() / rays[:, 2] / self.field.region.unit
+        shares = []
+        for (origin, direction), reach in zip(self._rays(camera), far.split(CHUNK), strict=True):
+            marched = march(self.field, origin, direction, self.recipe.sampling)
+            near = (marched.weights * (marched.along < reach[:, None])).sum(dim=1)
+            shares.append(near / marched.opacity.clamp(min=1e-6))
+        return torch.cat(shares).view(depth.shape)
+
+    @torch.no_grad()
+    def lattice(self, axes: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+        """Signed distances [X, Y, Z] in world units at all combinations of world coordinates, on the CPU."""
+        region = self.field.region
+        own = [
+            ((axis.to(self.device, torch.float32)) - origin) / region.unit
+            for axis, origin in zip(axes, region.center, strict=True)
+        ]
+        return (self.field.lattice(own) * region.unit).cpu()
+
+    @torch.no_grad()
+    def surface(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Normals [N, 3], and linear colors [N, 3] seen from straight above, at places [N, 3] of the surface."""
+        colors = []
+        for part in self.field.region.inner(places.to(self.device, torch.float32)).split(CHUNK):
+            geometry = self.field.geometry(part)
+            normal = unit(geometry.slope)
+            color = self.field.color(part, -normal, normal, geometry.features)
+            colors.append(torch.cat((normal, srgb_decode(color)), dim=1))
+        normal, color = torch.cat(colors).to(places).split(3, dim=1)
+        return normal, color
+
+    def _rays(self, camera: Camera) -> list[tuple[Tensor, Tensor]]:
+        """Origins and directions of all pixels, in parts."""
+        directions = camera.world_rays(device=self.device).view(-1, 3)
+        center = self.field.region.inner(camera.pose(directions.dtype, self.device).center)
+        return [(center.expand(len(part), 3), part) for part in directions.split(CHUNK)]
+
+    def _ray_pixels(
+        self, origin: Tensor, direction: Tensor, depth: bool, within: Within | None
+    ) -> _RayPixels:
+        region = self.field.region
+        inside = None if within is None else lambda inner: within(region.world(inner))
+        marched = march(self.field, origin, direction, self.recipe.sampling, within=inside)
+        distance = marched.distance
+        if depth:
+            traced, hit = trace(self.field, origin, direction)
+            distance = torch.where(hit & (within is None), traced, distance)
+        return _RayPixels(marched.color, marched.normal, marched.opacity, distance)

@@ -1,0 +1,338 @@
+"""The loop that trains a field: one view a step, some hundred rays of it, compared with color, DoLP and AoLP.
+
+The loss terms are GNeRP's (Li et al. 2024): color, angle of polarization, eikonal, and the guidance by covariances.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from polarguide.capture import Scene, View
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
+from polarguide.optics import aolp, dolp, lens_frame, luminance
+from polarguide.optics.color import srgb_encode
+from polarguide.shading.model import PLAIN, ShadingModel
+from polarguide.training.distributed import ALONE
+from polarguide.training.feed import Entry, Packed, ViewStore, packed, unpacked
+from polarguide.training.settings import ResolvedSettings, StepReport
+from polarguide.training.state import seeded
+from polarguide_bench.gnerp.march import RaySamples, march
+from polarguide_bench.gnerp.recipe import NeuralRecipe
+from polarguide_bench.gnerp.state import FieldState
+
+
+def color_loss(predicted: Tensor, measured: Tensor, dolp: Tensor) -> Tensor:
+    """Mean of ``(1 - DoLP) |difference|`` of shown colors [N, 3], DoLP [N]."""
+    return ((1 - dolp)[:, None] * (predicted - measured).abs()).mean()
+
+
+def aolp_loss(normal: Tensor, rays: Tensor, aolp: Tensor, dolp: Tensor, *, circular: bool) -> Tensor:
+    """Mean of DoLP times the difference of the predicted angle of polarization from the measured one.
+
+    The prediction is that of specular light: perpendicular to the plane of incidence, that is the azimuth of the
+    blended normal about the ray plus 90 degrees, modulo 180.
+
+    Args:
+        normal: [N, 3] blended, camera axes, any length. rays: [N, 3] unit, camera axes.
+        aolp: [N] radians in [0, pi), in the lens frame. dolp: [N] in [0, 1].
+        circular: ``(1 - cos 2 difference) / 2``; else, as published, the difference of the numbers in [0, pi), which
+            jumps where one of them passes 180 degrees.
+    """
+    right, up = _across(normal, rays)
+    if circular:
+        # cos and sin of twice the azimuth without the azimuth; 90 degrees more turn the sign.
+        square = (right * right + up * up).clamp(min=1e-12)
+        cosine, sine = (up * up - right * right) / square, -2 * right * up / square
+        difference = 0.5 * (1 - cosine * torch.cos(2 * aolp) - sine * torch.sin(2 * aolp))
+    else:
+        flat = (right * right + up * up) < 1e-12
+        azimuth = torch.atan2(torch.where(flat, 0.0, up), torch.where(flat, 1.0, right))
+        difference = (torch.remainder(azimuth + math.pi / 2, math.pi) - aolp).abs()
+    return (dolp * difference).mean()
+
+
+def eikonal_loss(slopes: Tensor) -> Tensor:
+    """Mean of ``(|slope| - 1)^2`` over slopes [..., 3]."""
+    return ((dot(slopes, slopes) + 1e-12).sqrt() - 1).square().mean()
+
+
+def guidance_loss(
+    normals: Tensor, around: Tensor, weights: Tensor, rays: Tensor, aolp: Tensor, neighbors: Tensor,
+    dolp: Tensor, *, circular: bool,
+) -> Tensor:  # fmt: skip
+    """L1 of the covariance of normals around a ray's samples, splatted into the picture, from that of the AoLP.
+
+    A sample has six neighbors; the covariance of their normals about its own is projected on the plane across the
+    ray, [2, 2], and blended along it. That of the picture is of ``(sin, -cos)`` of the AoLP at four pixels about that
+    of the ray's own, times the squared length of the blended normal across the ray. As published, (sin, -cos) turns
+    its sign where the AoLP passes 180 degrees, and the normal does not; ``circular`` doubles the angles of both.
+
+    Args:
+        normals: [N, K, 3] unit, camera axes, of the samples. around: [N, K, 6, 3] of their neighbors.
+        weights: [N, K] of the samples in the picture. rays: [N, 3] unit, camera axes.
+        aolp: [N] radians. neighbors: [N, 4] of the neighboring pixels. dolp: [N] weight of each ray.
+    """
+    own = torch.stack(_across(normals, rays[:, None]), dim=-1)
+    others = torch.stack(_across(around, rays[:, None, None]), dim=-1)
+    length = (weights[..., None] * own).sum(dim=1).square().sum(dim=-1)
+    field, weight = _vectors(aolp, circular), weights[..., None, None]
+    if circular:
+        own, others = _doubled(own), _doubled(others)
+    predicted = (weight * _covariance(own, others)).sum(dim=1)
+    measured = length[:, None, None] * _covariance(field, _vectors(neighbors, circular))
+    return (dolp[:, None, None] * (predicted - measured).abs()).mean()
+
+
+def _across(vectors: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """Components of vectors along the lens frame of rays, image right and image up."""
+    right, up = lens_frame(rays)
+    return dot(vectors, right), dot(vectors, up)
+
+
+def _vectors(aolp: Tensor, circular: bool) -> Tensor:
+    """The normal [..., 2] across the ray that an AoLP stands for, or that with twice its angle."""
+    normal = torch.stack((torch.sin(aolp), -torch.cos(aolp)), dim=-1)
+    return _doubled(normal) if circular else normal
+
+
+def _doubled(vectors: Tensor) -> Tensor:
+    """Vectors [..., 2] with twice their angle, and the same length."""
+    x, y = vectors.unbind(-1)
+    length = (x * x + y * y + 1e-12).sqrt()
+    return torch.stack(((x * x - y * y) / length, 2 * x * y / length), dim=-1)
+
+
+def _covariance(own: Tensor, others: Tensor) -> Tensor:
+    """[..., 2, 2] of vectors [..., M, 2] about [..., 2], over M - 1."""
+    apart = others - own[..., None, :]
+    return apart.transpose(-1, -2) @ apart / (others.shape[-2] - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """Of one view, row by row: P = H W pixels.
+
+    Attributes:
+        picture: shown colors [P, 3]. dolp: [P] in [0, 1], 0 where nothing is known of the polarization.
+        aolp: [P] radians in [0, pi), in the lens frame. valid: numbers of the pixels that count, [V].
+    """
+
+    picture: Tensor
+    dolp: Tensor
+    aolp: Tensor
+    valid: Tensor
+
+
+def target_of(view: View, store: ViewStore, device: torch.device) -> Target:
+    """The target of a view, computed once and stored as two bytes a value."""
+
+    def make() -> Entry:
+        entry = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(device))}
+        if bool(view.invalid.any()):
+            entry["valid"] = Packed((~view.invalid).to(device))
+        if view.is_determined:
+            gray = luminance(view.stokes())
+            degree = dolp(gray) * ~(view.saturated | view.invalid)
+            entry["dolp"], entry["aolp"] = packed(degree.to(device)), packed(aolp(gray).to(device))
+        return entry
+
+    stored = store.get("target", view.name, make)
+    picture = unpacked(stored["picture"]).view(-1, 3)
+    nothing = torch.zeros(len(picture), device=device)
+    degree, angle = (
+        unpacked(stored[name]).flatten() if name in stored else nothing for name in ("dolp", "aolp")
+    )
+    valid = stored["valid"].codes.flatten() if "valid" in stored else nothing == 0
+    return Target(picture, degree, torch.remainder(angle, torch.pi), valid.nonzero()[:, 0])
+
+
+MAP_EVERY = 16
+"""Steps after which the map of distances is brought up to date."""
+GLANCE = (0.3, 0.7)
+"""Shares of the steps between which the color comes to depend on the direction: before, it has to be explained by the
+place, so that a wrong surface cannot be painted with what each view sees."""
+DIAGONAL = ((-1, -1), (-1, 1), (1, -1), (1, 1))
+"""Neighbors of a pixel: rows and columns."""
+
+
+class FieldTrainer:
+    """Trains a neural recipe on a scene.
+
+    Args:
+        scene: the capture. recipe: the method. settings: the user's choices, one view a step.
+        device: to compute on.
+        state: where to go on from, on the device; None: from the beginning.
+        store: keeps what is computed of the views; None: in memory.
+
+    Attributes:
+        shading: has the layers of a scene without reflection.
+        whole: whether the state is one between two steps. ranks: it is alone.
+    """
+
+    ranks = ALONE
+    shading: ShadingModel = PLAIN
+
+    def __init__(
+        self,
+        scene: Scene,
+        recipe: NeuralRecipe,
+        settings: ResolvedSettings,
+        device: torch.device,
+        state: FieldState | None = None,
+        store: ViewStore | None = None,
+    ) -> None:
+        self.scene, self.recipe, self.settings, self._device = scene, recipe, settings, device
+        cameras = [view.camera for view in scene.train_views]
+        self.state = state or FieldState.first(recipe, cameras, settings.seed, device)
+        self._store = store or ViewStore()
+        self.whole = True
+
+    def exchange_statistics(self) -> None:
+        """Fields have no statistics to exchange."""
+
+    @property
+    def total(self) -> int:
+        """Steps in all."""
+        return self.settings.steps
+
+    @property
+    def done(self) -> int:
+        """Number of finished steps."""
+        return self.state.step
+
+    def step(self) -> StepReport:
+        """One optimizer step."""
+        state, settings, field = self.state, self.settings, self.state.field
+        share = state.step / settings.steps
+        generator = seeded(settings.seed, 9, state.step)
+        view = self._view_of(state.step)
+        target = target_of(view, self._store, self._device)
+        self.whole = False
+        if state.step % MAP_EVERY == 0:
+            field.map_distances()
+        field.direction_share.fill_(_ramp(share, *GLANCE))
+        drawn = torch.randint(len(target.valid), (self.recipe.sampling.rays,), generator=generator)
+        pixels = target.valid[drawn.to(self._device)]
+        origin, rays = self._rays(view.camera, pixels)
+        marched = march(
+            field,
+            origin,
+            view.camera.to_world(rays),
+            self.recipe.sampling,
+            generator=generator,
+        )
+        color = color_loss(marched.color, target.picture[pixels], target.dolp[pixels])
+        loss = self._loss(color, marched, view.camera, rays, pixels, target, share)
+        self._set_rates(share)
+        loss.backward()
+        state.optimizer.step(dict(field.named_parameters()))
+        with torch.no_grad():
+            # Fog is where grids would begin; a surface never gets thicker than it was at first.
+            field.log_sharpness.clamp_(min=field.first_log_sharpness)
+            squared = (marched.color - target.picture[pixels]).square().mean()
+            psnr = -10 * torch.log10(squared.clamp(min=1e-10))
+        stage = "color and angles" if share < self.recipe.weights.guided else "guided"
+        report = StepReport(
+            state.step, stage, None, torch.stack((color.detach(), psnr, loss.detach())), self.done + 1
+        )
+        state.step += 1
+        if state.step == settings.steps:
+            field.map_distances()
+        self.whole = True
+        return report
+
+    def _loss(
+        self,
+        color: Tensor,
+        marched: RaySamples,
+        camera: Camera,
+        rays: Tensor,
+        pixels: Tensor,
+        target: Target,
+        share: float,
+    ) -> Tensor:
+        weights = self.recipe.weights
+        dolp, aolp = target.dolp[pixels], target.aolp[pixels]
+        loss = weights.color * color + weights.eikonal * eikonal_loss(marched.slopes)
+        if weights.aolp:
+            normal = camera.to_camera(marched.normal)
+            angles = aolp_loss(normal, rays, aolp, dolp, circular=weights.circular)
+            loss = loss + weights.aolp * angles
+        if weights.guidance and share >= weights.guided:
+            loss = loss + weights.guidance * self._guidance(marched, camera, rays, pixels, target)
+        return loss
+
+    def _guidance(
+        self, marched: RaySamples, camera: Camera, rays: Tensor, pixels: Tensor, target: Target
+    ) -> Tensor:
+        """The published Gaussians of normals, at the heaviest samples of each ray."""
+        heaviest = marched.weights.detach().topk(self.recipe.sampling.neighbors, dim=1).indices
+        index = heaviest[..., None].expand(-1, -1, 3)
+        around = self._neighbors(marched, camera, rays, heaviest)
+        normals = unit(self.state.field.geometry(around.view(-1, 3)).slope).view(around.shape)
+        row, column = pixels // camera.width, pixels % camera.width
+        beside = [
+            (row + dy).clamp(0, camera.height - 1) * camera.width + (column + dx).clamp(0, camera.width - 1)
+            for dy, dx in DIAGONAL
+        ]
+        return guidance_loss(
+            camera.to_camera(marched.normals.gather(1, index)),
+            camera.to_camera(normals),
+            marched.weights.gather(1, heaviest),
+            rays,
+            target.aolp[pixels],
+            target.aolp[torch.stack(beside, dim=1)],
+            target.dolp[pixels],
+            circular=self.recipe.weights.circular,
+        )
+
+    def _neighbors(self, marched: RaySamples, camera: Camera, rays: Tensor, chosen: Tensor) -> Tensor:
+        """Places [N, K, 6, 3] around chosen samples [N, K]: four a pixel away both ways, two along the ray."""
+        places = marched.places.gather(1, chosen[..., None].expand(-1, -1, 3))
+        width = (marched.along.gather(1, chosen) / camera.fx)[..., None]
+        pose = camera.pose(places.dtype, places.device)
+        right, down = pose.rotation[0] * width, pose.rotation[1] * width
+        ahead = camera.to_world(rays)[:, None] * width
+        steps = [dy * down + dx * right for dy, dx in DIAGONAL]
+        return torch.stack([places + step for step in (*steps, ahead, -ahead)], dim=2)
+
+    def _rays(self, camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Origin [N, 3] in the field's coordinates, and directions in camera axes."""
+        region, device = self.state.field.region, self._device
+        rays = camera.rays(device=device).view(-1, 3)[pixels]
+        center = region.inner(camera.pose(rays.dtype, device).center)
+        return center.expand(len(rays), 3), rays
+
+    def _view_of(self, place: int) -> View:
+        """The view at a place in the sequence of all views: every epoch visits each once, in a new order."""
+        views = self.scene.train_views
+        epoch, place = divmod(place, len(views))
+        order = torch.randperm(len(views), generator=seeded(self.settings.seed, 4, epoch))
+        return views[int(order[place])]
+
+    def _set_rates(self, share: float) -> None:
+        """Rates of this step: linear warm-up, then a cosine."""
+        rates, shape = self.recipe.rates, self.recipe.shape
+        late = max(0.0, (share - rates.warmup) / (1 - rates.warmup))
+        falling = rates.last + (1 - rates.last) * 0.5 * (1 + math.cos(math.pi * late))
+        rising = min(1.0, (share * self.settings.steps + 1) / (rates.warmup * self.settings.steps + 1))
+        optimizer = self.state.optimizer
+        for name in optimizer.rates:
+            level = name.rpartition(".")[2]
+            if name.startswith("shape_grids."):
+                own = rates.distances * (shape.resolutions[0] / shape.resolutions[int(level)]) ** rates.finer
+            elif "levels." in name:
+                own = rates.features
+            else:
+                own = rates.sharpness if name == "log_sharpness" else rates.networks
+            optimizer.rates[name] = own * rising * falling
+
+
+def _ramp(share: float, begin: float, end: float) -> float:
+    """From 0 to 1 between two shares of the steps."""
+    return min(1.0, max(0.0, (share - begin) / (end - begin)))

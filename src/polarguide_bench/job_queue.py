@@ -1,0 +1,263 @@
+"""Jobs on workers: handed out in order, watched, gone on with when their workers are lost, and stopped without loss."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+
+from polarguide.core.errors import PolarguideError
+from polarguide.core.progress import Advance, Reporter
+from polarguide.results.evaluation.record import code_digest
+from polarguide.runs.folder import CHECKPOINT, LOG
+from polarguide_bench.children import (
+    POLL_SECONDS,
+    Message,
+    Outcome,
+    Task,
+    count_at_work,
+    files_digest,
+    kill,
+    perform,
+)
+from polarguide_bench.cluster import Workers
+
+if TYPE_CHECKING:
+    from distributed import Future
+
+ASK_SECONDS = 1.0
+"""Between two questions to the scheduler, who may be far away."""
+TAIL_BYTES = 4096
+MOST_LOSSES = 10
+"""Times in a row that a job may be lost without having saved anything: it takes more memory than there is, perhaps."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Tasks to do one after the other, each in a process of its own.
+
+    Attributes:
+        label: what messages call it.
+        folder: made if need be. Its ``stderr.txt`` takes what the processes write.
+        tasks: what is still to do, by what the folder holds: called whenever the job is begun or gone on with.
+        total: how much there is to do, as ``progress`` counts it.
+        progress: how much is done, and a few words on that.
+        saved: files that are written anew whenever there is something new to go on from.
+    """
+
+    label: str
+    folder: Path
+    tasks: Callable[[], Sequence[Task]]
+    total: int
+    progress: Callable[[], tuple[int, str]]
+    saved: tuple[Path, ...]
+
+
+def run_job(label: str, run: Path, tasks: Callable[[], Sequence[Task]], steps: int) -> Job:
+    """The job that trains and scores a run of so many steps; see ``Job``."""
+
+    def progress() -> tuple[int, str]:
+        step, note = training_progress(run, steps)
+        return step, note if step < steps else "scoring"
+
+    return Job(label, run, tasks, steps, progress, (run / CHECKPOINT,))
+
+
+def training_progress(run: Path, steps: int) -> tuple[int, str]:
+    """How many steps of a training are done, as its log says, and what it says of the last."""
+    row = last_row(run / LOG)
+    if row is None or row.psnr is None:
+        return 0, ""
+    count = "" if row.gaussians is None else f"  {row.gaussians:,} Gaussians"
+    return min(steps, row.step + 1), f"PSNR {row.psnr:.1f} dB{count}"
+
+
+class _Active:
+    """A job that was handed to a worker."""
+
+    def __init__(self, job: Job, future: Future, advance: Advance) -> None:
+        self.job, self.future, self._advance = job, future, advance
+
+    def report(self) -> int:
+        """Pass on how far it is; returns how much is done."""
+        done, note = self.job.progress()
+        self._advance(done, note=note)
+        return done
+
+    def outcome(self) -> Outcome:
+        """After the end: what became of it.
+
+        Raises:
+            PolarguideError: the scheduler has gone.
+        """
+        from distributed import KilledWorker
+
+        if self.future.cancelled():
+            raise PolarguideError(
+                "scheduler",
+                expected="a scheduler until the end",
+                found="that the connection to it was lost",
+                remedy="The same command goes on, once there is a scheduler.",
+            )
+        error = self.future.exception() if self.future.status == "error" else None
+        if isinstance(error, KilledWorker):
+            return Outcome("lost", "its worker has gone")
+        if error is not None:
+            return Outcome("failed", f"worker: {(str(error).splitlines() or [type(error).__name__])[0]}")
+        outcome: Outcome = self.future.result()
+        return outcome
+
+
+class _Progress:
+    """Progress of many jobs: one bar for all, and one for each running job."""
+
+    def __init__(self, jobs: Sequence[Job], reporter: Reporter, stack: contextlib.ExitStack) -> None:
+        self._reporter, self._total, self._ended = reporter, len(jobs), 0
+        self._done = {job.folder: job.progress()[0] for job in jobs}
+        self._all = stack.enter_context(reporter.track("all", sum(job.total for job in jobs)))
+        self._stack = stack
+        self._open: dict[Path, contextlib.ExitStack] = {}
+
+    def begin(self, job: Job) -> Advance:
+        """A job starts, or goes on."""
+        self._open[job.folder] = self._stack.enter_context(contextlib.ExitStack())
+        return self._open[job.folder].enter_context(self._reporter.track(job.label, job.total))
+
+    def report(self, active: Sequence[_Active], slots: int) -> None:
+        """How far all and each of them are."""
+        for each in active:
+            self._done[each.job.folder] = each.report()
+        waits = "" if slots else "  waiting for a worker"
+        self._all(sum(self._done.values()), note=f"{self._ended} of {self._total} ended{waits}")
+
+    def pause(self, job: Job, why: str) -> None:
+        """A job was lost, and will go on."""
+        self._open.pop(job.folder).close()
+        self._reporter.say(f"lost  {job.label}: {why}; it goes on from what it has saved")
+
+    def end(self, job: Job, error: str | None) -> None:
+        """A job has ended."""
+        self._ended += 1
+        self._done[job.folder] = job.total
+        self._open.pop(job.folder).close()
+        self._reporter.say(f"done  {job.label}" if error is None else f"failed  {job.label}: {error}")
+
+
+class _Losses:
+    """How often jobs were lost without anything new to go on from."""
+
+    def __init__(self) -> None:
+        self._counts: dict[Path, tuple[int, int]] = {}  # when anything was saved, losses since
+
+    def give_up(self, job: Job) -> bool:
+        """Count one more loss; whether it is the last."""
+        saved = max((path.stat().st_mtime_ns for path in job.saved if path.exists()), default=0)
+        before, count = self._counts.get(job.folder, (saved, 0))
+        count = count + 1 if before == saved else 1
+        self._counts[job.folder] = saved, count
+        return count >= MOST_LOSSES
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    workers: Workers,
+    *,
+    reporter: Reporter,
+    on_end: Callable[[Job, str | None], None] = lambda job, error: None,
+) -> None:
+    """Work through jobs. One that fails takes no other down; one whose process or worker is lost goes on elsewhere.
+
+    Args:
+        jobs: what to do, in this order.
+        workers: who does it, one job each at a time.
+        reporter: receives progress, and a line at the end of each job.
+        on_end: called after each job, with its error or None.
+
+    Raises:
+        KeyboardInterrupt: raised meanwhile, as by Ctrl-C; passed on when all children have stopped.
+        PolarguideError: the scheduler has gone.
+    """
+    waiting, active, losses = deque(jobs), list[_Active](), _Losses()
+    with contextlib.ExitStack() as stack:
+        progress = _Progress(jobs, reporter, stack)
+        slots, asked_at = workers.slots(), time.monotonic()
+        try:
+            while waiting or active:
+                while waiting and len(active) < max(1, min(slots, workers.most)):
+                    active.append(_handed_out(waiting.popleft(), workers, progress))
+                for each in [each for each in active if each.future.done()]:
+                    outcome = each.outcome()
+                    active.remove(each)
+                    if outcome.state == "lost" and not losses.give_up(each.job):
+                        progress.pause(each.job, outcome.error)
+                        waiting.appendleft(each.job)
+                        continue
+                    error = None if outcome.state == "done" else outcome.error
+                    progress.end(each.job, error)
+                    on_end(each.job, error)
+                progress.report(active, slots)
+                time.sleep(POLL_SECONDS)
+                if time.monotonic() - asked_at > ASK_SECONDS:
+                    slots, asked_at = workers.slots(), time.monotonic()
+                    workers.replace_lost()
+        except BaseException:  # whatever happens here, no child goes on unwatched
+            _stop(active, workers)
+            raise
+
+
+def _handed_out(job: Job, workers: Workers, progress: _Progress) -> _Active:
+    future = workers.client.submit(
+        perform,
+        tuple(Message(task, files_digest(), code_digest()) for task in job.tasks()),
+        str(job.folder.absolute()),
+        gpus=workers.gpus,
+        key=f"{job.label} {time.monotonic_ns()}",
+        pure=False,
+    )
+    return _Active(job, future, progress.begin(job))
+
+
+def _stop(active: Sequence[_Active], workers: Workers) -> None:
+    """Cancel all, and wait until their processes have ended; a second Ctrl-C kills these."""
+    client, keys = workers.client, [each.future.key for each in active]
+    with contextlib.suppress(Exception):  # the scheduler may be what has gone
+        client.cancel([each.future for each in active], force=True)
+        try:
+            while any(client.run(count_at_work, keys).values()):
+                time.sleep(POLL_SECONDS)
+        except KeyboardInterrupt:
+            client.run(kill, keys)
+
+
+class LogRow(msgspec.Struct):
+    """A line of a log, as far as progress shows it."""
+
+    step: Annotated[int, msgspec.Meta(ge=0)]
+    psnr: float | None = None
+    gaussians: int | None = None
+
+
+_ROWS = msgspec.json.Decoder(LogRow)
+
+
+def last_row(log: Path) -> LogRow | None:
+    """The last whole line of a log, or None where there is none yet."""
+    try:
+        if not log.is_file():  # a pipe would never end
+            return None
+        with open(log, "rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL_BYTES))
+            lines = file.read(TAIL_BYTES).split(b"\n")
+    except OSError:
+        return None
+    for line in reversed(lines):
+        with contextlib.suppress(ValueError, RecursionError):  # empty, half written, or cut by the seek
+            return _ROWS.decode(line)
+    return None

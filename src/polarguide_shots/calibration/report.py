@@ -1,0 +1,273 @@
+"""Figures of a sensor's analyzers by position, the table for the console, and a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from polarguide.capture.sensor.analyzers import AnalyzerCalibration
+from polarguide.capture.sensor.pattern import Pattern
+from polarguide.geometry.polarizer import ANGLES, stokes_of_four
+from polarguide.visualization.figures import FONT, INK, Picture, contact_sheet, scalar_to_rgb, scale_bar
+from polarguide_shots.calibration.solve import ShotFit
+
+COUNTLESS = 1000.0
+"""Extinction ratios above this are not told apart: noise and the polarizer decide them."""
+_COLORS = ("R", "G", "B")
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Position:
+    """The analyzers at one angle, behind one color.
+
+    Attributes:
+        name: "0", "45", ... or "R 0", ...
+        angle: nominal, degrees. color: 0 to 2, None for a monochrome sensor.
+        throughput: 1 is the mean around it; extinction: ratio; angle_error: degrees; all by block, [rows, columns].
+    """
+
+    name: str
+    angle: int
+    color: int | None
+    throughput: Array
+    extinction: Array
+    angle_error: Array
+
+
+def positions(calibration: AnalyzerCalibration) -> list[Position]:
+    """The positions of a sensor, colors first, then by angle."""
+    pattern = calibration.pattern
+    colors = (None,) if pattern.colors is None else (0, 1, 2)
+    rows = []
+    for color in colors:
+        for angle in ANGLES:
+            chosen = pattern.angles == angle
+            if color is not None and pattern.colors is not None:
+                chosen &= pattern.colors == color
+            vectors = calibration.vectors[:, :, chosen].astype(np.float64).mean(axis=2)
+            name = f"{angle}" if color is None else f"{_COLORS[color]} {angle}"
+            rows.append(Position(name, angle, color, *_measures(vectors, np.radians(angle))))
+    return rows
+
+
+def _measures(vectors: Array, nominal: float) -> tuple[Array, Array, Array]:
+    s0, s1, s2 = np.moveaxis(vectors, -1, 0)
+    strength = np.hypot(s1, s2)
+    least = (s0 + strength) / COUNTLESS
+    extinction = (s0 + strength) / np.maximum(s0 - strength, least)
+    turn = np.angle(np.exp(1j * (np.arctan2(s2, s1) - 2 * nominal))) / 2
+    return 2 * s0, extinction, np.degrees(turn)
+
+
+def spread(values: Array) -> tuple[float, float, float]:
+    """Median, 5th and 95th percentile."""
+    low, middle, high = np.percentile(values, [5, 50, 95])
+    return float(middle), float(low), float(high)
+
+
+def effect(calibration: AnalyzerCalibration) -> tuple[float, float]:
+    """Readings of the sensor without correction: the DoLP of unpolarized and of fully polarized light.
+
+    Both are medians over the blocks, the latter over angles of the light, too.
+    """
+    pattern = calibration.pattern
+    vectors = calibration.vectors.astype(np.float64)
+    corners = range(0, pattern.period, 2)
+    zero, full = [], []
+    turns = np.radians(np.arange(0, 180, 15))
+    light = np.stack([np.ones_like(turns), np.cos(2 * turns), np.sin(2 * turns)], axis=1)
+    for top in corners:
+        for left in corners:
+            cell = vectors[:, :, top : top + 2, left : left + 2].reshape(*vectors.shape[:2], 4, 3)
+            places = [int(a) for a in pattern.angles[top : top + 2, left : left + 2].ravel()]
+            cell = cell[:, :, [places.index(angle) for angle in ANGLES]]
+            zero.append(_dolp(np.moveaxis(cell[..., 0], -1, 0)))
+            full.append(_dolp(np.moveaxis(cell @ light.T, -2, 0)))
+    return float(np.median(zero)), float(np.median(full))
+
+
+def _dolp(four: Array) -> Array:
+    s0, s1, s2 = stokes_of_four(four)
+    return np.asarray(np.hypot(s1, s2) / s0)
+
+
+def lines(calibration: AnalyzerCalibration, analyzers: list[Position]) -> list[str]:
+    """The table for the console."""
+    rows = ["position   throughput             extinction ratio       angle error in degrees"]
+    for position in analyzers:
+        cells = [
+            _cell(position.throughput, "{:.3f}"),
+            _cell(position.extinction, "{:.0f}"),
+            _cell(position.angle_error, "{:+.2f}"),
+        ]
+        rows.append(f"{position.name + ' deg':<10} " + " ".join(f"{cell:<22}" for cell in cells).rstrip())
+    unpolarized, polarized = effect(calibration)
+    rows.append("(median, and 5 % to 95 % of the blocks)")
+    rows.append(
+        f"Without it this sensor reads unpolarized light as DoLP {unpolarized:.3f}, fully polarized light as "
+        f"{polarized:.3f}."
+    )
+    return rows
+
+
+def _cell(values: Array, form: str) -> str:
+    def text(value: float) -> str:
+        return f">{COUNTLESS:.0f}" if form == "{:.0f}" and value >= 0.999 * COUNTLESS else form.format(value)
+
+    middle, low, high = spread(values)
+    return text(middle) if values.size == 1 else f"{text(middle)} ({text(low)} to {text(high)})"
+
+
+_CURVES = {0: (204, 51, 51), 45: (46, 134, 46), 90: (51, 102, 204), 135: (190, 120, 20)}
+_HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 340, 70, 30, 78, 48
+_WIDTH = 1040
+_GRID = (222, 222, 222)
+
+
+def calibration_picture(
+    calibration: AnalyzerCalibration,
+    analyzers: Sequence[Position],
+    fit: ShotFit,
+    means: Array,
+    pattern: Pattern,
+) -> Picture:
+    """Draw a calibration.
+
+    Args:
+        calibration: it. analyzers: its positions. fit: of the shots. means: of the shots by position, [T, K], and
+        pattern: pattern of the region, to which they belong.
+    """
+    maps = _maps(analyzers)
+    curves = _curves(calibration, analyzers, fit, means, pattern)
+    width = max(maps.shape[1], curves.shape[1])
+    padded = [
+        np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0)), constant_values=255)
+        for part in (curves, maps)
+    ]
+    return np.concatenate(padded)
+
+
+def _maps(analyzers: Sequence[Position]) -> Picture:
+    """Throughput, extinction ratio and angle error by block: a row an angle, three columns a color."""
+    colors = sorted(
+        {position.color for position in analyzers}, key=lambda color: -1 if color is None else color
+    )
+    kinds = (
+        ("throughput", "viridis", [p.throughput for p in analyzers]),
+        ("extinction ratio", "magma", [p.extinction for p in analyzers]),
+        ("angle error, degrees", "turbo", [p.angle_error for p in analyzers]),
+    )
+    rows: list[list[Picture | None]] = [[] for _ in ANGLES]
+    labels, footer = [], []
+    for title, colormap, values in kinds:
+        low, high = _range(np.stack(values), signed=title.startswith("angle"))
+        for color in colors:
+            labels.append(title if color is None else f"{'RGB'[color]}: {title}")
+            footer.append(scale_bar(low, high, colormap))
+            for index, angle in enumerate(ANGLES):
+                channel = next(
+                    v for p, v in zip(analyzers, values, strict=True) if p.angle == angle and p.color == color
+                )
+                rows[index].append(scalar_to_rgb(torch.from_numpy(channel.copy()), low, high, colormap))
+    most = 420 if len(colors) == 1 else 256
+    return contact_sheet(
+        rows,
+        [f"{angle} deg" for angle in ANGLES],
+        labels,
+        footer=footer,
+        minimum_width=256,
+        maximum_width=most,
+    )
+
+
+def _range(values: Array, *, signed: bool) -> tuple[float, float]:
+    """Ends of a scale, rounded outward to two digits."""
+    low, high = (float(end) for end in np.percentile(values, [1, 99]))
+    if signed:
+        end = max(0.1, float(np.ceil(10 * max(abs(low), abs(high))) / 10))
+        return -end, end
+    step = 10.0 ** np.floor(np.log10(max(high - low, 1e-3 * high)))
+    low, high = float(np.floor(low / step) * step), float(np.ceil(high / step) * step)
+    return (float(f"{low:.6g}"), float(f"{high:.6g}")) if high > low else (low, low + float(step))
+
+
+def _curves(
+    calibration: AnalyzerCalibration,
+    analyzers: Sequence[Position],
+    fit: ShotFit,
+    means: Array,
+    pattern: Pattern,
+) -> Picture:
+    """Mean intensity of the positions of an angle against the angle of the polarizer, with Malus's law through it."""
+    drawn: Picture = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
+    places = pattern.angles.ravel()
+    bottom, right = _HEIGHT - _BOTTOM, _WIDTH - _RIGHT - 330
+    turns = np.radians(np.linspace(0, 180, 181))
+    light = np.stack([np.ones_like(turns), np.cos(2 * turns), np.sin(2 * turns)], axis=1)
+    curves = {a: light @ fit.vectors[places == a].mean(axis=0) for a in ANGLES}
+    readings = {a: means[:, places == a].mean(axis=1) / fit.levels for a in ANGLES}
+    top_value = max(float(curve.max()) for curve in curves.values()) * 1.05
+
+    def at(angle: float, value: float) -> tuple[int, int]:
+        return (
+            round(_LEFT + angle / 180 * (right - _LEFT)),
+            round(bottom - max(0.0, value) / top_value * (bottom - _TOP)),
+        )
+
+    for angle in range(0, 181, 45):
+        cv2.line(drawn, at(angle, 0), at(angle, top_value), _GRID, 1)
+        _text(drawn, f"{angle}", at(angle, 0)[0] - 10, bottom + 18)
+    for share in (0.0, 0.25, 0.5, 0.75):
+        value = share * top_value
+        cv2.line(drawn, at(0, value), at(180, value), _GRID, 1)
+        _text(drawn, f"{value:.2f}", 24, at(0, value)[1] + 4)
+    _text(
+        drawn,
+        "angle of the polarizer in degrees; share of full scale; dots are shots, curves the fit",
+        _LEFT + 40,
+        _HEIGHT - 10,
+    )
+    for angle in ANGLES:
+        points = np.array(
+            [at(float(np.degrees(t)), float(v)) for t, v in zip(turns, curves[angle], strict=True)]
+        )
+        cv2.polylines(drawn, [points.astype(np.int32)], False, _CURVES[angle], 1, cv2.LINE_AA)
+        for turn, value in zip(fit.angles, readings[angle], strict=True):
+            cv2.circle(drawn, at(float(np.degrees(turn)), float(value)), 4, _CURVES[angle], -1, cv2.LINE_AA)
+    lens = f", {calibration.lens}" if calibration.lens else ""
+    block = calibration.block
+    own = "a vector a pixel" if block == calibration.pattern.period else f"blocks of {block} pixels"
+    title = f"{calibration.sensor}{lens}: {calibration.size[0]}x{calibration.size[1]} pixels, {own}"
+    _text(drawn, title, 12, 26, 0.6)
+    _text(drawn, f"{len(means)} shots, misfit {fit.misfit:.2%} of their mean", 12, 50)
+    _legend(drawn, analyzers, right + 24)
+    return drawn
+
+
+def _legend(drawn: Picture, analyzers: Sequence[Position], x: int) -> None:
+    """Medians of the positions."""
+    columns = (90, 168, 242)
+    for text, place in zip(("throughput", "extinction", "angle error"), columns, strict=True):
+        _text(drawn, text, x + place - 4, 50, 0.4)
+    for line, position in enumerate(analyzers):
+        throughput, extinction, error = (
+            spread(values)[0] for values in (position.throughput, position.extinction, position.angle_error)
+        )
+        y = _TOP + line * (26 if len(analyzers) == len(ANGLES) else 20)
+        cv2.circle(drawn, (x + 6, y - 4), 5, _CURVES[position.angle], -1, cv2.LINE_AA)
+        _text(drawn, f"{position.name} deg", x + 18, y)
+        ratio = f">{COUNTLESS:.0f}" if extinction > 0.999 * COUNTLESS else f"{extinction:.0f}"
+        for text, place in zip((f"{throughput:.3f}", ratio, f"{error:+.2f}"), columns, strict=True):
+            _text(drawn, text, x + place, y)
+
+
+def _text(drawn: Picture, text: str, x: int, y: int, scale: float = 0.45) -> None:
+    plain = text.encode("ascii", "replace").decode()
+    cv2.putText(drawn, plain, (x, y), FONT, scale, INK, 1, cv2.LINE_AA)

@@ -1,0 +1,442 @@
+"""From the files of a shot, a raw mosaic or pictures, to linear intensities at four angles, and what is wrong there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture import checks
+from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented, pair_ratio
+from polarguide.capture.exposures import FOUR
+from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
+from polarguide.capture.filter.develop import align_shots, estimate_shifts, linear_intensities, moved_shots
+from polarguide.capture.filter.encoding import transfer_of_set
+from polarguide.capture.filter.shots import Shots, read_shots, require_four_shots, stacked
+from polarguide.capture.layout import (
+    KEPT,
+    READ,
+    find_layout,
+    require_memory_of_each,
+    select_views,
+)
+from polarguide.capture.sensor.analyzer_file import read_analyzers
+from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
+from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic, spoiled
+from polarguide.capture.sensor.pattern import (
+    SENSOR_SIZES,
+    SIDE,
+    Levels,
+    Pattern,
+    estimate_levels,
+    tiled,
+    unusable_samples,
+)
+from polarguide.capture.view import ANGLES, FULL_CODE, View
+from polarguide.capture.view_reader import ViewData, read_view
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import require_file
+from polarguide.preparation.mosaic_source import MosaicFiles, block_intensities, sample_blocks
+from polarguide.preparation.shot_exposures import corrected_note, exposures_of_view, stated_exposures
+from polarguide_shots.maps import (
+    Developed,
+    Map,
+    Mask,
+    NoiseModel,
+    Part,
+    averaged_factor,
+    estimated_noise,
+    gains_of,
+    given_noise,
+    interpolation_factors,
+)
+from polarguide_shots.options import ShotOptions
+from polarguide_shots.samples import (
+    SetSamples,
+    behind_lens,
+    levels_of_shot,
+    piled_up,
+    read_set,
+    samples_of_arrays,
+    samples_of_loaded,
+    samples_of_view,
+)
+from polarguide_shots.sets import ExposureSet, known_places
+
+AROUND = 32
+"""Pixels around a part that are developed with it: more than any interpolation reaches."""
+
+
+def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -> Developed:
+    files = MosaicFiles(options.preparation())
+    stored, container, full = _stored(shot, files)
+    pattern = files.pattern
+    _require_on_sensor(shot.where, stored.shape, options)
+    dark = files.dark(stored.shape)
+    values = files.cut(stored)
+    levels, notes = _levels_of(stored, container, full, options)
+    files.require_kind(sample_blocks(values, SIDE), levels)
+    assert options.sensor is not None
+    x, y = options.offset_x + files.crop[0], options.offset_y + files.crop[1]
+    analyzers = _analyzers(stored.shape, options)
+    ratio = _ratio_of(values, dark, levels, pattern, None if analyzers is None else (analyzers, (x, y)))
+    gains, gain_notes = gains_of(ratio, options)
+    mode, way = options.demosaic, options.interpolation
+    step = DEMOSAIC_MODES[mode]
+    cut = _cut(part, values.shape, step)
+    whole = (values.shape[1] // step, values.shape[0] // step) if cut is not None else None
+    if cut is not None:  # what is judged of the shot as a whole is judged
+        values, dark = np.ascontiguousarray(values[cut]), None if dark is None else dark[cut]
+        x, y = x + cut[1].start, y + cut[0].start
+    saturated, black = unusable_samples(values, levels, dark)
+    defective = defects([np.minimum(values, levels.white)], pattern.period)
+    notes += [defects_note(int(defective.sum()), values.size)] if defective.any() else []
+    linear = levels.linear(values, dark)
+    if analyzers is not None:
+        linear = analyzers.apply(linear, offset=(x, y))
+        saturated, black, defective = map(spread_to_cells, (saturated, black, defective))
+    if gains != UNIT_GAINS:
+        of_angle = dict(zip(ANGLES, gains, strict=True))
+        linear *= tiled(np.vectorize(lambda a: np.float32(1 / of_angle[a]))(pattern.angles), linear.shape)
+    lsb = 1 / (levels.white - levels.black)
+    noise = given_noise(options, lsb) or _noise_of(linear, saturated | black | defective, pattern, lsb)
+    picture = demosaic(linear, saturated, pattern, mode=mode, interpolation=way, colored=False)
+    dark_pixels, masked = (
+        spoiled(samples, pattern, mode=mode, interpolation=way) for samples in (black, defective)
+    )
+    return Developed(
+        intensities=oriented(picture.intensities, options.calibration),
+        dark=dark_pixels,
+        saturated=picture.invalid,
+        masked=masked,
+        noise=noise,
+        factors=_placed(interpolation_factors(options.sensor, x, y, mode), options.calibration),
+        mean_variance=averaged_factor(options.sensor, x, y, mode),
+        pair_ratio=ratio,
+        notes=(*notes, *gain_notes),
+        origin=(0, 0) if cut is None else (cut[1].start // step, cut[0].start // step),
+        whole=whole,
+    )
+
+
+def _stored(shot: ExposureSet, files: MosaicFiles) -> tuple[NDArray[Any], int, int | None]:
+    """The values of a mosaic, the bits that one takes where it is stored, and the full scale that the file states."""
+    if shot.stored is not None:
+        return files.given(shot.stored, shot.name), 8 * shot.stored.dtype.itemsize, None
+    path = shot.files[0]
+    stored = files.read(path)
+    return stored, files.container(path, stored), files.full_scale(path, stored)
+
+
+def _levels_of(
+    stored: NDArray[Any], container: int, full: int | None, options: ShotOptions
+) -> tuple[Levels, list[str]]:
+    """Black, full scale and saturation of a mosaic, and notes of what its type does not imply."""
+    levels = estimate_levels(
+        int(stored.max()),
+        int(np.bitwise_or.reduce(stored, None)),
+        container,
+        bits=options.bits,
+        black=options.black_level,
+        saturation=options.saturation,
+        stated=full,
+    )
+    notes = []
+    if full is not None:
+        notes.append(f"{levels.white} is full scale, as the file states (--bits says otherwise).")
+    elif options.bits is None and container == 16:
+        notes.append(f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale.")
+    pile, piled = piled_up(stored, container, options)
+    if pile is not None and pile < levels.saturation:
+        levels, notes = replace(levels, saturation=pile), [*notes, *piled]
+    return replace(levels, gamma=options.gamma), notes
+
+
+def _ratio_of(
+    values: NDArray[Any],
+    dark: NDArray[np.float32] | None,
+    levels: Levels,
+    pattern: Pattern,
+    corrected: tuple[AnalyzerCalibration, tuple[int, int]] | None,
+) -> float | None:
+    """The ratio of the pair sums; ``corrected``: by a calibration, from this column and row of the sensor on."""
+    side, matrices = 2 * pattern.period, None
+    if corrected is not None:
+        of_cells = corrected[0].correction(corrected[1], values.shape[::-1])
+        matrices = np.stack([[sample_blocks(cell, pattern.period) for cell in row] for row in of_cells])
+    floor = None if dark is None else sample_blocks(dark, side)
+    angles, _, usable = block_intensities([sample_blocks(values, side)], levels, floor, pattern, matrices)
+    return pair_ratio(angles, usable)
+
+
+def _noise_of(linear: NDArray[np.float32], bad: Mask, pattern: Pattern, lsb: float) -> NoiseModel:
+    """The noise of the samples that are not ``bad``."""
+    cells = {int(pattern.angles[r, c]): linear[r::2, c::2] for r, c in np.ndindex(2, 2)}
+    good = ~(bad[::2, ::2] | bad[1::2, ::2] | bad[::2, 1::2] | bad[1::2, 1::2])
+    return estimated_noise([cells[angle] for angle in ANGLES], good, lsb)
+
+
+def _cut(part: Part | None, shape: tuple[int, ...], step: int) -> tuple[slice, slice] | None:
+    """The samples of a mosaic that a part of its picture needs: whole superpixels, with ``AROUND`` around them.
+
+    Args:
+        part: part of the picture. shape: shape of the mosaic, rows and columns. step: samples of a pixel, each way.
+
+    Returns:
+        Rows and columns; None for all, where hardly any would be left out.
+    """
+    if part is None:
+        return None
+    ends = []
+    for begin, length, most in ((part[1], part[3], shape[0]), (part[0], part[2], shape[1])):
+        low = max(0, begin * step - AROUND) // 8 * 8
+        ends.append(slice(low, max(low, min(most, -(-((begin + length) * step + AROUND) // 8) * 8))))
+    rows, columns = ends
+    area = (rows.stop - rows.start) * (columns.stop - columns.start)
+    return (rows, columns) if 0 < 2 * area <= shape[0] * shape[1] else None
+
+
+def _analyzers(shape: tuple[int, ...], options: ShotOptions) -> AnalyzerCalibration | None:
+    """The calibration of the sensor, checked against what it is to correct; read once for all shots."""
+    path = options.analyzers
+    if path is None:
+        return None
+    calibration = calibration_of(path)
+    calibration.require_sensor(options.sensor, path)
+    calibration.require_region((options.offset_x, options.offset_y), (shape[1], shape[0]), path)
+    return calibration
+
+
+def calibration_of(path: Path) -> AnalyzerCalibration:
+    require_file(path, expected="a file of polarguide calibrate", remedy="Check --calibration.")
+    state = path.stat()
+    return _read(path, state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=1)
+def _read(path: Path, *_: int) -> AnalyzerCalibration:
+    return read_analyzers(path)
+
+
+def _require_on_sensor(path: Path | str, shape: tuple[int, ...], options: ShotOptions) -> None:
+    """Refuse what is larger than the sensor: another one, or no mosaic."""
+    assert options.sensor is not None
+    size = SENSOR_SIZES[options.sensor]
+    most = tuple(n - o for n, o in zip(size, (options.offset_x, options.offset_y), strict=True))
+    if shape[1] > most[0] or shape[0] > most[1]:
+        raise PolarguideError(
+            path,
+            expected=f"at most {most[0]}x{most[1]} pixels of {options.sensor}",
+            found=f"{shape[1]}x{shape[0]}",
+            remedy="Check --sensor, --offset-x and --offset-y.",
+        )
+
+
+def _placed(factors: Map, calibration: Calibration) -> Map:
+    """The factors by true angle."""
+    if calibration.permutes:
+        return oriented(factors, calibration)
+    return np.broadcast_to(factors.mean(axis=0), factors.shape)
+
+
+_MAPS = 4 * (4 * 3 + 3 + 5)
+"""Bytes for each pixel of the intensities and of what is derived from them first, all at once."""
+
+
+def develop(shot: ExposureSet, options: ShotOptions, part: Part | None = None) -> Developed:
+    """Read the files of a shot; of a mosaic, develop at least ``part`` of the picture, None: all of it.
+
+    Raises:
+        PolarguideError: one is missing, cannot be read, or does not fit the others or the options.
+    """
+    if shot.fault is not None:
+        raise shot.fault
+    options.require_kind(shot.kind, shot.name)
+    if shot.kind == "mosaic":
+        try:
+            return develop_mosaic(shot, options, part)
+        except PolarguideError as error:
+            path = shot.where
+            if error.where.startswith(str(path)):
+                raise
+            # An option or the dark frame does not fit this file; of many, it has to be named.
+            where = f"{path} ({error.where})"
+            raise PolarguideError(
+                where, expected=error.expected, found=error.found, remedy=error.remedy
+            ) from error
+    return _filter(shot, options) if shot.kind == "filter" else _scene_view(shot, options)
+
+
+def set_samples(shot: ExposureSet, options: ShotOptions) -> SetSamples | None:
+    """Samples of a view at any polarizer angles; None for four angles or a mosaic, which ``develop`` reads.
+
+    Raises:
+        PolarguideError: a file is missing, cannot be read, or does not fit the others or the options.
+    """
+    if shot.fault is not None:
+        raise shot.fault
+    options.require_kind(shot.kind, shot.name)
+    if shot.kind == "set" and shot.stored is not None:
+        return samples_of_arrays(shot.name, shot.stored, shot.angles, options)
+    if shot.kind == "set":
+        return read_set(shot.name, shot.pictures, options)
+    if shot.kind != "scene" or shot.files:
+        return None
+    data, scale = _read_view(shot, options)
+    return samples_of_view(data, scale, options)
+
+
+def check_files(options: ShotOptions) -> None:
+    """Check once, before many shots, the files that all of them are developed with.
+
+    Raises:
+        PolarguideError: there is none, or the calibration is damaged or of another sensor.
+    """
+    if options.dark_frame is not None:
+        require_file(options.dark_frame, expected="a dark frame", remedy="Check --dark-frame.")
+    if options.analyzers is not None:
+        calibration_of(options.analyzers).require_sensor(options.sensor, options.analyzers)
+
+
+def _four(shot: ExposureSet, levels: Levels | None = None) -> Shots:
+    """The four pictures of a shot, of its files or in memory."""
+    return (
+        read_shots(shot.files, levels=levels) if shot.stored is None else stacked(shot.stored, levels=levels)
+    )
+
+
+def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
+    if shot.stored is None:
+        require_four_shots(shot.paths[0].parent, {shot.name: shot.files})
+    paths = [shot.files[angle] for angle in ANGLES] if shot.stored is None else []
+    shots = _four(shot)
+    levels, notes = levels_of_shot(shots.pictures, 8 * shots.pictures.dtype.itemsize, options)
+    if levels is not None:
+        shots = _four(shot, levels)
+    decision = transfer_of_set(paths, options.transfer, shots, ANGLES)
+    transfer = decision.transfer
+    notes += [decision.note, *filter(None, [decision.doubt])]
+    linear = linear_intensities(shots.pictures, transfer)
+    lsb = 1 / float(np.iinfo(shots.pictures.dtype).max if levels is None else levels.white)
+    clipped, dark = shots.clipped, shots.dark
+    if options.align:
+        shifts = estimate_shifts(linear)
+        linear, clipped = align_shots(linear, clipped, shifts)
+        moved = moved_shots(shifts)
+        notes += [f"Shots moved, in pixels: {', '.join(moved)}."] if moved else []
+    saturated = np.asarray(clipped.any(axis=0))
+    stated, missing = stated_exposures({shot.name: paths})
+    exposed = np.asarray(stated.get(shot.name, UNIT_GAINS))
+    notes += [corrected_note(stated[shot.name])] if stated else [missing] if missing else []
+    if options.gains == "auto" and options.calibration.gains is None:
+        labels = [path.name for path in paths] or [f"picture {number}" for number in (1, 2, 3, 4)]
+        measured = exposures_of_view(labels, linear.mean(axis=3), ~(saturated | dark), exposed.tolist())
+        exposed = np.asarray(measured.gains)
+        notes += [f"Shots {measured.warning}"] if measured.warning else []
+    if (exposed != 1.0).any():
+        linear = linear / exposed.astype(np.float32)[:, None, None, None]
+    gray = linear.mean(axis=3)
+    ratio = pair_ratio(gray, ~(saturated | dark))
+    gains, gain_notes = gains_of(ratio, options)
+    if gains != UNIT_GAINS:
+        linear = linear / np.asarray(gains, np.float32)[:, None, None, None]
+        gray = linear.mean(axis=3)
+    noise = given_noise(options, lsb)
+    # The luminance is the mean of three samples, whose noise is independent but in gray files, where they are copies.
+    samples = 1 if (shots.pictures[..., :1] == shots.pictures).all() else 3
+    factor = 1.0 if noise is None else 1 / samples
+    noise = noise or estimated_noise(gray, ~(saturated | dark), lsb / samples**0.5)
+    turned = np.stack(
+        [apply_orientation(p, shots.orientation) for p in oriented(linear, options.calibration)]
+    )
+    upright = oriented(turned, orientation_calibration(shots.orientation))
+    return Developed(
+        intensities=np.ascontiguousarray(upright),
+        dark=np.ascontiguousarray(apply_orientation(dark, shots.orientation)),
+        saturated=np.ascontiguousarray(apply_orientation(saturated, shots.orientation)),
+        masked=np.zeros(upright.shape[1:3], bool),
+        noise=noise,
+        factors=np.full((4, 1, 1), factor, np.float32),
+        mean_variance=factor,
+        pair_ratio=ratio,
+        notes=(*notes, *gain_notes),
+    )
+
+
+def _scene_view(shot: ExposureSet, options: ShotOptions) -> Developed:
+    data, scale = _read_view(shot, options)
+    largest = int(np.iinfo(data.peak.dtype).max)
+    intensities = oriented(data.codes.astype(np.float32) / np.float32(FULL_CODE), options.calibration)
+    saturated = np.zeros(data.black.shape, bool) if scale is None else np.asarray(data.peak >= scale)
+    masks = data.black, saturated, data.invalid, data.mask
+    return _undistorted(intensities, masks, 1 / largest, options)
+
+
+def _read_view(shot: ExposureSet, options: ShotOptions) -> tuple[ViewData, int | None]:
+    """A view of a scene, and the stored value at which it saturates; None where it does not."""
+    assert shot.root is not None
+    layout = find_layout(shot.root)
+    select_views(layout, [shot.view])
+    require_memory_of_each(
+        shot.paths,
+        max(1, len(shot.paths) // 4) * (KEPT + READ) + _MAPS,
+        "a view",
+        remedy="Free memory, or prepare the scene in a smaller size.",
+    )
+    transfer = "srgb" if options.transfer == "srgb" else "linear"
+    data = read_view(layout, shot.view, factor=1, transfer=transfer)
+    return data, checks.full_scale(data.histogram, int(np.iinfo(data.peak.dtype).max))
+
+
+def develop_view(view: View, options: ShotOptions) -> Developed:
+    """The intensities of a view of a scene at 0, 45, 90 and 135 degrees, as its ``codes`` and masks are."""
+    intensities = behind_lens(view, view.intensities(), FOUR)
+    dark, lost, step = _state_of(view)
+    masks = dark, lost, view.invalid.numpy(), None if view.mask is None else view.mask.numpy()
+    return _undistorted(intensities.numpy(), masks, step, options)
+
+
+def samples_of(view: View) -> SetSamples:
+    """The samples of a view of a scene at other angles.
+
+    Raises:
+        PolarguideError: its pictures do not determine Stokes vectors.
+    """
+    known_places(view.name, view.exposures)
+    return samples_of_loaded(view, *_state_of(view))
+
+
+def _state_of(view: View) -> tuple[Mask, Mask, float]:
+    """Dark and saturated pixels of a view, and one stored value as a share of full scale."""
+    codes = view.codes.numpy()
+    peak, lost = codes.max(axis=(0, 3)), view.saturated.numpy()
+    # Of pixels without polarization information, those nearer to black than to the brightest of the view are dark.
+    dark = (lost & (peak < peak.max() / 2)) | (peak == 0)
+    # Codes are multiples of what one stored value is, unless they were decoded or averaged.
+    step = int(np.gcd.reduce(np.flatnonzero(np.bincount(codes.ravel()))))
+    return dark, lost & ~dark, max(step, 1) / FULL_CODE
+
+
+def _undistorted(
+    intensities: Map, masks: tuple[Mask, Mask, Mask, Mask | None], lsb: float, options: ShotOptions
+) -> Developed:
+    """A picture of a scene, whose samples are its pixels. masks: dark, saturated, invalid, foreground."""
+    dark, saturated, invalid, foreground = masks
+    gray = intensities.mean(axis=3)
+    good = ~(saturated | dark | invalid)
+    noise = given_noise(options, lsb) or estimated_noise(gray, good, lsb)
+    return Developed(
+        intensities=intensities,
+        dark=dark,
+        saturated=saturated,
+        masked=invalid if foreground is None else invalid | ~foreground,
+        noise=noise,
+        factors=np.ones((4, 1, 1), np.float32),
+        mean_variance=1.0,
+        pair_ratio=pair_ratio(gray, good),
+        notes=(),
+    )

@@ -1,0 +1,404 @@
+"""``read_shot``: the maps of one exposure set, of files or of arrays in memory."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeGuard
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polarguide import optics
+from polarguide.capture.colmap.model import fit_camera, read_model
+from polarguide.capture.exposures import FOUR, Angle, normalized
+from polarguide.capture.given_arrays import Array, as_numpy, exposures_of, kind_of, stored_pictures
+from polarguide.capture.view import ANGLES, View
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import check_finite, index_of
+from polarguide.core.text import decimals
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
+from polarguide_shots.develop import develop, develop_view, samples_of, set_samples
+from polarguide_shots.exposures import find_shots
+from polarguide_shots.fit import DARK_SNR, maps_of_set
+from polarguide_shots.maps import Developed, Map, Part, Reason, ShotMaps
+from polarguide_shots.options import ShotOptions
+from polarguide_shots.sets import ExposureSet, require_determined
+
+UNREADABLE = (PolarguideError, OSError, MemoryError)
+"""What one bad file may raise; others come after it."""
+_TILE = 1 << 18
+"""Pixels that are worked on at a time, so that what is between stays in the processor's cache."""
+
+
+def read_shot(
+    shot: ExposureSet
+    | View
+    | Array
+    | str
+    | os.PathLike[str]
+    | Sequence[str | os.PathLike[str]]
+    | Sequence[Array],
+    options: ShotOptions | None = None,
+    angles: Sequence[Angle] = ANGLES,
+    part: Part | None = None,
+) -> ShotMaps:
+    """Read one exposure set: S0, DoLP, AoLP, their standard deviations, and which pixels say nothing.
+
+    Args:
+        shot: of ``find_shots``; a view of a scene; or the path of a mosaic or of a video with its table, the paths of
+            shots through a filter at four or any three or more angles, or a folder with one shot. Or arrays of NumPy
+            or torch: with ``options.sensor`` a raw mosaic [H, W] of uint8 or uint16; else pictures through a filter,
+            [K, H, W] or [K, H, W, 3] RGB (or K of them), whole numbers as stored or linear floats from 0 to 1.
+        options: how to read it.
+        part: x, y, width and height of what is wanted of the picture of a mosaic: the rest is left out where that saves
+            time, as ``ShotMaps.origin`` and ``whole`` say. Noise that is not given is then estimated from the part.
+        angles: angles of the K pictures of an array, degrees counter-clockwise as displayed; files state theirs.
+
+    Raises:
+        PolarguideError: the path is not one shot, a file is missing, cannot be read, or does not fit, or an array has
+            another shape or type.
+    """
+    options = (options or ShotOptions()).checked()
+    if isinstance(shot, View):
+        if shot.exposures != FOUR:
+            return maps_of_set(shot.name, (), samples_of(shot), options)
+        return maps_of(ExposureSet(shot.name, "scene", {}), develop_view(shot, options), options)
+    if is_array(shot):
+        shot = array_shot(stacked_array(shot), options, angles)
+    elif not isinstance(shot, ExposureSet):
+        paths = [shot] if isinstance(shot, str | os.PathLike) else list(shot)
+        found = find_shots(paths, options)
+        if len(found) != 1:
+            raise PolarguideError(
+                paths[0],
+                expected="one shot",
+                found=f"{len(found)}",
+                remedy="find_shots lists them; read them one by one.",
+            )
+        shot = found[0]
+    samples = set_samples(shot, options)
+    if samples is not None:
+        return maps_of_set(shot.name, shot.paths, samples, options)
+    return maps_of(shot, develop(shot, options, part), options)
+
+
+def fault_of(shot: ExposureSet, error: BaseException) -> PolarguideError:
+    """One of ``UNREADABLE`` as an error that names the shot."""
+    if isinstance(error, PolarguideError):
+        return error
+    if isinstance(error, OSError):
+        found, remedy = error.strerror or str(error), "Check the files and their disk."
+    else:
+        found, remedy = "it needs more memory than there is", "Free memory, or take a smaller region."
+    expected = "a shot that can be read, and room for its maps"
+    return PolarguideError(shot.where, expected=expected, found=found, remedy=remedy)
+
+
+def tiles(height: int, width: int) -> Iterator[slice]:
+    """Rows of a picture to work on at a time; each starts with a whole superpixel."""
+    rows = max(1, _TILE // width // 4) * 4
+    for top in range(0, height, rows):
+        yield slice(top, min(top + rows, height))
+
+
+@torch.no_grad()
+def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> ShotMaps:
+    """The maps of developed intensities."""
+    _, height, width, _ = developed.intensities.shape
+    stokes = torch.empty((3, height, width))
+    dolp, debiased, aolp, sigma_dolp, sigma_aolp = (torch.empty((height, width)) for _ in range(5))
+    reason = torch.zeros((height, width), dtype=torch.uint8)
+    factors = torch.from_numpy(np.ascontiguousarray(developed.factors))
+    period = factors.shape[1]
+    floor, slope = developed.noise.floor, developed.noise.slope
+    pattern: torch.Tensor | None = None
+    for part in tiles(height, width):
+        samples = torch.from_numpy(developed.intensities[:, part])
+        gray = samples[..., 0] if samples.shape[-1] == 1 else samples.mean(dim=-1)
+        count = gray.shape[1]
+        if pattern is None:
+            pattern = factors.repeat(1, -(-count // period), -(-width // period))[..., :width].contiguous()
+        variances = gray.clamp(min=0).mul_(slope).add_(floor).mul_(pattern[:, :count])
+        stokes[:, part] = s = optics.stokes(gray)
+        dolp[part] = degree = optics.dolp(s)
+        aolp[part] = optics.aolp(s)
+        spread = optics.polarization_uncertainty(s, variances)
+        sigma_dolp[part], sigma_aolp[part], debiased[part] = spread.dolp, spread.aolp, spread.debiased
+        # Later reasons replace earlier ones.
+        why = reason[part]
+        why[degree <= options.snr * spread.dolp] = Reason.NOISE
+        why[s[0] <= DARK_SNR / 2 * variances.sum(dim=0).sqrt()] = Reason.DARK
+    codes = reason.numpy()
+    for mask, kind in (
+        (developed.dark, Reason.DARK),
+        (developed.saturated, Reason.SATURATED),
+        (developed.masked, Reason.MASKED),
+    ):
+        codes[mask] = kind
+    return ShotMaps(
+        name=shot.name,
+        files=shot.paths,
+        intensities=developed.intensities,
+        stokes=stokes.numpy(),
+        dolp=dolp.numpy(),
+        dolp_debiased=debiased.numpy(),
+        aolp=aolp.numpy(),
+        sigma_dolp=sigma_dolp.numpy(),
+        sigma_aolp=sigma_aolp.numpy(),
+        reason=codes,
+        noise=developed.noise,
+        pair_ratio=developed.pair_ratio,
+        notes=developed.notes,
+        pixel_variance=float(developed.factors.mean()),
+        mean_variance=developed.mean_variance,
+        origin=developed.origin,
+        whole=developed.whole,
+    )
+
+
+TOWARD = (0.0, -0.5, -1.0)
+"""What a normal is guessed to be where polarization leaves a choice: toward the camera, and a little upward."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMaps:
+    """Normals and layers of one shot, for a smooth dielectric under unpolarized light.
+
+    Attributes:
+        zeniths: [3, H, W] float32, radians: of diffuse light, and of specular light below and above Brewster's angle,
+            whose degree of polarization is the pixel's. The six candidates of the normal have azimuth AoLP and AoLP +
+            pi (diffuse), AoLP + pi/2 and AoLP - pi/2 (specular). NaN for diffuse light where it cannot be so polarized.
+        normal: [H, W, 3] float32, the candidate nearest to ``TOWARD``, camera axes (x right, y down, z forward): a
+            guess among six, and 0 where the reason of the pixel says that it has no angle.
+        specular_paper, diffuse_paper: [H, W, C] float32, units of S0: the coarse cue of PolarGuide-GSDR, which needs no
+            normal (it takes the diffuse zenith of the DoLP); the two do not add up to S0.
+        specular_exact, diffuse_exact: [H, W, C] float32, units of S0: Fresnel's split, which needs the normal, and so
+            is as right as the guess above. They add up to S0.
+        conditioned: [H, W] bool, where the exact one is well conditioned.
+        refractive_index: refractive index of all surfaces.
+        perspective: whether the rays of the pixels are known; else all are parallel to the axis.
+    """
+
+    zeniths: Map
+    normal: Map
+    specular_paper: Map
+    diffuse_paper: Map
+    specular_exact: Map
+    diffuse_exact: Map
+    conditioned: NDArray[np.bool_]
+    refractive_index: float
+    perspective: bool
+
+
+def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
+    """A camera of ``fx,fy,cx,cy`` in pixels of a picture of ``size`` (width, height).
+
+    Raises:
+        PolarguideError: the text is something else.
+    """
+    numbers = decimals(text)
+    # A center may lie outside of a cut picture; beyond these bounds it is a slip.
+    centered = all(abs(c - n / 2) <= 10 * n for c, n in zip(numbers[2:], size, strict=False))
+    if len(numbers) != 4 or not centered or not all(0 < f <= 1e6 for f in numbers[:2]):
+        raise PolarguideError(
+            "--intrinsics",
+            expected="fx,fy,cx,cy in pixels of the developed picture",
+            found=repr(text),
+            remedy="Give four numbers; the center of the first pixel is at 0.5.",
+        )
+    return Camera(*size, *numbers, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+
+
+def camera_of(shot: ExposureSet, size: tuple[int, int], intrinsics: str | None) -> Camera | None:
+    """The camera of a shot: by intrinsics given, else of a scene that has poses, else None.
+
+    Raises:
+        PolarguideError: the intrinsics or the scene's model cannot be used.
+    """
+    if intrinsics is not None:
+        return parse_intrinsics(intrinsics, size)
+    if shot.root is None or not (shot.root / "sparse").exists():
+        return None
+    model = read_model(shot.root)
+    if shot.view not in model.names:
+        return None
+    return fit_camera(model.camera(shot.view), *size, folder=model.folder, view=shot.view)
+
+
+@torch.no_grad()
+def surface_maps(
+    maps: ShotMaps, camera: Camera | None = None, refractive_index: float | None = None
+) -> SurfaceMaps:
+    """Candidates of the normals, one of them, and both separations.
+
+    Args:
+        maps: maps of the shot.
+        camera: of its pixels, for their rays; None takes rays parallel to the axis, which a long lens nearly has.
+        refractive_index: refractive index of all surfaces; None: ``INDEX``.
+
+    Raises:
+        PolarguideError: the refractive index is out of range.
+    """
+    refractive_index = index_of(refractive_index)
+    check_finite("refractive_index", refractive_index, 1.0001, 4.0)
+    channels, height, width = maps.intensities.shape[3], *maps.reason.shape
+    zeniths = torch.empty((3, height, width))
+    normal = torch.empty((3, height, width)).movedim(0, -1)
+    paper_specular, paper_diffuse, specular, diffuse = (
+        torch.empty((channels, height, width)).movedim(0, -1) for _ in range(4)
+    )
+    conditioned = torch.empty((height, width), dtype=torch.bool)
+    stokes, dolp, aolp = (torch.from_numpy(a) for a in (maps.stokes, maps.dolp, maps.aolp))
+    for part in tiles(height, width):
+        rays = torch.tensor([0.0, 0.0, 1.0]) if camera is None else camera.rays()[part]
+        s = optics.stokes(torch.from_numpy(maps.intensities[:, part]))
+        zenith, chosen = _chosen_normal(stokes[0, part], dolp[part], aolp[part], rays, refractive_index)
+        zeniths[:, part] = zenith
+        paper = optics.paper_separation(s, zenith[0], refractive_index)
+        exact = optics.exact_separation(s, chosen, rays, refractive_index)
+        paper_specular[part], paper_diffuse[part] = paper.specular, paper.diffuse
+        specular[part], diffuse[part] = exact.specular, exact.diffuse
+        conditioned[part] = exact.conditioned
+        usable = torch.from_numpy(maps.usable[part])
+        normal[part] = chosen * usable[..., None]
+    above = dolp > optics.diffuse_dolp_limit(refractive_index)
+    zeniths[0][above] = math.nan
+    return SurfaceMaps(
+        zeniths=zeniths.numpy(),
+        normal=normal.numpy(),
+        specular_paper=paper_specular.numpy(),
+        diffuse_paper=paper_diffuse.numpy(),
+        specular_exact=specular.numpy(),
+        diffuse_exact=diffuse.numpy(),
+        conditioned=conditioned.numpy(),
+        refractive_index=refractive_index,
+        perspective=camera is not None,
+    )
+
+
+def _chosen_normal(
+    s0: Tensor, dolp: Tensor, aolp: Tensor, rays: Tensor, index: float
+) -> tuple[Tensor, Tensor]:
+    """Zeniths [3, ...] of the candidates, and the one of ``optics.physical_candidates`` nearest to ``TOWARD``.
+
+    The same as ``optics.disambiguate`` finds, but without making all six: of two that lie half a turn apart the nearer
+    one is on the side of the guess.
+    """
+    below, above = optics.specular_zeniths(dolp, index)
+    zeniths = torch.stack((optics.diffuse_zenith(dolp, index), below, above))
+    guess = unit(torch.tensor(TOWARD))
+    x_ref, up_ref = optics.lens_frame(rays)
+    right, up, along = dot(x_ref, guess), dot(up_ref, guess), dot(rays, guess)
+    cosine, sine = torch.cos(aolp), torch.sin(aolp)
+    # Across the ray, toward the guess: with azimuth AoLP, and a quarter turn from it.
+    diffuse_side, specular_side = cosine * right + sine * up, cosine * up - sine * right
+    sines, cosines = torch.sin(zeniths), torch.cos(zeniths)
+    possible = (dolp <= optics.diffuse_dolp_limit(index)) | (s0 <= 0)
+    score = torch.where(possible, sines[0] * diffuse_side.abs() - cosines[0] * along, -4.0)
+    sine_z, cosine_z, specular = sines[0], cosines[0], torch.zeros_like(possible)
+    for sine_k, cosine_k in zip(sines[1:], cosines[1:], strict=True):
+        other = sine_k * specular_side.abs() - cosine_k * along
+        nearer = other > score
+        score, specular = torch.maximum(score, other), specular | nearer
+        sine_z, cosine_z = torch.where(nearer, sine_k, sine_z), torch.where(nearer, cosine_k, cosine_z)
+    sign = torch.where(torch.where(specular, specular_side, diffuse_side) < 0, -sine_z, sine_z)
+    x = torch.where(specular, -sine, cosine) * sign
+    y = torch.where(specular, cosine, sine) * sign
+    axes = zip(*(v.unbind(-1) for v in (x_ref, up_ref, rays)), strict=True)
+    # Component by component in memory, as all that follows reads them.
+    return zeniths, torch.stack([x * a + y * b - cosine_z * ray for a, b, ray in axes]).movedim(0, -1)
+
+
+NAME = "array"
+"""Default name of a shot in memory."""
+_MOSAIC = "a mosaic [H, W] of uint8 or uint16, as --sensor (ShotOptions.sensor) says"
+
+
+def array_shot(
+    array: Array, options: ShotOptions, angles: Sequence[Angle] = ANGLES, name: str = NAME
+) -> ExposureSet:
+    """A shot in memory.
+
+    Args:
+        array: with a sensor, a raw mosaic [H, W] of uint8 or uint16; else pictures through a filter, [K, H, W] gray or
+            [K, H, W, 3] RGB: uint8 or uint16 as stored, or linear floats from 0 to 1. It is not written to.
+        options: how it is read. name: name of the shot.
+        angles: angles of the K pictures in degrees, counter-clockwise as displayed.
+
+    Raises:
+        PolarguideError: shape, type or angles do not fit; its ``where`` is the name.
+    """
+    values = as_numpy(array)
+    if options.sensor is not None:
+        return ExposureSet(name, "mosaic", {}, stored=_mosaic(values, options, name))
+    if values.ndim == 2:
+        remedy = (
+            "Name the sensor of a mosaic: ShotOptions(sensor=...); stack the pictures of a filter, [K, H, W]."
+        )
+        expected = "pictures [K, H, W] or [K, H, W, 3] through a filter, or a sensor of the mosaic"
+        raise PolarguideError(name, expected=expected, found=kind_of(values), remedy=remedy)
+    if np.issubdtype(values.dtype, np.floating) and options.transfer == "srgb":
+        raise PolarguideError(
+            name,
+            expected="integers with srgb=True",
+            found=kind_of(values),
+            remedy="Leave srgb out: floats are linear.",
+        )
+    stored = stored_pictures(values, name)
+    exposures_of(angles, len(stored), f"{name} (angles)")
+    known = [angle if isinstance(angle, str) else normalized(float(angle)) for angle in angles]
+    if sorted(map(str, known)) == sorted(str(float(angle)) for angle in ANGLES):
+        order = [known.index(float(angle)) for angle in ANGLES]
+        return ExposureSet(name, "filter", {}, stored=stored[order], angles=tuple(map(float, ANGLES)))
+    require_determined(f"{name} (angles)", known)
+    return ExposureSet(name, "set", {}, stored=stored, angles=tuple(known))
+
+
+def is_array(shot: object) -> TypeGuard[Array | Sequence[Array]]:
+    """Whether something is an array, or a list of them."""
+    first = shot[0] if isinstance(shot, list | tuple) and shot else shot
+    return isinstance(first, np.ndarray | Tensor)
+
+
+def stacked_array(shot: Array | Sequence[Array], name: str = NAME) -> Array:
+    """The array itself, or one of a list of pictures.
+
+    Raises:
+        PolarguideError: the pictures of the list have several shapes or types.
+    """
+    if not isinstance(shot, list | tuple):
+        return shot  # type: ignore[return-value]
+    pictures = [as_numpy(picture) for picture in shot]
+    kinds = list(dict.fromkeys(map(kind_of, pictures)))
+    if len(kinds) > 1:
+        remedy = "Export all pictures of a shot with the same settings."
+        raise PolarguideError(
+            name, expected="pictures of one shape and type", found=" and ".join(kinds), remedy=remedy
+        )
+    return np.stack(pictures)
+
+
+def _mosaic(values: NDArray[Any], options: ShotOptions, name: str) -> NDArray[Any]:
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[..., 0]
+    if values.ndim != 2 or values.dtype not in (np.uint8, np.uint16) or 0 in values.shape:
+        remedy = (
+            "Give what the sensor delivers, before any demosaicing; without a sensor, pictures [K, H, W]."
+        )
+        raise PolarguideError(name, expected=_MOSAIC, found=kind_of(values), remedy=remedy)
+    found = values.shape[1], values.shape[0]
+    wanted = options.width or found[0], options.height or found[1]
+    if found != wanted:
+        raise PolarguideError(
+            name,
+            expected=f"{wanted[0]}x{wanted[1]} pixels, as width and height say",
+            found=f"{found[0]}x{found[1]}",
+            remedy="Leave the two out: an array knows its size.",
+        )
+    return np.ascontiguousarray(values)

@@ -1,0 +1,335 @@
+"""From the files of a set to the samples that are fitted: linear values of its pictures, their angles and exposures."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from polarguide.capture import checks
+from polarguide.capture.calibration import ANGLES, Calibration
+from polarguide.capture.exposures import Angle, Exposure, analyzers, turned
+from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
+from polarguide.capture.filter.encoding import VIDEO, kind_of_file, transfer_of_set
+from polarguide.capture.filter.shots import Shots, read_stack, stacked
+from polarguide.capture.formats.decoders import rescaled
+from polarguide.capture.formats.pictures import linear_codes
+from polarguide.capture.layout import require_memory
+from polarguide.capture.picture_sets import Mask, SetSamples
+from polarguide.capture.sensor.pattern import FULL_16, Levels, clipping_bits, estimate_levels
+from polarguide.capture.view import View
+from polarguide.capture.view_reader import ViewData, require_alike
+from polarguide.core.errors import PolarguideError
+from polarguide.preparation.shot_exposures import corrected_note, stated_exposures
+from polarguide_shots.options import ShotOptions
+from polarguide_shots.sets import SetPicture, known_places, read_frames
+
+# Compression smears the edge of clipped areas over a few values.
+_COMPRESSED_FULL = 250
+_FITTED = 4 * (4 * 3 + 3 + 7)
+"""Bytes for each pixel of what is fitted: intensities, Stokes vectors and maps."""
+
+
+def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) -> SetSamples:
+    """Read the pictures of a set, one after the other.
+
+    Raises:
+        PolarguideError: one cannot be read, they differ in size, depth or orientation, or they do not fit into memory.
+    """
+    require_no_order(options.calibration, name)
+    unused = len(pictures)
+    pictures = [picture for picture in pictures if not isinstance(picture.angle, str)]
+    unused -= len(pictures)
+    _require_one_kind(pictures)
+    count = len(pictures)
+    values: NDArray[Any] | None = None
+    lost: NDArray[Any] | None = None
+    dark: Mask | None = None
+    code, gray, kind = 1, True, np.dtype(np.uint16)
+    for place, shot in enumerate(_read_each(pictures)):
+        stored = shot.pictures[0]
+        gray = gray and bool((stored[..., :1] == stored).all())
+        if values is None or lost is None or dark is None:
+            code = shot.orientation
+            needed = (count * (2 * (1 if gray else 3) + 1) + _FITTED) * stored[..., 0].size
+            remedy = "Make the pictures smaller, all by the same factor."
+            require_memory(pictures[0].path, needed, f"{count} pictures of {name}", remedy=remedy)
+            values = np.empty((count, *stored.shape[:2], 1 if gray else 3), np.uint16)
+            lost, dark = np.empty(values.shape[:3], bool), np.ones(values.shape[1:3], bool)
+        elif not gray and values.shape[3] == 1:
+            values = np.repeat(values, 3, axis=3)
+        values[place] = stored[..., : values.shape[3]]
+        lost[place] = shot.clipped[0]
+        kind = stored.dtype
+        dark &= shot.dark
+    assert values is not None
+    assert lost is not None
+    assert dark is not None
+    gains, words = _gains(pictures)
+    read = Shots(values, code, lost, dark)
+    angles = [_degrees(picture.angle) for picture in pictures]
+    labels = tuple(picture.label for picture in pictures)
+    files = list(dict.fromkeys(picture.path for picture in pictures))
+    film = files[0] if pictures[0].frame is not None else None
+    samples = _samples(read, kind, labels, angles, gains, options, files, film)
+    return replace(samples, notes=(*samples.notes, *words, *_unused(unused)))
+
+
+def samples_of_arrays(
+    name: str, stored: NDArray[Any], angles: Sequence[Angle], options: ShotOptions
+) -> SetSamples:
+    """The samples of a set in memory.
+
+    Args:
+        name: name of the shot. stored: [K, H, W, 3] uint8 or uint16. angles: angles of the K pictures.
+    """
+    require_no_order(options.calibration, name)
+    places = [k for k, angle in enumerate(angles) if not isinstance(angle, str)]
+    shots = stacked(stored[places])
+    gray = bool((shots.pictures[..., :1] == shots.pictures).all())
+    values = shots.pictures[..., :1] if gray else shots.pictures
+    read = replace(shots, pictures=values.astype(np.uint16), clipped=shots.clipped.copy())
+    labels = tuple(f"picture {k + 1}" for k in places)
+    known = [_degrees(angles[k]) for k in places]
+    samples = _samples(read, stored.dtype, labels, known, [1.0] * len(places), options)
+    return replace(samples, notes=(*samples.notes, *_unused(len(angles) - len(places))))
+
+
+def _samples(
+    read: Shots,
+    kind: np.dtype[Any],
+    labels: tuple[str, ...],
+    angles: Sequence[float],
+    gains: Sequence[float],
+    options: ShotOptions,
+    files: Sequence[Path] = (),
+    film: Path | None = None,
+) -> SetSamples:
+    """Linear samples of stored ones, upright; ``read`` is used up: uint16, whatever ``kind`` the values have.
+
+    ``files``: of the pictures; ``film``: the video that they are frames of.
+    """
+    values, lost, dark, code = read.pictures, read.clipped, read.dark, read.orientation
+    levels, notes = levels_of_shot(values, 8 * kind.itemsize, options)
+    every, step = np.arange(np.iinfo(kind).max + 1, dtype=kind), 1 / float(np.iinfo(kind).max)
+    if levels is not None:
+        every, step = rescaled(every, levels.white), 1 / levels.white
+    decision = transfer_of_set(files, options.transfer, _judged(read, every), angles, video=film)
+    transfer = decision.transfer
+    linear = linear_codes(every, transfer)
+    as_stored = levels is None and kind == np.uint16 and transfer == "linear"
+    for picture, clipped in zip(values, lost, strict=True):  # one after the other, as memory is
+        if levels is not None:
+            clipped |= (picture >= levels.saturation).any(axis=2)
+        if not as_stored:
+            picture[...] = linear[picture]
+    turn = orientation_calibration(code)
+    return SetSamples(
+        labels=labels,
+        values=apply_orientation(values.transpose(1, 2, 0, 3), code).transpose(2, 0, 1, 3),
+        exposures=tuple(
+            Exposure(_degrees(turned(turned(angle, options.calibration), turn)), gain=gain)
+            for angle, gain in zip(angles, gains, strict=True)
+        ),
+        lost=apply_orientation(lost.transpose(1, 2, 0), code).transpose(2, 0, 1),
+        dark=apply_orientation(dark, code),
+        masked=np.zeros(apply_orientation(dark, code).shape, bool),
+        step=step,
+        notes=(decision.note, *filter(None, [decision.doubt]), *notes),
+    )
+
+
+def _judged(read: Shots, every: NDArray[Any]) -> Shots:
+    """A sample of pictures with full scale that of the type of ``every``, which has what each stored value becomes."""
+    usable = ~(read.clipped.any(axis=0) | read.dark)
+    pictures, sample = checks.sampled(read.pictures), checks.sampled(usable[None])
+    return Shots(every[pictures], 1, ~sample, np.zeros(sample.shape[1:], bool))
+
+
+def levels_of_shot(
+    values: NDArray[Any], container: int, options: ShotOptions
+) -> tuple[Levels | None, list[str]]:
+    """Full scale and saturation of the pictures of one shot, and notes; None where they are those of the files.
+
+    Full scale is never guessed from the values of one shot, or shots of a series would be on several scales.
+
+    Args:
+        values: [K, ...] stored values. container: bits of a value in the files.
+
+    Raises:
+        PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.
+    """
+    pile, notes = piled_up(values, container, options)
+    if pile is None and options.bits is None and options.saturation is None:
+        return None, []
+    bits, top = options.bits or container, options.saturation or pile
+    return estimate_levels(int(values.max()), 1, container, bits=bits, black=0.0, saturation=top), notes
+
+
+def piled_up(values: NDArray[Any], container: int, options: ShotOptions) -> tuple[int | None, list[str]]:
+    """The value below full scale at which samples of 16-bit files clip, unless options state it; and a note of it."""
+    top = int(values.max())
+    if container != 16 or top == FULL_16 or options.bits is not None or options.saturation is not None:
+        return None, []
+    bits = top.bit_length()
+    if top != (1 << bits) - 1:  # cheaper than to count values, and the rule of what follows
+        return None, []
+    counts = sum((np.bincount(part.ravel(), minlength=FULL_16 + 1) for part in values), np.zeros(1, np.int64))
+    if clipping_bits(counts) is None:
+        return None, []
+    return top, [
+        f"Values pile up at {top} ({counts[top] / counts.sum():.1%} of the samples): taken as saturated. "
+        f"--bits {bits} makes it full scale."
+    ]
+
+
+def require_no_order(calibration: Calibration, name: str) -> None:
+    """Refuse what a calibration says of pictures called 0, 45, 90 and 135 for pictures at other angles.
+
+    Raises:
+        PolarguideError: the calibration has gains or another order.
+    """
+    for field, given in (("gains", calibration.gains is not None), ("order", calibration.order != ANGLES)):
+        if given:
+            raise PolarguideError(
+                f"calibration ({field})",
+                expected="pictures at 0, 45, 90 and 135 degrees: the option is for these",
+                found=f"{name}, a set of pictures at other angles",
+                remedy="Leave it out; sense and zero apply, and angles.csv has a column gain.",
+            )
+
+
+def _read_each(pictures: Sequence[SetPicture]) -> Iterator[Shots]:
+    """Each picture as read; all of one size, depth and orientation.
+
+    Raises:
+        PolarguideError: one cannot be read, or differs.
+    """
+    first: Shots | None = None
+    for path, group in itertools.groupby(pictures, key=lambda picture: picture.path):
+        frames = [picture.frame for picture in group]
+        for shot in _video(path, frames) if frames[0] is not None else [read_stack([path])] * len(frames):
+            first = first or shot
+            require_alike(path, shot.pictures[0], pictures[0].path, first.pictures[0])
+            if shot.orientation != first.orientation:
+                raise PolarguideError(
+                    path,
+                    expected=f"EXIF orientation {first.orientation} like {pictures[0].path.name}",
+                    found=str(shot.orientation),
+                    remedy="Keep the camera still within a set, or export all with the same orientation.",
+                )
+            yield shot
+
+
+def _video(path: Path, frames: Sequence[int | None]) -> Iterator[Shots]:
+    """Frames of a video, in the order that is asked for, as pictures are read."""
+    wanted = [frame for frame in frames if frame is not None]
+    rising = sorted(wanted)
+    read = {frame: picture for frame, picture in zip(rising, read_frames(path, rising), strict=True)}
+    for frame in wanted:
+        picture = read[frame]
+        clipped, lit = (np.asarray(mask.any(axis=2)) for mask in (picture >= _COMPRESSED_FULL, picture > 0))
+        yield Shots(picture[None], 1, clipped[None], ~lit)
+
+
+def _require_one_kind(pictures: Sequence[SetPicture]) -> None:
+    """Refuse files of several kinds.
+
+    Raises:
+        PolarguideError: there are such.
+    """
+    kinds: dict[str, Path] = {}
+    for picture in pictures:
+        kinds.setdefault(VIDEO if picture.frame is not None else kind_of_file(picture.path), picture.path)
+    if len(kinds) > 1:
+        raise PolarguideError(
+            pictures[0].path.parent,
+            expected="a set of one kind of file",
+            found=" and ".join(f"{kind} ({path.name})" for kind, path in kinds.items()),
+            remedy="Keep one kind: their brightness cannot be compared.",
+        )
+
+
+def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:
+    """The gain of each picture: as the table states, else as the files state their exposure; and notes."""
+    gains = [picture.gain for picture in pictures]
+    if all(gain is None and picture.frame is None for gain, picture in zip(gains, pictures, strict=True)):
+        stated, missing = stated_exposures({"": [picture.path for picture in pictures]})
+        if stated:
+            return stated[""], [corrected_note(stated[""])]
+        if missing:
+            return [1.0] * len(pictures), [missing]
+    return [1.0 if gain is None else gain for gain in gains], []
+
+
+def samples_of_view(data: ViewData, full: int | None, options: ShotOptions) -> SetSamples:
+    """The samples of a view of a scene as stored, at other angles than the usual four; ``full``: where it saturates.
+
+    Raises:
+        PolarguideError: its known pictures do not determine Stokes vectors.
+    """
+    require_no_order(options.calibration, data.name)
+    places = known_places(data.name, data.exposures)
+    saturated = np.zeros(data.black.shape, bool) if full is None else np.asarray(data.peak >= full)
+    return SetSamples(
+        labels=tuple(f"picture {k + 1}" for k in places),
+        values=data.codes[places],
+        exposures=tuple(
+            replace(e, angle=_degrees(turned(e.angle or 0.0, options.calibration)))
+            for e in (data.exposures[k] for k in places)
+        ),
+        lost=np.broadcast_to(saturated, (len(places), *saturated.shape)),
+        dark=data.black,
+        masked=data.invalid if data.mask is None else data.invalid | ~data.mask,
+        step=1 / float(np.iinfo(data.peak.dtype).max),
+        notes=_unused(len(data.exposures) - len(places)),
+    )
+
+
+def behind_lens(view: View, intensities: Tensor, exposures: Sequence[Exposure]) -> Tensor:
+    """Intensities of a view [K, H, W, C] at some exposures, as polarizers behind the lens would have measured them."""
+    if view.mount == "sensor":
+        return intensities
+    rays = view.camera.rays()
+    more = analyzers(exposures, rays, "sensor")[..., None, None] - analyzers(exposures, rays, "filter")
+    return intensities + torch.einsum("ksyx,syxc->kyxc", more, view.stokes()[1:]) / 2
+
+
+def samples_of_loaded(view: View, dark: Mask, saturated: Mask, step: float) -> SetSamples:
+    """The samples of a view as loaded: with its mask, its exposures, and rays through a filter before the lens.
+
+    Raises:
+        PolarguideError: its known pictures do not determine Stokes vectors.
+    """
+    places = known_places(view.name, view.exposures)
+    exposures = [replace(view.exposures[k], gain=1.0) for k in places]
+    intensities = behind_lens(view, view.intensities()[places], exposures)
+    invalid = view.invalid.numpy()
+    return SetSamples(
+        labels=tuple(f"picture {k + 1}" for k in places),
+        values=intensities.numpy(),
+        exposures=tuple(exposures),
+        lost=np.broadcast_to(saturated, (len(places), *saturated.shape)),
+        dark=dark,
+        masked=invalid if view.mask is None else invalid | ~view.mask.numpy(),
+        step=step,
+        notes=_unused(len(view.exposures) - len(places)),
+    )
+
+
+def _degrees(angle: Angle) -> float:
+    """An angle that is known to be a number."""
+    assert not isinstance(angle, str)
+    return angle
+
+
+def _unused(count: int) -> tuple[str, ...]:
+    """The note about pictures that a fit cannot use."""
+    return (f"{count} pictures without a known angle are not used.",) if count else ()

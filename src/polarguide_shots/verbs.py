@@ -1,0 +1,242 @@
+"""Verbs of shots without poses and of the camera: measure, priors, calibrate."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shlex
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+import polarguide
+from polarguide.cli.console import ConsoleReporter, console, print_error, say, use_threads
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import SceneOptions, ThreadOptions
+from polarguide.core.records import option_name
+from polarguide.core.system import StopSignals
+from polarguide.preparation.settings import CalibrationOptions
+from polarguide_shots.calibration.settings import CalibrateSettings
+from polarguide_shots.options import MeasureOptions, ShotOptions, WatchOptions
+
+
+def measure(
+    paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH ...")] = (),
+    /,
+    *,
+    out: Path,
+    options: Annotated[MeasureOptions, tyro.conf.arg(name="")],
+    watching: Annotated[WatchOptions, tyro.conf.arg(name="")],
+    reading: Annotated[ShotOptions, tyro.conf.arg(name="")],
+    angles: Annotated[CalibrationOptions, tyro.conf.arg(name="")],
+    compute: Annotated[ThreadOptions, tyro.conf.arg(name="")],
+) -> int:
+    """A table of many shots for inspection lines: S0, DoLP and AoLP by region, limits, a golden part.
+
+    Writes table.csv (a line per region), table.jsonl (a line per shot), and pictures of shots beyond their limits.
+    The same command goes on where it stopped: what is in the table is not measured again. The exit status is 3 if a
+    shot is beyond a limit, else 2 if one could not be read. docs/how-to/inspection-line.md shows the whole way.
+
+    Args:
+        paths: Raw mosaics, shots of four files, scenes, or folders of them.
+        out: Folder of the table.
+    """
+    use_threads(compute.threads)
+    if bool(paths) == (watching.watch is not None):
+        raise PolarguideError(
+            "--watch",
+            expected="shots to measure, or a folder to watch",
+            found="both" if paths else "neither",
+            remedy="Give files and folders for one pass, or --watch FOLDER.",
+        )
+    for name in ("settle", "patience", "idle"):
+        if watching.watch is None and getattr(watching, name) != getattr(WatchOptions, name):
+            raise PolarguideError(
+                f"--{name}",
+                expected="--watch",
+                found="one pass over files",
+                remedy="Leave it out, or watch a folder.",
+            )
+    reading = replace(reading, calibration=angles.read(), analyzers=angles.analyzers())
+    heard = partial(_print_entry, every=watching.watch is not None)
+    if watching.watch is None:
+        line = importlib.import_module("polarguide_shots.measurement.line")
+        outcome = line.measure_shots(paths, out, options, reading, heard=heard, reporter=ConsoleReporter())
+    else:
+        watch = importlib.import_module("polarguide_shots.measurement.watch")
+        with StopSignals() as should_stop:
+            outcome = watch.watch_folder(
+                watching.watch, out, options, reading, watching,
+                should_stop=should_stop, heard=heard, reporter=ConsoleReporter(),
+            )  # fmt: skip
+    _print_outcome(outcome)
+    if outcome.trouble:  # why nothing was found in a watched folder
+        print_error(outcome.trouble)
+    if outcome.waiting:
+        names = ", ".join(outcome.waiting[:4]) + (", ..." if len(outcome.waiting) > 4 else "")
+        unmeasured = f"{len(outcome.waiting)} that are not, and were not measured ({names})"
+        remedy = "Complete, rename or remove their files; the same command goes on."
+        error = PolarguideError(watching.watch, expected="complete shots", found=unmeasured, remedy=remedy)
+        print_error(str(error))
+    status: int = outcome.exit_status
+    return status
+
+
+def _print_entry(entry: Any, *, every: bool) -> None:
+    """Print a shot that is beyond a limit or could not be read; ``every``: also one without a fault."""
+    if entry.status == "unread":
+        print_error(entry.why)
+    elif entry.status == "beyond":
+        console.print("[bold red]beyond:[/] ", end="")
+        faults = (f"{row['region']} {row['why']}" for row in entry.regions if row["why"])
+        say(f"{entry.shot}: {'; '.join(faults)}")
+    elif every:
+        say(f"{entry.status}: {entry.shot}")
+
+
+def _print_outcome(outcome: Any) -> None:
+    counts = outcome.counts
+    shots = ", ".join(
+        f"{counts[status]} {status}"
+        for status in ("measured", "within", "beyond", "unread")
+        if counts[status]
+    )
+    before = f" ({outcome.earlier} of them earlier)" if outcome.earlier else ""
+    say(f"shots: {shots or 'none'}{before}")
+    pictures = f"   pictures: {outcome.folder}/beyond" if counts["beyond"] else ""
+    say(f"table: {outcome.folder}/table.csv, .jsonl{pictures}")
+
+
+def priors(
+    paths: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    /,
+    *,
+    out: Path,
+    formats: str | None = None,
+    intrinsics: str | None = None,
+    refractive_index: float | None = None,
+    run: Path | None = None,
+    views: str = "test",
+    threshold: float | None = None,
+    downscale: int = 1,
+    memory: float | None = None,
+    shots: Annotated[ShotOptions, tyro.conf.arg(name="")],
+    angles: Annotated[CalibrationOptions, tyro.conf.arg(name="")],
+    machine: Annotated[ThreadOptions, tyro.conf.arg(name="")],
+) -> None:
+    """Polarization maps of a shot, many shots or a scene: pictures, numbers and a page.
+
+    S0, DoLP and AoLP with their standard deviations, both separations, polarization normals with the zeniths of their
+    candidates, and the pixels that say nothing. A shot is a raw mosaic (with --sensor), four files of a rotating filter
+    (names or folders with 0, 45, 90, 135), or a view of a scene without poses; folders may hold many. The exact
+    separation needs normals: those of a trained run with --run, else the polarization normals themselves, with their
+    ambiguity resolved only by the surface facing the camera (a rough guess, and named so). docs/how-to/one-shot.md
+    says more.
+
+    Args:
+        paths: Mosaics, shots, folders of them, or a scene folder.
+        out: Folder to write: a folder for each shot in it; pictures and a contact sheet for a scene with poses.
+        formats: Of the maps: some of png,exr,npy,page. Without it all for shots, none for a scene with poses.
+        intrinsics: fx,fy,cx,cy of the developed pictures, for normals; without them the rays are taken to be parallel.
+        refractive_index: Of the surfaces; without it as scene.json says, else 1.5.
+        run: For a scene: a run trained on it (at the same --downscale), whose normals resolve the ambiguity.
+        views: For a scene: test, train, all, or names separated by commas.
+        threshold: For a scene: DoLP above which a pixel's normal is used; without it 0.05.
+        downscale: For a scene: average the pictures over boxes of this many pixels first.
+        memory: For a scene: GiB that the pictures may take; without it, 80 % of what is free.
+    """
+    use_threads(machine.threads)
+    reporter = ConsoleReporter()
+    if not paths:
+        raise PolarguideError(
+            "PATH", expected="at least one shot or scene", found="none", remedy="Name files or folders."
+        )
+    options = replace(shots, calibration=angles.read(), analyzers=angles.analyzers())
+    some = None if formats is None else [name.strip() for name in formats.split(",") if name.strip()]
+    if len(paths) == 1 and os.path.lexists(paths[0] / "sparse"):
+        _refuse("shots", "a scene with poses", intrinsics=intrinsics)
+        sheet = polarguide.priors(
+            paths[0],
+            out,
+            run=None if run is None else polarguide.open_run(run, reporter=reporter),
+            views=views,
+            threshold=0.05 if threshold is None else threshold,
+            reading=SceneOptions(downscale, "srgb" if shots.transfer == "srgb" else "linear", memory),
+            formats=some or (),
+            shots=replace(options, transfer="auto"),
+            refractive_index=refractive_index,
+            reporter=reporter,
+        )
+        say(f"pictures: {out}   contact sheet: {sheet}")
+        return
+    _refuse(
+        "a scene with poses",
+        "shots",
+        run=run,
+        views=None if views == "test" else views,
+        threshold=threshold,
+        memory=memory,
+    )
+    if downscale != 1:
+        raise PolarguideError(
+            "downscale", expected="1 for shots", found=str(downscale), remedy="Use --demosaic quarter."
+        )
+    outcome = polarguide.shot_priors(
+        paths,
+        out,
+        shots=options,
+        formats=some,
+        intrinsics=intrinsics,
+        refractive_index=refractive_index,
+        reporter=reporter,
+    )
+    for name, folder in list(outcome.folders.items())[:4]:
+        page = folder / "shot.html"
+        say(f"{name}: {page if page.exists() else folder}")
+    if len(outcome.folders) > 4:
+        say(f"... and {len(outcome.folders) - 4} more in {out}")
+    if outcome.faults:
+        total = len(outcome.faults) + len(outcome.folders)
+        raise PolarguideError(
+            out,
+            expected=f"{total} shots",
+            found=f"{len(outcome.faults)} that failed ({', '.join(list(outcome.faults)[:4])})",
+            remedy="The warnings above say why; the others are written.",
+        )
+
+
+def _refuse(expected: str, found: str, **options: object) -> None:
+    """Refuse options that are given and mean something for others alone."""
+    for name, value in options.items():
+        if value is not None:
+            raise PolarguideError(
+                option_name(name), expected=expected, found=found, remedy=f"Leave it out, or name {expected}."
+            )
+
+
+def calibrate(
+    shots: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    out: Path,
+    settings: Annotated[CalibrateSettings, tyro.conf.arg(name="")],
+    compute: Annotated[ThreadOptions, tyro.conf.arg(name="")],
+) -> None:
+    """Calibrate a polarization camera: what each of its polarizers really measures, from shots of one before the lens.
+
+    The file corrects extinction ratio, angle and throughput of every position; prepare, priors, measure and inspect
+    take it as --calibration. docs/how-to/calibrate.md says how to take the shots.
+
+    Args:
+        shots: Folder of raw mosaics of a linear polarizer before a uniform light, at five or more angles.
+        out: File to write, ending in .safetensors; a picture (PNG) of the same name goes beside it.
+    """
+    use_threads(compute.threads)
+    calibration = importlib.import_module("polarguide_shots.calibration.calibrate")
+    outcome = calibration.calibrate_sensor(shots, out, settings, ConsoleReporter())
+    say(f"calibration: {outcome.path}   picture: {outcome.picture}")
+    option = f"--sensor {settings.sensor} --calibration {shlex.quote(str(outcome.path))}"
+    say(f"next: polarguide prepare RAW --out SCENE {option}")

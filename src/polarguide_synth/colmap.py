@@ -1,0 +1,234 @@
+"""Camera placement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.core.files import make_folder, write_text
+from polarguide.geometry.camera import Camera, look_at, quaternion
+from polarguide_synth.build import BuiltScene
+from polarguide_synth.ground_truth import intersect
+from polarguide_synth.mesh import Array
+from polarguide_synth.schema import CameraPath
+from polarguide_synth.settings import TEST_EVERY
+
+
+def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[Camera]:
+    """The cameras of a path, ring by ring, in the order of their angle about z.
+
+    Radius, height and angle are jittered by a few percent, so that the views do not lie on exact circles.
+    """
+    random = np.random.default_rng((seed, 11))
+    shares = np.array([float(ring.get("share", 1.0)) for ring in path.rings])
+    ends = np.round(np.cumsum(shares) / shares.sum() * path.views).astype(int)
+    counts = np.diff(np.concatenate([[0], ends]))
+    focal = float(width / 2 / np.tan(np.radians(path.fov) / 2))
+    size, center = (width, height), (width / 2, height / 2)
+    cameras = []
+    for ring, count in zip(path.rings, counts, strict=True):
+        start, stop = float(ring.get("from", 0.0)), float(ring.get("to", 360.0))
+        whole = abs(stop - start) >= 360
+        step = (stop - start) / max(1, count if whole else count - 1)
+        if path.spacing is not None:
+            step = float(path.spacing)
+            start = (start + stop) / 2 - step * (count - 1) / 2
+        for k in range(count):
+            angle = np.radians(start + step * (k + random.uniform(-0.15, 0.15)))
+            radius = float(ring["radius"]) * (1 + random.uniform(-0.03, 0.03))
+            z = float(ring["height"]) * (1 + random.uniform(-0.04, 0.04))
+            target = np.array(path.target, float) + path.wander * random.uniform(-1, 1, 3) * np.array(
+                [1, 1, 0.4]
+            )
+            eye = np.array(path.target, float) * [1, 1, 0] + [
+                radius * np.cos(angle),
+                radius * np.sin(angle),
+                z,
+            ]
+            cameras.append(Camera(*size, focal, focal, *center, *look_at(eye, target, (0.0, 0.0, 1.0))))
+    return cameras
+
+
+def view_names(count: int) -> list[str]:
+    """``v000``, ``v001``, ..."""
+    digits = max(3, len(str(count - 1)))
+    return [f"v{number:0{digits}d}" for number in range(count)]
+
+
+def held_out_names(names: list[str], every: int = TEST_EVERY) -> list[str]:
+    """One view in ``every``, starting with the first; none if there are fewer than two views."""
+    return names[::every] if len(names) > 1 else []
+
+
+NOISE_PIXELS = 0.6
+OUTLIERS = 0.01
+VIRTUAL = 0.02
+SMOOTH = 0.1
+"""Roughness below which reflections are sharp enough to be matched."""
+MATCHED_SHARE = 0.6
+"""Probability that a view that sees a point observes it."""
+
+
+@dataclass(frozen=True, eq=False)
+class SparsePoints:
+    """Points and their observations.
+
+    Attributes:
+        points: [M, 3]. colors: [M, 3] display-encoded.
+        tracks: tracks of each point, (view, x, y) of each observation.
+    """
+
+    points: Array
+    colors: NDArray[np.uint8]
+    tracks: list[list[tuple[int, float, float]]]
+
+
+def sample_sparse_points(
+    built: BuiltScene, cameras: Sequence[Camera], pictures: Sequence[NDArray[np.uint8]], count: int, seed: int
+) -> SparsePoints:
+    """Sample about ``count`` points.
+
+    Args:
+        built: the scene.
+        cameras: cameras of the views.
+        pictures: their photographs, display-encoded [H, W, 3].
+        count: number of points.
+        seed: seed of the random numbers.
+    """
+    random = np.random.default_rng((seed, 23))
+    origins, rays, colors, home = [], [], [], []
+    for number, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
+        gray = picture.mean(-1)
+        contrast = np.hypot(*np.gradient(gray)) + 2
+        amount = -(-count * 13 // 10 // len(cameras))
+        chosen = random.choice(gray.size, amount, p=(contrast / contrast.sum()).ravel())
+        world = camera.world_rays().numpy().astype(np.float64).reshape(-1, 3)
+        rays.append(world[chosen])
+        origins.append(np.broadcast_to(camera.center.numpy(), (amount, 3)))
+        colors.append(picture.reshape(-1, 3)[chosen])
+        home.append(np.full(amount, number))
+    origin, ray = np.concatenate(origins), np.concatenate(rays)
+    color, view = np.concatenate(colors), np.concatenate(home)
+    hits = intersect(built, origin, ray)
+    places = origin + hits.distance[:, None] * ray
+    visible = _visible(built, cameras, places) & (random.random((len(places), len(cameras))) < MATCHED_SHARE)
+    ghost, places = _mirrored(built, origin, ray, places, hits.normal, hits.thing, random)
+    # A reflection is consistent only between neighbors.
+    near = np.abs(np.arange(len(cameras)) - view[:, None]) <= 1
+    visible = np.where(ghost[:, None], near, visible)
+    visible[np.arange(len(view)), view] = True
+    drawn = np.array([False, *built.spec.shown])[hits.thing]
+    keep = np.flatnonzero(drawn & (visible.sum(1) >= 2))
+    keep = np.sort(random.permutation(keep)[:count])
+    tracks = [_track(places[k], np.flatnonzero(visible[k]), cameras, random) for k in keep]
+    reach = np.linalg.norm(places - origin, axis=1)[keep]
+    size = NOISE_PIXELS * reach / cameras[0].fx
+    moved = places[keep] + size[:, None] * random.normal(size=(len(keep), 3))
+    moved += (2 * size * random.normal(size=len(keep)))[:, None] * ray[keep]
+    wrong = random.random(len(keep)) < OUTLIERS
+    stretch = random.uniform(0.5, 1.8, len(keep))[:, None]
+    moved = np.where(wrong[:, None], origin[keep] + stretch * (moved - origin[keep]), moved)
+    return SparsePoints(moved, color[keep], tracks)
+
+
+def _visible(built: BuiltScene, cameras: Sequence[Camera], places: Array) -> NDArray[np.bool_]:
+    """Whether each camera sees each of the points [M, 3]: [M, V]."""
+    visible = np.zeros((len(places), len(cameras)), bool)
+    for number, camera in enumerate(cameras):
+        x, y, z = _project(camera, places).T
+        inside = np.flatnonzero(
+            (z > 1e-3) & (x > 1) & (y > 1) & (x < camera.width - 1) & (y < camera.height - 1)
+        )
+        if len(inside) == 0:
+            continue
+        way = places[inside] - camera.center.numpy()
+        length = np.linalg.norm(way, axis=1)
+        hits = intersect(built, np.broadcast_to(camera.center.numpy(), way.shape), way / length[:, None])
+        visible[inside, number] = np.abs(hits.distance - length) < 2e-3 * length
+    return visible
+
+
+def _mirrored(
+    built: BuiltScene,
+    origin: Array,
+    ray: Array,
+    places: Array,
+    normal: Array,
+    thing: NDArray[np.uint8],
+    random: np.random.Generator,
+) -> tuple[NDArray[np.bool_], Array]:
+    """Replace some points on smooth surfaces by the virtual images of reflected points: (which, points)."""
+    sharp = np.array([False] + [item.material.roughness < SMOOTH for item in built.spec.things])
+    chosen = np.flatnonzero(
+        sharp[thing] & (random.random(len(thing)) < VIRTUAL / max(sharp[thing].mean(), VIRTUAL))
+    )
+    ghost = np.zeros(len(places), bool)
+    if len(chosen) == 0:
+        return ghost, places
+    d, n = ray[chosen], normal[chosen]
+    back = d - 2 * (d * n).sum(-1, keepdims=True) * n
+    hits = intersect(built, places[chosen] + 1e-4 * n, back)
+    hit = hits.distance > 0
+    ghost[chosen[hit]] = True
+    places = places.copy()
+    places[chosen[hit]] += hits.distance[hit][:, None] * d[hit]
+    return ghost, places
+
+
+def _track(
+    place: Array, views: NDArray[np.int64], cameras: Sequence[Camera], random: np.random.Generator
+) -> list[tuple[int, float, float]]:
+    track = []
+    for view in views:
+        x, y, z = _project(cameras[view], place[None])[0]
+        dx, dy = random.normal(0, NOISE_PIXELS, 2)
+        if z > 0:
+            track.append((int(view), float(x + dx), float(y + dy)))
+    return track
+
+
+def _project(camera: Camera, places: Array) -> Array:
+    """(x, y) in pixels and z of points [M, 3]."""
+    local = places @ camera.rotation.numpy().T + camera.translation.numpy()
+    z = np.where(np.abs(local[:, 2]) < 1e-9, 1e-9, local[:, 2])
+    return np.stack(
+        (camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy, local[:, 2]), -1
+    )
+
+
+def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], sparse: SparsePoints) -> None:
+    """Write a COLMAP model as text files.
+
+    Raises:
+        PolarguideError: a file cannot be written.
+    """
+    make_folder(folder)
+    first = cameras[0]
+    inner = " ".join(f"{float(v)!r}" for v in (first.fx, first.fy, first.cx, first.cy))
+    write_text(folder / "cameras.txt", f"# one camera\n1 PINHOLE {first.width} {first.height} {inner}\n")
+    observations: list[list[str]] = [[] for _ in names]
+    rows = []
+    for number, (place, color, track) in enumerate(
+        zip(sparse.points, sparse.colors, sparse.tracks, strict=True), 1
+    ):
+        errors = []
+        parts = []
+        for view, x, y in track:
+            parts.append(f"{view + 1} {len(observations[view])}")
+            observations[view].append(f"{x:.3f} {y:.3f} {number}")
+            px, py, _ = _project(cameras[view], place[None])[0]
+            errors.append(np.hypot(px - x, py - y))
+        xyz = " ".join(f"{v:.6f}" for v in place)
+        rgb = " ".join(str(int(c)) for c in color)
+        rows.append(f"{number} {xyz} {rgb} {np.mean(errors):.4f} {' '.join(parts)}")
+    write_text(folder / "points3D.txt", "# points\n" + "\n".join(rows) + "\n")
+    lines = []
+    for number, (camera, name) in enumerate(zip(cameras, names, strict=True)):
+        numbers = (*quaternion(camera.rotation), *camera.translation.tolist())
+        pose = " ".join(f"{v:.15g}" for v in numbers)
+        lines += [f"{number + 1} {pose} 1 {name}.png", " ".join(observations[number])]
+    write_text(folder / "images.txt", "# two lines an image\n" + "\n".join(lines) + "\n")

@@ -1,0 +1,323 @@
+"""A polarization camera: Stokes vectors of its pixels by lobe, and raw mosaics with noise, gains and finite extinction.
+
+Full well, read noise and extinction ratio are close to those of Sony's IMX250MYR; photon noise is Poisson distributed,
+read noise normal (EMVA 1288).
+"""
+
+from __future__ import annotations
+
+import functools
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from polarguide.capture.filter.camera_files import INVERSE, apply_orientation, orientation_calibration
+from polarguide.capture.sensor.pattern import sensor_pattern, tiled
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.polarizer import malus
+from polarguide.optics.color import srgb_encode_array
+from polarguide_synth.mesh import Array
+from polarguide_synth.settings import dr, mi
+from polarguide_synth.transport import (
+    PathLimits,
+    Sampler,
+    lens_stokes,
+    opaque_value,
+    pinhole,
+    primary_rays,
+    trace_paths,
+)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Parameters of a sensor.
+
+    Attributes:
+        full_well: electrons at full scale.
+        read_noise: standard deviation of the read noise in electrons.
+        extinction: extinction ratio of the polarizers.
+        gains: gains of the samples behind polarizers at 0, 45, 90 and 135 degrees.
+        bits: bits of a stored value.
+        black: black level in stored values.
+    """
+
+    full_well: float = 10500.0
+    read_noise: float = 2.4
+    extinction: float = 300.0
+    gains: tuple[float, float, float, float] = (1.0, 0.985, 1.01, 0.992)
+    bits: int = 12
+    black: int = 64
+
+
+def noisy(intensity: Array, noise: float, random: np.random.Generator, sensor: Sensor) -> Array:
+    """Intensities with photon and read noise.
+
+    Args:
+        intensity: linear, 1 is full scale.
+        noise: 1 for exposure to the full well, 2 for a quarter of that light, 0 for no noise.
+        random: generator.
+        sensor: its full well and read noise.
+    """
+    if noise <= 0:
+        return intensity
+    electrons = sensor.full_well / noise**2
+    counts = random.poisson(np.clip(intensity, 0, None) * electrons) + random.normal(
+        0, sensor.read_noise, intensity.shape
+    )
+    return np.asarray(counts / electrons)
+
+
+def mosaic(
+    stokes: Array, name: str, noise: float, random: np.random.Generator, sensor: Sensor
+) -> NDArray[np.uint16]:
+    """The raw mosaic that a sensor stores, [H, W], given Stokes vectors [3, H, W, 3] whose full scale is 1.
+
+    An extinction ratio E scales S1 and S2 by (E - 1) / (E + 1). A monochrome sensor measures the mean of the colors.
+    """
+    pattern = sensor_pattern(name)
+    angles = tiled(pattern.angles, stokes.shape[1:3])
+    if pattern.colors is None:
+        light = stokes.mean(-1)
+    else:
+        colors = tiled(pattern.colors, stokes.shape[1:3])
+        light = np.take_along_axis(stokes, colors[None, ..., None], -1)[..., 0]
+    contrast = (sensor.extinction - 1) / (sensor.extinction + 1)
+    value = malus((light[0], contrast * light[1], contrast * light[2]), np.radians(angles))
+    value = noisy(value, noise, random, sensor) * np.array(sensor.gains)[angles // 45]
+    top = (1 << sensor.bits) - 1
+    return np.clip(np.round(sensor.black + value * (top - sensor.black)), 0, top).astype(np.uint16)
+
+
+STOPS = 0.3
+"""Automatic exposure differs by up to this from the mean, each way."""
+STEP = 15
+"""Degrees between the marks of the filter's ring."""
+QUALITY = 95
+_TIME = Fraction(1, 60)
+_TURNS = (1, 1, 1, 6, 8, 3)
+
+
+@dataclass(frozen=True)
+class FilterShot:
+    """A simulated photograph of a view through a filter.
+
+    Attributes:
+        angle: transmission axis of the filter, degrees counter-clockwise from the horizontal of the displayed picture.
+        stops: exposure relative to the mean one, in stops: 1 is twice the light.
+        orientation: EXIF orientation of the stored picture: 1, 3, 6 or 8.
+        noted: whether the file records the exposure time.
+    """
+
+    angle: float
+    stops: float = 0.0
+    orientation: int = 1
+    noted: bool = True
+
+    @property
+    def body_angle(self) -> int:
+        """The angle relative to the camera's body (the rows of the stored picture), 0 to 179 degrees."""
+        return round(self.angle - orientation_calibration(self.orientation).zero) % 180
+
+
+def plan_shot(seed: int, number: int) -> FilterShot:
+    """How the view with a number is photographed."""
+    random = np.random.default_rng((seed, 47, number))
+    angle = STEP * int(random.integers(0, 180 // STEP))
+    return FilterShot(angle, float(random.uniform(-STOPS, STOPS)), int(random.choice(_TURNS)))
+
+
+def behind_filter(stokes: Array, rays: Array, degrees: float) -> Array:
+    """Intensities behind an ideal sheet before the lens, [H, W, 3].
+
+    The sheet absorbs along an axis ``c`` in the plane of the picture. A ray ``d`` keeps the field perpendicular to
+    ``d`` and ``c``; its angle in the lens frame of the ray, which Stokes vectors refer to, differs from pixel to pixel.
+
+    Args:
+        stokes: [3, H, W, 3] in the lens frame. rays: [H, W, 3] unit, camera axes.
+        degrees: the filter's transmission axis, counter-clockwise as displayed.
+    """
+    angle = np.radians(degrees)
+    absorbed = np.array([np.sin(angle), np.cos(angle), 0.0])
+    field = np.cross(rays, absorbed)
+    x, y, z = np.moveaxis(rays, -1, 0)
+    right = np.stack([1 - x * x / (1 + z), -x * y / (1 + z), -x], axis=-1)
+    up = np.stack([x * y / (1 + z), y * y / (1 + z) - 1, y], axis=-1)
+    passed = np.arctan2((field * up).sum(-1), (field * right).sum(-1))
+    return np.asarray(malus(stokes, passed[..., None]))
+
+
+def filter_jpeg(
+    stokes: Array, rays: Array, shot: FilterShot, noise: float, random: np.random.Generator, sensor: Sensor
+) -> bytes:
+    """The JPEG file that a camera stores of a view: noise, sRGB, 8 bits, turned as the camera was held.
+
+    Args:
+        stokes: [3, H, W, 3] of the upright picture, full scale 1, in the lens frame.
+        rays: [H, W, 3] unit, of the upright picture.
+        shot: angle, exposure and orientation.
+        noise, random, sensor: as in ``sensor.noisy``.
+    """
+    light = behind_filter(stokes, rays, shot.angle) * 2.0**shot.stops
+    encoded = srgb_encode_array(np.clip(noisy(light, noise, random, sensor), 0.0, 1.0))
+    stored = apply_orientation(np.rint(255 * encoded).astype(np.uint8), INVERSE[shot.orientation])
+    options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(stored[..., ::-1]), options)
+    time = _TIME * Fraction(2.0**shot.stops) if shot.noted else None
+    block = b"Exif\0\0" + exif_tags(shot.orientation, time)
+    segment = b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block
+    return data[:2].tobytes() + segment + data[2:].tobytes()
+
+
+def exif_tags(orientation: int, time: Fraction | None) -> bytes:
+    """A TIFF structure with the orientation and, in its EXIF directory, exposure time, f-number and ISO speed."""
+    if time is None:
+        return b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 274, 3, 1, orientation, 0, 0)
+    head = b"MM\0*" + struct.pack(">I", 8)
+    first = struct.pack(">HHHIHHHHIII", 2, 274, 3, 1, orientation, 0, 34665, 4, 1, 38, 0)
+    entries = struct.pack(">HHHIIHHIIHHIHHI", 3, 33434, 5, 1, 80, 33437, 5, 1, 88, 34855, 3, 1, 100, 0, 0)
+    seconds = time.limit_denominator(1_000_000)
+    return head + first + entries + struct.pack(">IIII", seconds.numerator, seconds.denominator, 8, 1)
+
+
+PATHS_AT_ONCE = 1 << 20
+"""Limits memory, and the delay of Ctrl-C."""
+SCATTER = 0x9E3779B1
+
+
+@dataclass(frozen=True, eq=False)
+class LobeRadiance:
+    """The light that reaches the pixels of a camera, in units of S0.
+
+    Attributes:
+        specular, diffuse: Stokes vectors of the two lobes of the first surface in the lens frame of each ray,
+            [3, H, W, 3] float64.
+        emitted: radiance of directly visible light sources and environment, [H, W, 3] float64.
+    """
+
+    specular: NDArray[np.float64]
+    diffuse: NDArray[np.float64]
+    emitted: NDArray[np.float64]
+
+    @property
+    def stokes(self) -> NDArray[np.float64]:
+        """Stokes vector of the picture, [3, H, W, 3]."""
+        total = self.specular + self.diffuse
+        total[0] += self.emitted
+        return total
+
+
+def render_lobes(
+    scenes: Sequence[Any],
+    camera: Camera,
+    samples: int,
+    *,
+    seed: int,
+    limits: PathLimits,
+    center: bool = False,
+) -> LobeRadiance:
+    """Render a view.
+
+    Args:
+        scenes: one Mitsuba scene of a spectral variant, or three of a mono one: red, green and blue. The channels
+            share their random numbers, so that the noise has no color.
+        camera: pose and intrinsics; the reconstruction filter is a box of one pixel.
+        samples: paths per pixel and lobe.
+        seed: seed of the view.
+        limits: limits of the paths.
+        center: send all rays through the centers of pixels.
+    """
+    pixels = camera.width * camera.height
+    passes = min(samples, -(-samples * pixels // PATHS_AT_ONCE))
+    while samples % passes:  # passes of one size are traced once
+        passes += 1
+    batch = samples // passes
+    total = np.zeros((pixels, 7, 3))
+    for start in range(0, samples, batch):
+        for channel, scene in enumerate(scenes):
+            sums = _render_pass(scene, camera, (start, batch), seed, limits, center)
+            if len(scenes) == 1:
+                total += sums
+            else:
+                total[..., channel] += sums[..., 0]
+    grid = (total / samples).reshape(camera.height, camera.width, 7, 3).transpose(2, 0, 1, 3)
+    return LobeRadiance(grid[0:3], grid[3:6], grid[6])
+
+
+def _render_pass(
+    scene: Any, camera: Camera, part: tuple[int, int], seed: int, limits: PathLimits, center: bool
+) -> NDArray[np.float64]:
+    """Sums over some samples of each pixel: [pixels, 7, 3 or 1]."""
+    pixels = camera.width * camera.height
+    first, count = part
+    lens, start = pinhole(camera), opaque_value(mi.UInt32, seed * SCATTER % 2**32)
+    if mi.variant().startswith("scalar"):
+        sums = np.zeros((pixels, 7, 3))
+        for pixel in range(pixels):
+            for sample in range(first, first + count):
+                parts = _path(scene, lens, pixel, sample, start, limits, center)
+                sums[pixel] += np.array([[float(v) for v in color] for color in parts])
+        return sums
+    part_values = [opaque_value(mi.UInt32, value) for value in (first, count)]
+    totals = _compiled()(scene, lens, part_values, pixels, count, start, limits, center)
+    return np.stack([column.numpy() for column in totals], -1).reshape(pixels, 7, -1).astype(np.float64)
+
+
+@functools.cache
+def _compiled() -> Callable[..., list[Any]]:
+    """``_sums``, traced once per scene and picture size instead of once per pass: tracing costs as much time as
+    100,000 paths."""
+    return dr.freeze(_sums, warn_after=1 << 30)
+
+
+def _sums(
+    scene: Any,
+    lens: list[Any],
+    part: list[Any],
+    pixels: int,
+    count: int,
+    seed: Any,
+    limits: PathLimits,
+    center: bool,
+) -> list[Any]:
+    """Sums over ``count`` samples of each pixel, all at once."""
+    first, per_pixel = part
+    index = dr.arange(mi.UInt32, pixels * count)
+    pixel = index // per_pixel
+    sample = index - pixel * per_pixel + first
+    parts = _path(scene, lens, pixel, sample, seed, limits, center)
+    flat = [value for color in parts for value in color]
+    dr.eval(flat)
+    return [dr.block_reduce(dr.ReduceOp.Add, value, count) for value in flat]
+
+
+def _path(
+    scene: Any, lens: list[Any], pixel: Any, sample: Any, seed: Any, limits: PathLimits, center: bool
+) -> list[list[Any]]:
+    """One sample in color: S0, S1, S2 of the specular and of the diffuse lobe, and the directly visible emission."""
+    sampler = Sampler(mi.UInt32(pixel), mi.UInt32(sample), seed)
+    spread, place = sampler.next(), sampler.pair()
+    if center:
+        place = mi.Point2f(0.5, 0.5)
+    ray, x_ref = primary_rays(lens, mi.UInt32(pixel), place)
+    weight: Any = 1.0
+    if mi.is_spectral:
+        ray.wavelengths, weight = mi.sample_rgb_spectrum(_shifted(spread))
+    specular, diffuse, emitted = trace_paths(scene, ray, sampler, limits)
+    parts = [*lens_stokes(specular, ray, x_ref), *lens_stokes(diffuse, ray, x_ref), emitted]
+    if not mi.is_spectral:
+        return [[part.x] for part in parts]
+    colors = [mi.spectrum_to_srgb(part * weight, ray.wavelengths, True) for part in parts]
+    return [[color.x, color.y, color.z] for color in colors]
+
+
+def _shifted(sample: Any) -> Any:
+    """Four equally spaced numbers modulo 1, one for each wavelength of a ray."""
+    values = (sample + k / 4 for k in range(4))
+    return mi.UnpolarizedSpectrum(*(dr.select(value >= 1.0, value - 1.0, value) for value in values))

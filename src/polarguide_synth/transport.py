@@ -1,0 +1,313 @@
+"""Polarized path tracing that separates the two lobes of the first surface.
+
+Mitsuba supplies geometry, polarized BSDFs and emitters; the integrator is our own, because those of Mitsuba add the
+lobes. Two independent paths start at the first surface, one by the specular lobe and one by the diffuse lobe, so that
+specular + diffuse = S0 holds for every sample and both layers carry full Stokes vectors. Polarization by further
+surfaces is included.
+
+Direct light is estimated by multiple importance sampling with the balance heuristic (Veach and Guibas 1995). All
+emitters are unpolarized, so only the first column of every Mueller matrix is needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from polarguide.geometry.camera import Camera
+from polarguide_synth.settings import dr, mi
+
+
+def opaque_value(kind: Any, value: float) -> Any:
+    """A number that is not compiled into the kernel as a literal, so that one kernel serves all views."""
+    return kind(value) if mi.variant().startswith("scalar") else dr.opaque(kind, value)
+
+
+def pinhole(camera: Camera) -> list[Any]:
+    """A camera in Mitsuba's types: width, (fx, fy, cx, cy), the axes of the camera in the world, and its center."""
+    inner = [opaque_value(mi.Float, value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
+    # The rows of the world-to-camera rotation are the camera's axes in the world.
+    axes = [mi.Vector3f(*(opaque_value(mi.Float, float(v)) for v in row)) for row in camera.rotation]
+    origin = mi.Point3f(*(opaque_value(mi.Float, float(v)) for v in camera.center))
+    return [opaque_value(mi.UInt32, camera.width), inner, axes, origin]
+
+
+def primary_rays(camera: list[Any], pixel: Any, place: Any) -> tuple[Any, Any]:
+    """Rays through points in pixels.
+
+    Args:
+        camera: from ``pinhole``.
+        pixel: index of the pixel, row by row.
+        place: position in the pixel, [0, 1)^2.
+
+    Returns:
+        Mitsuba's rays, and the x axis of the lens frame of each ray (see ``optics.lens_frame``), in world axes.
+    """
+    width, (fx, fy, cx, cy), axes, origin = camera
+    row = pixel // width
+    x = (mi.Float(pixel - row * width) + place.x - cx) / fx
+    y = (mi.Float(row) + place.y - cy) / fy
+    d = dr.normalize(mi.Vector3f(x, y, mi.Float(1.0)))
+    scale = 1 / (1 + d.z)
+    x_ref = mi.Vector3f(1 - d.x * d.x * scale, -d.x * d.y * scale, -d.x)
+    ray, right = (axes[0] * v.x + axes[1] * v.y + axes[2] * v.z for v in (d, x_ref))
+    return mi.Ray3f(origin, ray), right
+
+
+def lens_stokes(light: list[Any], ray: Any, x_ref: Any) -> list[Any]:
+    """Convert Stokes vectors from Mitsuba's frame of ``-ray.d`` to our lens frame.
+
+    Mitsuba measures angles from its basis counter-clockwise as seen against the light, that is in the picture, as we
+    do; only the basis has to be rotated.
+    """
+    forward = -ray.d
+    turn = mi.mueller.rotate_stokes_basis(forward, mi.mueller.stokes_basis(forward), x_ref)
+    s0, s1, s2 = light
+    return [s0, s1 * turn[1, 1] + s2 * turn[1, 2], s1 * turn[2, 1] + s2 * turn[2, 2]]
+
+
+_PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41)
+_WHOLE = 2**32
+
+
+class Sampler:
+    """Random numbers for one sample of each pixel.
+
+    The first dimensions follow a Kronecker sequence with the square roots of primes, with a random shift per pixel and
+    dimension (Cranley and Patterson 1976). Every single sample is uniform, so that estimates are unbiased.
+
+    Args:
+        pixel: index of the pixel.
+        sample: index of the sample in its pixel, counted over all passes.
+        seed: seed of the view, as Mitsuba's unsigned integer.
+
+    Attributes:
+        later: generator of independent numbers for the later dimensions.
+    """
+
+    def __init__(self, pixel: Any, sample: Any, seed: Any) -> None:
+        self._pixel, self._sample, self._seed = pixel, sample, seed
+        self._used = 0
+        state = mi.sample_tea_64(pixel, seed)
+        self.later = mi.PCG32(1, state + mi.UInt64(sample), mi.UInt64(sample))
+
+    def next(self) -> Any:
+        """The next dimension of the sequence, in [0, 1)."""
+        step = int((_PRIMES[self._used] ** 0.5 % 1) * _WHOLE)
+        self._used += 1
+        shift = mi.sample_tea_32(self._pixel, self._seed + mi.UInt32(self._used))[0]
+        # In integers modulo 2^32, because floats lose digits as the index grows.
+        turned = mi.UInt32((self._sample * mi.UInt32(step) + shift) & mi.UInt32(_WHOLE - 1))
+        return dr.minimum(mi.Float(turned) * (1 / _WHOLE), 1 - 2.0**-24)
+
+    def pair(self) -> Any:
+        """The next two dimensions as a point."""
+        first = self.next()
+        return mi.Point2f(first, self.next())
+
+
+LEAST_DENSITY = 1e-5
+DirectionSampler = Callable[[Any, Any, Any, Any, Any, Any], tuple[Any, Any]]
+
+
+def sample_bsdf(bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, active: Any) -> tuple[Any, Any]:
+    """Sample a direction by Mitsuba's BSDF.
+
+    Returns:
+        (value, density) for the direction ``toward`` a light; (direction, density, weight, delta) of the sampled one.
+    """
+    evaluated = bsdf.eval_pdf(context, si, toward, active)
+    sample, weight = bsdf.sample(context, si, *numbers, active)
+    delta = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    return evaluated, (sample.wo, sample.pdf, weight, delta)
+
+
+def sample_cosine(
+    bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, active: Any
+) -> tuple[Any, Any]:
+    """Sample a direction with a density proportional to the cosine; returns what ``sample_bsdf`` does.
+
+    Mitsuba 3.9 evaluates the diffuse lobe of a coated surface correctly, but if only this lobe is selected, its
+    densities are those of both lobes together.
+    """
+    value = bsdf.eval(context, si, toward, active)
+    side = dr.sign(si.wi.z)  # surfaces have two sides
+    there = dr.maximum(toward.z * side, 0.0) * dr.inv_pi
+    wo = mi.warp.square_to_cosine_hemisphere(numbers[1])
+    wo = mi.Vector3f(wo.x, wo.y, wo.z * side)
+    density = dr.abs(wo.z) * dr.inv_pi
+    active = active & (density > LEAST_DENSITY)
+    inverse = dr.select(active, 1 / dr.maximum(density, LEAST_DENSITY), 0.0)
+    weight = bsdf.eval(context, si, wo, active) * inverse
+    return (value, there), (wo, dr.select(active, density, 0.0), weight, mi.Bool(False))
+
+
+TINY = 1e-30
+SHOWN = "shown"
+"""Of a shape, the attribute that is 1 where the camera sees it and 0 where it is black to it."""
+ROULETTE_FROM = 1
+"""Number of surfaces after which Russian roulette starts."""
+
+
+@dataclass(frozen=True)
+class PathLimits:
+    """Limits of the traced paths.
+
+    Attributes:
+        depth: largest number of surfaces on a path.
+        clamp: largest radiance that one path may contribute from beyond its second surface, in scene units; the Stokes
+            vector of a brighter path is scaled down as a whole. 0: no limit and no bias.
+        shown_only: whether the camera sees only shapes whose attribute ``SHOWN`` is 1.
+    """
+
+    depth: int = 6
+    clamp: float = 0.0
+    shown_only: bool = False
+
+
+def trace_paths(
+    scene: Any, ray: Any, sampler: Sampler, limits: PathLimits
+) -> tuple[list[Any], list[Any], Any]:
+    """Trace the light that arrives along rays, separately for the lobes of the first surface.
+
+    Args:
+        scene: Mitsuba scene, of a polarized variant.
+        ray: primary rays, with wavelengths in a spectral variant.
+        sampler: random numbers of every ray.
+        limits: limits of the paths.
+
+    Returns:
+        (specular, diffuse, emitted): [S0, S1, S2] of either lobe in Mitsuba's frame of the direction ``-ray.d``; the
+        directly visible radiance of light sources and environment.
+    """
+    si = scene.ray_intersect(ray)
+    counted = _shown(si) if limits.shown_only else mi.Bool(True)
+    emitted = _emitted(scene, si, mi.Bool(True))
+    if limits.shown_only:
+        emitted *= dr.select(
+            counted, 1.0, 0.0
+        )  # the scalar variant evaluates emitters that are not active, too
+    flags = mi.BSDFFlags
+    lobes = []
+    for kinds, sample_direction in (
+        (flags.Glossy | flags.Delta, sample_bsdf),
+        (flags.Diffuse, sample_cosine),
+    ):
+        context = mi.BSDFContext()
+        context.type_mask = int(kinds)
+        numbers = (sampler.next(), sampler.pair(), sampler.pair())
+        start = (dr.identity(mi.Spectrum), numbers, si.is_valid() & counted)
+        direct, after = _scatter(scene, ray, si, context, *start, sample_direction)
+        lobes.append(_continue_paths(scene, direct, after, sampler, limits))
+    return lobes[0], lobes[1], emitted
+
+
+def _continue_paths(
+    scene: Any, light: list[Any], after: tuple[Any, ...], sampler: Sampler, limits: PathLimits
+) -> list[Any]:
+    """Add to ``light`` what the paths collect after the first surface: [S0, S1, S2]."""
+    both = mi.BSDFContext()
+
+    def alive(depth: Any, s0: Any, s1: Any, s2: Any, active: Any, *_: Any) -> Any:
+        return active
+
+    def step(depth: Any, s0: Any, s1: Any, s2: Any, active: Any, ray: Any, gain: Any, place: Any, pdf: Any,
+             delta: Any, random: Any) -> Any:  # fmt: skip
+        si = scene.ray_intersect(ray, active)
+        rival = 0.0
+        if si.emitter(scene) is not None:  # always, except in the scalar variant
+            seen_from = mi.DirectionSample3f(scene, si, place)
+            rival = scene.pdf_emitter_direction(place, seen_from, active & (delta ^ True))
+        share = dr.select(delta, 1.0, pdf / dr.maximum(pdf + rival, TINY))
+        emitted = _emitted(scene, si, active) * dr.select(active, share, 0.0)
+        limited = _limited([gain[i, 0] * emitted for i in range(3)], limits.clamp, depth > 1)
+        active = active & si.is_valid() & (depth < limits.depth)
+        numbers = (random.next_float32(), _point(random), _point(random))
+        direct, state = _scatter(scene, ray, si, both, gain, numbers, active, sample_bsdf)
+        direct = _limited(direct, limits.clamp, mi.Bool(True))
+        state = _russian_roulette(state, random.next_float32(), depth > ROULETTE_FROM)
+        s0, s1, s2 = (s + a + b for s, a, b in zip((s0, s1, s2), limited, direct, strict=True))
+        return (depth + 1, s0, s1, s2, *state, random)
+
+    start = (mi.UInt32(1), *light, *after, sampler.later)
+    end = dr.while_loop(start, alive, step, label="path", max_iterations=limits.depth + 1)
+    sampler.later = end[-1]
+    return list(end[1:4])
+
+
+def _scatter(
+    scene: Any,
+    ray: Any,
+    si: Any,
+    context: Any,
+    gain: Any,
+    numbers: tuple[Any, Any, Any],
+    active: Any,
+    sample_direction: DirectionSampler,
+) -> tuple[list[Any], tuple[Any, ...]]:
+    """Direct light at a surface, and the continuation of the path.
+
+    Args:
+        context: selects the lobes.
+        gain: Mueller matrix of the path from this surface to the camera.
+        numbers: to choose a lobe, a direction and a light.
+        sample_direction: samples directions, and evaluates the density of given ones.
+
+    Returns:
+        [S0, S1, S2] at the camera, and (active, ray, gain, place, density, delta) of the ray that leaves.
+    """
+    if active is False:  # the scalar variant: there is no surface
+        dark = [mi.UnpolarizedSpectrum(0.0)] * 3
+        return dark, (False, mi.Ray3f(ray), gain, mi.Interaction3f(si), 0.0, False)
+    choose, turn, light = numbers
+    bsdf = si.bsdf(ray)
+    ds, brought = scene.sample_emitter_direction(si, light, True, active)
+    lit = active & (ds.pdf > 0)
+    toward = si.to_local(ds.d)
+    (value, pdf), (wo, density, weight, delta) = sample_direction(
+        bsdf, context, si, (choose, turn), toward, active
+    )
+    back = gain @ si.to_world_mueller(value, -toward, si.wi)
+    share = dr.select(ds.delta, 1.0, ds.pdf / dr.maximum(ds.pdf + pdf, TINY))
+    arriving = brought[0, 0] * dr.select(lit, share, 0.0)
+    direct = [back[i, 0] * arriving for i in range(3)]
+    gain = gain @ si.to_world_mueller(weight, -wo, si.wi)
+    leaving = si.spawn_ray(si.to_world(wo))
+    leaving.wavelengths = ray.wavelengths
+    active = active & (density > 0)
+    return direct, (active, mi.Ray3f(leaving), gain, mi.Interaction3f(si), density, delta)
+
+
+def _russian_roulette(state: tuple[Any, ...], number: Any, where: Any) -> tuple[Any, ...]:
+    """Russian roulette: end paths of small throughput at random, and raise the weight of the others."""
+    active, ray, gain, *rest = state
+    chance = dr.select(where, dr.clip(dr.max(gain[0, 0]), 0.1, 1.0), 1.0)
+    return active & (number < chance), ray, gain * (1 / chance), *rest
+
+
+def _emitted(scene: Any, si: Any, active: Any) -> Any:
+    """Unpolarized radiance of the light source or environment at an intersection."""
+    emitter = si.emitter(scene)
+    return mi.UnpolarizedSpectrum(0.0) if emitter is None else emitter.eval(si, active)[0, 0]
+
+
+def _shown(si: Any) -> Any:
+    """Whether the camera sees the surface at an intersection; lights and the environment are not among them."""
+    if si.shape is None:  # the scalar variant
+        return False
+    return si.shape.eval_attribute_1(SHOWN, si, mi.Bool(si.is_valid())) > 0.5
+
+
+def _limited(light: list[Any], limit: float, where: Any) -> list[Any]:
+    """A Stokes vector scaled so that no wavelength of its S0 exceeds the limit."""
+    if limit <= 0:
+        return light
+    peak = dr.max(light[0])
+    scale = dr.select(where & (peak > limit), limit / dr.maximum(peak, TINY), 1.0)
+    return [part * scale for part in light]
+
+
+def _point(random: Any) -> Any:
+    first = random.next_float32()
+    return mi.Point2f(first, random.next_float32())

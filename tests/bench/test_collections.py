@@ -1,0 +1,155 @@
+"""A batch: what fails alone, what goes on, what excludes what, and the page over all."""
+
+import os
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pandas as pd
+import pytest
+from faults import Fault
+from heard import Heard
+from tiny_capture import ideal_intensities, write_tiny_capture
+
+from polarguide.core.options import SceneOptions
+from polarguide.core.records import decode
+from polarguide.preparation.settings import PrepareSettings
+from polarguide.training.settings import TrainSettings
+from polarguide_bench import job_queue
+from polarguide_bench.batch import Capture, Row, _task, run_batch
+from polarguide_bench.children import Message, encoded
+from polarguide_bench.collection import FORMAT, STEPS, CaptureRecord, prepare_settings
+from polarguide_bench.compare import locked
+from polarguide_bench.options import BatchOptions
+
+OPTIONS = BatchOptions(jobs=1, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def collection(tmp_path_factory: pytest.TempPathFactory) -> list[Capture]:
+    """Three captures, of which two are broken: one has a picture that is cut short, the other nothing to read."""
+    root = tmp_path_factory.mktemp("collection")
+    good, cut, empty = root / "good", root / "cut", root / "empty <b>"
+    tiny = write_tiny_capture(good)
+    for number, name in enumerate(tiny.linear):
+        tiny.write_view(name, ideal_intensities(number, height=24, width=24))
+    tiny.write_cameras("1 PINHOLE 24 24 31 31 12 12")
+    picture = write_tiny_capture(cut).picture("v003", 45)
+    picture.write_bytes(picture.read_bytes()[:50])
+    empty.mkdir()
+    how: dict[str, Any] = {"recipe": "3dgs", "settings": TrainSettings(20), "reading": SceneOptions()}
+    return [Capture(path.name, path, **how) for path in (good, cut, empty)]
+
+
+def stop_when(done: Callable[[], bool], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C as soon as the condition is true."""
+    whole = job_queue._Progress.report
+
+    def report(self: Any, *arguments: Any) -> None:
+        whole(self, *arguments)
+        if done():
+            monkeypatch.undo()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(job_queue._Progress, "report", report)
+
+
+@pytest.mark.slow
+def test_broken_captures_are_rows_and_the_others_go_on_also_after_a_stop(
+    collection: list[Capture], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = tmp_path / "captures" / collection[0].name
+
+    def inspected() -> bool:
+        record = CaptureRecord.load(good)
+        return record is not None and "inspect" in record.done
+
+    stop_when(inspected, monkeypatch)
+    with pytest.raises(KeyboardInterrupt):
+        run_batch(collection, tmp_path, OPTIONS)
+    with locked(tmp_path, "batch"):  # nothing is left at work
+        page = (good / "inspection" / "inspection.html").stat().st_mtime_ns
+
+    heard = Heard()
+    rows = run_batch(collection, tmp_path, OPTIONS, reporter=heard)
+    assert (good / "inspection" / "inspection.html").stat().st_mtime_ns == page
+    assert [row.state for row in rows] == ["done", "failed", "failed"]
+    assert "cut short" in rows[1].error
+    assert "nothing to read" in rows[2].error
+    assert rows[0].record is not None
+    assert rows[0].record.done == STEPS
+
+    html = (tmp_path / "index.html").read_text()
+    assert "<b>" not in html.partition("<tbody>")[2]
+    assert all(row.error in unescape(html) for row in rows)
+    links = re.findall(r'href="([^"]+)"', html)
+    assert [Path(link).name for link in links] == [
+        "inspection.html", "errors.png", "share.html", "splats.ply",
+    ]  # fmt: skip
+    assert all((tmp_path / link).exists() for link in links)
+    table = pd.read_csv(tmp_path / "results.csv")
+    assert table["state"].tolist() == ["done", "failed", "failed"]
+    assert table["psnr"].notna().tolist() == [True, False, False]
+
+    # Finished captures are not repeated; other options for them, or other files, are refused by name.
+    run_batch(collection[:1], tmp_path, OPTIONS, reporter=heard)
+    assert heard.said[-1] == "captures: 1, of them finished before: 1"
+    other = _task(replace(collection[0], settings=TrainSettings(30)), tmp_path, OPTIONS)
+    Fault(str(good), "(settings)", "others").raised_by(rows[0].record.require, other.request, good)
+
+
+def test_two_in_one_folder_exclude_each_other(collection: list[Capture], tmp_path: Path) -> None:
+    with locked(tmp_path, "batch"):
+        Fault("", "nobody", "another batch").raised_by(run_batch, collection, tmp_path, OPTIONS)
+    Fault("recipe").raised_by(run_batch, [replace(collection[0], recipe="magic")], tmp_path / "new", OPTIONS)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_capture_is_known_by_its_content(tmp_path: Path) -> None:
+    folder, source = tmp_path / "captures" / "a", tmp_path / "a"
+    (source / "0").mkdir(parents=True)
+    (source / "0" / "v.png").write_bytes(b"123")
+    begun = _task(Capture("a", source, PrepareSettings()), tmp_path, OPTIONS).request
+    record = CaptureRecord(FORMAT, begun)
+    folder.mkdir(parents=True)
+    record.save(folder)
+    os.utime(source / "0" / "v.png", ns=(1, 1))
+    moved = source.rename(tmp_path / "moved")
+    again = _task(Capture("a", moved, PrepareSettings()), tmp_path, OPTIONS).request
+    assert again.stamp != begun.stamp
+    record.require(again, folder)
+    (moved / "0" / "v.png").write_bytes(b"124")  # as large
+    changed = _task(Capture("a", moved, PrepareSettings()), tmp_path, OPTIONS).request
+    Fault(str(folder), "(stamp)", "files that have changed").raised_by(record.require, changed, folder)
+    old = CaptureRecord(FORMAT, msgspec.structs.replace(begun, digest=""))  # of an earlier version
+    Fault(str(folder), "(stamp)", "files that have changed").raised_by(old.require, again, folder)
+
+
+def test_damaged_health_is_a_remark_of_its_capture(tmp_path: Path) -> None:
+    folder = tmp_path / "captures" / "a"
+    (folder / "run").mkdir(parents=True)
+    (folder / "run" / "health.json").write_text("{")
+    request = _task(Capture("a", tmp_path, PrepareSettings()), tmp_path, OPTIONS).request
+    row = Row(
+        "a",
+        "",
+        folder,
+        "done",
+        "",
+        CaptureRecord(FORMAT, request, done=("prepare", "train"), findings=("x",)),
+    )
+    first, second = row.remarks()
+    assert first == "x"
+    assert "health.json: expected a JSON file" in second
+
+
+def test_settings_survive_their_way(tmp_path: Path) -> None:
+    settings = PrepareSettings(sensor="IMX250MYR", dark_frame=tmp_path / "dark.png", poses="sfm").checked()
+    task = _task(Capture("a", tmp_path, settings), tmp_path, OPTIONS)
+    assert task.request.prepare is not None
+    assert prepare_settings(task.request.prepare) == settings
+    assert decode(encoded(Message(task, "", "")), Message, "task").task == task
