@@ -12,10 +12,10 @@ from polarguide.core.files import make_folder
 from polarguide.core.options import PathLike
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.raster import choose_backend
-from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.mesh import missing_package
 from polarguide_bench.compare import compare, locked
 from polarguide_bench.options import BENCH, Bench, BenchOptions
+from polarguide_bench.recipes import recipe_named
 from polarguide_bench.results import Results
 from polarguide_synth.folder import State, folder_state, scene_digest, scene_request, verify_scene
 from polarguide_synth.render import Plan, expected_time, synthesize

@@ -21,11 +21,8 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import decode
 from polarguide.core.system import only_writer
 from polarguide.raster import choose_backend
-from polarguide.recipes import recipe_named
-from polarguide.recipes.registry import ABLATIONS, ablations_of
 from polarguide.results.evaluation.record import code_digest, commit
 from polarguide.results.evaluation.table import COLUMNS, PART_METRICS
-from polarguide.training.recipe import Method
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.children import STDERR, Scoring, Task, Training
 from polarguide_bench.cluster import workers
@@ -41,6 +38,7 @@ from polarguide_bench.plan import (
     plan_runs,
     scene_entries,
 )
+from polarguide_bench.recipes import ABLATIONS, AnyRecipe, ablations_of, recipe_named
 from polarguide_bench.record import FORMAT, REMEDY, Record
 from polarguide_bench.report import exposure_svg, read_study, study_svg, write_report
 from polarguide_bench.results import Results
@@ -53,7 +51,7 @@ BESIDE_OTHERS = "beside_others.txt"
 
 def compare(
     scenes: Sequence[PathLike],
-    recipes: Sequence[str | Method],
+    recipes: Sequence[str | AnyRecipe],
     out: PathLike,
     *,
     settings: TrainSettings = TrainSettings(),
@@ -133,7 +131,7 @@ def ablate(
     out: PathLike,
     *,
     only: Sequence[str] = (),
-    reference: Sequence[str | Method] = (),
+    reference: Sequence[str | AnyRecipe] = (),
     settings: TrainSettings = TrainSettings(),
     options: CompareOptions = CompareOptions(),
     reporter: Reporter = SILENT,
@@ -189,11 +187,11 @@ def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
     return (base, *(f"{base}:{name}" for name in names if name in selected or not only))
 
 
-def _checked_recipes(recipes: Sequence[str | Method]) -> tuple[Method, ...]:
+def _checked_recipes(recipes: Sequence[str | AnyRecipe]) -> tuple[AnyRecipe, ...]:
     """The recipes as they are registered: runs are trained in other processes, which know recipes by name."""
     registered = tuple(recipe_named(recipe if isinstance(recipe, str) else recipe.name) for recipe in recipes)
     for passed, own in zip(recipes, registered, strict=True):
-        if isinstance(passed, Method) and passed != own:
+        if not isinstance(passed, str) and passed != own:
             raise PolarguideError(
                 "recipes",
                 expected=f"the registered recipe {own.name}",

@@ -26,17 +26,24 @@ from polarguide.core.options import Exposures, SceneOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import free_memory
 from polarguide.raster import Backend
-from polarguide.recipes.registry import ablations_of
 from polarguide.results.evaluation.record import code_digest, model_digest, read_metrics
 from polarguide.results.evaluation.target import SceneFacts
-from polarguide.runs.families import family_of
-from polarguide.runs.folder import CONFIGURATION, RunConfiguration, compared_steps, trained_steps
+from polarguide.runs.folder import (
+    CHECKPOINT,
+    CONFIGURATION,
+    PLY,
+    RunConfiguration,
+    compared_steps,
+    trained_steps,
+)
 from polarguide.runs.memory_plan import pixels_of
 from polarguide.runs.opened import read_scene
 from polarguide.runs.train import expected_memory
-from polarguide.training.recipe import Method, Recipe
+from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
+from polarguide_bench.gnerp.memory import plan_field_memory
 from polarguide_bench.options import ClusterOptions, CompareOptions
+from polarguide_bench.recipes import AnyRecipe, ablations_of
 
 State = Literal["new", "begun", "trained", "done"]
 RUNS = "runs"
@@ -52,7 +59,7 @@ class TableRow:
     """
 
     name: str
-    recipe: Method
+    recipe: AnyRecipe
     exposures: Exposures = "captured"
     steps: int | None = None
 
@@ -79,7 +86,7 @@ class Comparison:
     """
 
     scenes: tuple[Path, ...]
-    recipes: tuple[Method, ...]
+    recipes: tuple[AnyRecipe, ...]
     settings: TrainSettings
     options: CompareOptions
     out: Path
@@ -107,7 +114,7 @@ class Comparison:
                 rows.append(TableRow(name, next(iter(others), recipe), word, steps))
         return tuple(rows)
 
-    def seeds(self, recipe: Method) -> range:
+    def seeds(self, recipe: AnyRecipe) -> range:
         """The seeds of a recipe."""
         first = self.settings.seed
         return range(first, first + self.seeds_of.get(recipe.name, self.options.seeds))
@@ -178,7 +185,7 @@ class PlannedRun:
         return f"{self.scene.name}, {self.row.name}, seed {self.settings.seed}"
 
     @property
-    def recipe(self) -> Method:
+    def recipe(self) -> AnyRecipe:
         """The method."""
         return self.row.recipe
 
@@ -206,7 +213,7 @@ class PlannedRun:
             return "done"
         # Scoring looks for the scene where the training found it: going on with the training takes up a moved one.
         moved = configuration.scene != str(self.scene.path.resolve())
-        leaves = family_of(self.recipe).leaves
+        leaves = PLY if isinstance(self.recipe, Recipe) else CHECKPOINT
         finished = (self.folder / leaves).exists() and trained_steps(self.folder) == self.steps
         return "trained" if same and finished and not moved else "begun"
 
@@ -317,8 +324,13 @@ def most_memory(runs: Sequence[PlannedRun]) -> int:
     pixels = {run.scene.path: run.reading.downscale for run in runs}
     counts = {path: pixels_of(path, downscale) for path, downscale in pixels.items()}
     kinds = {(run.scene.path, run.row.name): run for run in runs}.values()  # seeds take the same
-    peaks = (expected_memory(counts[r.scene.path], r.recipe, r.settings, r.reading) for r in kinds)
-    return max(peaks, default=0)
+    return max((_expected_memory(run, counts[run.scene.path]) for run in kinds), default=0)
+
+
+def _expected_memory(run: PlannedRun, pixels: Sequence[int]) -> int:
+    if isinstance(run.recipe, Recipe):
+        return expected_memory(pixels, run.recipe, run.settings, run.reading)
+    return plan_field_memory(pixels, run.recipe, limit=run.reading.memory).peak
 
 
 def own_gpus(backend: Backend) -> tuple[str, ...]:

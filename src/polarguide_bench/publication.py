@@ -12,8 +12,8 @@ import pandas as pd
 
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import write_text
-from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.table import COLUMNS, Metric
+from polarguide_bench.recipes import recipe_named
 from polarguide_bench.results import Results, metric_of_runs, scatter_on, values_of
 from polarguide_bench.tables import Section, TableRow, leaders, notes, readable, score_cell
 

@@ -41,6 +41,8 @@ from polarguide.visualization.pages import (
     page_part,
     templates,
 )
+from polarguide_bench.gnerp.runs import FieldRun
+from polarguide_bench.opened import open_compared
 from polarguide_bench.plan import Comparison, PlannedRun, SceneEntry
 from polarguide_bench.results import Results
 from polarguide_bench.tables import formatted, sections, seed_counts
@@ -317,7 +319,7 @@ def _scene_views(
 ) -> Iterator[tuple[EmbeddedView | None, str | None]]:
     """The named views of one scene, as ``embed`` gives them; ``limit`` in bytes for each."""
     scene = read_scene(entry.path, comparison.options)
-    opened = [OpenedRun.open(run.folder, device=comparison.options.own_device) for run in runs]
+    opened = [open_compared(run.folder, comparison.options.own_device) for run in runs]
     scores = [(run.metrics() or {})["views"] for run in runs]
     for name in names:
         view = scene.view(name)
@@ -337,7 +339,7 @@ def _ground_truth_tile(scene: Scene, view: View) -> Tile:
     return Tile(GROUND_TRUTH if view.ground_truth is not None else PHOTOGRAPH, pictures, {})
 
 
-def _tile(name: str, run: OpenedRun, view: View, scores: Mapping[str, float | None]) -> Tile:
+def _tile(name: str, run: OpenedRun | FieldRun, view: View, scores: Mapping[str, float | None]) -> Tile:
     """The pictures of one view by a run called ``name``."""
     result = run.model.render(view.camera, surface=True).to("cpu")
     pictures: dict[str, Picture] = {}

@@ -35,6 +35,7 @@ from polarguide.results.export import formats, web_page
 from polarguide.runs.folder import CONFIGURATION, writing_to
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import train
+from polarguide.training.recipe import Recipe
 from polarguide.visualization import figures
 from polarguide.visualization.layers import layer_picture
 from polarguide.visualization.pages import data_uri
@@ -52,6 +53,9 @@ from polarguide_bench.collection import (
     Step,
     prepare_settings,
 )
+from polarguide_bench.gnerp.runs import FieldRun, train_field
+from polarguide_bench.opened import open_compared
+from polarguide_bench.recipes import recipe_named
 
 THUMBNAIL = 320
 """Longest side of the pictures on the page of a batch, in pixels."""
@@ -259,20 +263,33 @@ def do(task: Task) -> None:
         process(task)
         return
     if isinstance(task, Scoring):
-        evaluate(OpenedRun.open(task.folder, device=task.compute.device), speed=task.speed)
+        score(task)
         return
     _wait_for_others(Path(task.folder))
+    recipe = recipe_named(task.recipe)
+    trains: Any = train if isinstance(recipe, Recipe) else train_field
     with StopSignals() as should_stop:
-        train(
+        trains(
             task.scene,
             task.folder,
-            recipe=task.recipe,
+            recipe=recipe,
             settings=task.settings,
             session=SessionOptions(task.compute.threads, task.compute.device),
             reading=task.reading,
             resume=os.path.lexists(Path(task.folder) / CONFIGURATION),
             should_stop=should_stop,
         )
+
+
+def score(task: Scoring) -> None:
+    """Score a run.
+
+    Raises:
+        PolarguideError: the run or its scene cannot be read.
+    """
+    run = open_compared(task.folder, task.compute.device)
+    surface = run.surface if isinstance(run, FieldRun) else None
+    evaluate(run, speed=task.speed, surface=surface)
 
 
 def _wait_for_others(run: Path) -> None:

@@ -1,5 +1,5 @@
-"""Recipes by name: the methods that ``train`` offers, and their ablations."""
+"""Recipes by name: the methods that ``train`` offers, and their controls."""
 
-from polarguide.recipes.registry import ABLATIONS, RECIPES, ablations_of, recipe_named
+from polarguide.recipes.registry import RECIPES, recipe_named
 
-__all__ = ["ABLATIONS", "RECIPES", "ablations_of", "recipe_named"]
+__all__ = ["RECIPES", "recipe_named"]

@@ -1,15 +1,10 @@
-"""The baselines on our Gaussians, 3DGS (Kerbl et al. 2023), 3DGS-DR (Ye et al. 2024) and Ref-GS (Zhang et al. 2025),
-and GNeRP (Li et al. 2024), a field.
-"""
+"""The baselines on our Gaussians: 3DGS (Kerbl et al. 2023), 3DGS-DR (Ye et al. 2024) and Ref-GS (Zhang et al. 2025)."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.directional import DirectionalShading
 from polarguide.training.recipe import Recipe, Repeat, Rounds, Stage, Weights
-from polarguide_bench.gnerp.recipe import FieldRates, FieldShape, NeuralRecipe, Sampling
 
 # Learning rates of the 3DGS release but for the geometry's, which belong to 30,000 steps: in some thousand, means and
 # scales have to learn twice as fast and rotations ten times. That of the means is times the scene's extent, and falls
@@ -91,29 +86,5 @@ RECIPE_REF_GS = Recipe(
         environment_spread=0.5,
         environment_rate=1e-2,
         environment_resolution=32,
-    ),
-)
-
-
-RECIPE_GNERP = NeuralRecipe(
-    name="gnerp",
-    about="A signed-distance field (dense grids) with color and angle of polarization.",
-)
-
-ABLATIONS_GNERP = (
-    replace(
-        RECIPE_GNERP,
-        name="gnerp:circular",
-        about="gnerp with angles compared on the circle.",
-        weights=replace(RECIPE_GNERP.weights, circular=True),
-    ),
-    replace(
-        RECIPE_GNERP,
-        name="gnerp:published",
-        about="gnerp with the published networks, samples and steps: for a GPU.",
-        steps=100_000,
-        shape=FieldShape(kind="networks"),
-        sampling=Sampling(coarse=64, fine=128),
-        rates=FieldRates(networks=5e-4),
     ),
 )

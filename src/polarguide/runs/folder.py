@@ -16,7 +16,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, overload
+from typing import Annotated, Any, Protocol
 
 import msgspec
 import torch
@@ -34,13 +34,10 @@ from polarguide.core.files import atomic, in_utf8, make_folder, read_file, requi
 from polarguide.core.options import Transfer, index_of
 from polarguide.core.records import LARGEST_RECORD, decode
 from polarguide.training.checked import refuse_foreign
-from polarguide.training.recipe import Method, Recipe
-from polarguide.training.settings import STEPS, Background, ResolvedSettings, TrainSettings
+from polarguide.training.recipe import Recipe
+from polarguide.training.settings import STEPS, ResolvedSettings, TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide_bench.gnerp.recipe import NeuralRecipe
-from polarguide_bench.gnerp.state import FieldState
 
-AnyState = TrainingState | FieldState
 CONFIGURATION = "run.json"
 CHECKPOINT = "checkpoint.safetensors"
 LOG = "log.jsonl"
@@ -48,6 +45,30 @@ LOCK = ".lock"
 PLY = "point_cloud.ply"
 FOR_STEPS = {"adam", "frozen"}
 """Parts of the names of tensors that only further steps read."""
+
+
+class RecordedRecipe(Protocol):
+    """A recipe as far as a run's folder records it."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+
+    def data(self) -> dict[str, Any]:
+        """All values as plain JSON types."""
+
+
+class SavedState(Protocol):
+    """The state of a training as far as a checkpoint holds it.
+
+    Attributes:
+        step: number of finished steps.
+    """
+
+    step: int
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +102,7 @@ class RunConfiguration:
     def of(
         cls,
         scene: Scene,
-        recipe: Method,
+        recipe: RecordedRecipe,
         settings: ResolvedSettings,
         device: torch.device,
         painted: str | None = None,
@@ -155,7 +176,7 @@ def _series(version: str) -> str:
     return ".".join(version.split(".")[:2])
 
 
-def save_checkpoint(run: Path, state: AnyState, *, optimizer: bool = True) -> None:
+def save_checkpoint(run: Path, state: SavedState, *, optimizer: bool = True) -> None:
     """Write the state so that a kill at any moment leaves either the old checkpoint or the new one.
 
     Args:
@@ -177,19 +198,23 @@ def save_checkpoint(run: Path, state: AnyState, *, optimizer: bool = True) -> No
             raise OSError(str(error)) from None
 
 
-@overload
-def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu") -> TrainingState: ...
-
-
-@overload
-def load_checkpoint(run: Path, recipe: Method, device: torch.device | str = "cpu") -> AnyState: ...
-
-
-def load_checkpoint(run: Path, recipe: Method, device: torch.device | str = "cpu") -> AnyState:
-    """Read the state of a run, whatever it was trained on, to a device.
+def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu") -> TrainingState:
+    """Read the state of a run, wherever it was trained, to a device.
 
     Raises:
         PolarguideError: there is none, or it is damaged.
+    """
+    with checkpoint_tensors(run) as tensors:
+        refuse_foreign(tensors, recipe)
+    return TrainingState.from_tensors({name: values.to(device) for name, values in tensors.items()}, recipe)
+
+
+@contextlib.contextmanager
+def checkpoint_tensors(run: Path) -> Iterator[dict[str, Tensor]]:
+    """The tensors in a run's checkpoint, on the CPU. Faults that are found inside are faults of the file.
+
+    Raises:
+        PolarguideError: there is no checkpoint, or it is damaged.
     """
     path = run / CHECKPOINT
     if not path.exists():
@@ -205,10 +230,7 @@ def load_checkpoint(run: Path, recipe: Method, device: torch.device | str = "cpu
     try:
         with in_utf8(path) as name, safe_open(name, framework="pt") as file:
             tensors: dict[str, Tensor] = {key: file.get_tensor(key) for key in list(file.keys())}
-        if isinstance(recipe, NeuralRecipe):
-            return FieldState.from_tensors(tensors, recipe, device)
-        assert isinstance(recipe, Recipe)
-        refuse_foreign(tensors, recipe)
+        yield tensors
     except (SafetensorError, ValueError, OSError, RuntimeError) as error:
         raise PolarguideError(
             path,
@@ -216,7 +238,6 @@ def load_checkpoint(run: Path, recipe: Method, device: torch.device | str = "cpu
             found=f"damaged or foreign data ({str(error)[:300]})",
             remedy="Train again into a new folder.",
         ) from None
-    return TrainingState.from_tensors({name: values.to(device) for name, values in tensors.items()}, recipe)
 
 
 def trained_steps(run: Path) -> int | None:
@@ -332,16 +353,13 @@ more of them would give at full size was not studied.
 
 
 def most_gaussians(
-    pixels: int, method: Method, settings: TrainSettings, resumed: ResolvedSettings | None = None
+    pixels: int, method: Recipe, settings: TrainSettings, resumed: ResolvedSettings | None = None
 ) -> int:
-    """How many Gaussians there may be for so many pixels of all views; 0 of a field, which has none.
+    """How many Gaussians there may be for so many pixels of all views.
 
     Args:
         pixels: pixels of the training views. asked, resumed: as for ``resolve``.
     """
-    if isinstance(method, NeuralRecipe):
-        return 0
-    assert isinstance(method, Recipe)
     recorded = {} if resumed is None else _recorded(resumed)
     by_size = min(int(pixels / method.densification.pixels_each), MOST_GAUSSIANS)
     return recorded.get("gaussians", by_size) if settings.gaussians is None else settings.gaussians
@@ -358,7 +376,7 @@ def compared_steps(*specified: int | None) -> int:
 def resolve(
     settings: TrainSettings,
     scene: Scene,
-    method: Method,
+    method: Recipe,
     resumed: ResolvedSettings | None = None,
     *,
     processes: int = 1,
@@ -371,13 +389,13 @@ def resolve(
         processes: how many share the views of a step.
 
     Raises:
-        PolarguideError: a setting that means nothing for this method.
+        PolarguideError: a setting that is out of range.
     """
     recorded = {} if resumed is None else _recorded(resumed)
     sizes = [view.camera.width * view.camera.height for view in scene.train_views]
     values: dict[str, Any] = {
         **vars(settings),
-        "steps": _steps(sizes, method),
+        "steps": _steps(sizes),
         "refractive_index": index_of(None, scene.refractive_index),
         "views_per_step": processes,
         **{name: recorded[name] for name in OPEN if name in recorded},
@@ -385,11 +403,8 @@ def resolve(
         **settings.specified(),
     }
     if values["background"] == "auto":
-        values["background"] = _background(scene, method)
-    resolved = ResolvedSettings(**values)
-    if isinstance(method, NeuralRecipe):
-        _refuse_for_field(resolved, method)
-    return resolved
+        values["background"] = "black" if has_black_background(scene.train_views) else "scene"
+    return ResolvedSettings(**values)
 
 
 def _recorded(resumed: ResolvedSettings) -> dict[str, Any]:
@@ -397,28 +412,5 @@ def _recorded(resumed: ResolvedSettings) -> dict[str, Any]:
     return {name: value for name, value in resumed.specified().items() if value != 0}
 
 
-def _steps(sizes: Sequence[int], method: Method) -> int:
-    if isinstance(method, NeuralRecipe):
-        return method.steps
+def _steps(sizes: Sequence[int]) -> int:
     return max(STEPS, 500 * math.ceil(VISITS * len(sizes) / 500)) * (2 if max(sizes) > LARGE else 1)
-
-
-def _background(scene: Scene, method: Method) -> Background:
-    """The background behind the subject, by the edges of the pictures; fields ignore it."""
-    if isinstance(method, NeuralRecipe):
-        return "scene"
-    return "black" if has_black_background(scene.train_views) else "scene"
-
-
-def _refuse_for_field(settings: ResolvedSettings, method: NeuralRecipe) -> None:
-    for name, value, most in (
-        ("gaussians", settings.gaussians, 0),
-        ("views_per_step", settings.views_per_step, 1),
-    ):
-        if value > most:
-            raise PolarguideError(
-                name,
-                expected=f"{most} with the recipe {method.name}, a field",
-                found=str(value),
-                remedy="Leave it out.",
-            )

@@ -31,7 +31,7 @@ from polarguide.core.records import read_record
 from polarguide.core.text import command
 from polarguide.gaussians.densify import Densification, free_space
 from polarguide.optics.color import srgb_encode
-from polarguide.runs.model import Model
+from polarguide.runs.model import GaussianModel
 from polarguide.training.angles.polarizers import Judgment
 from polarguide.training.photometric import behind_analyzer
 
@@ -244,7 +244,9 @@ class Evidence:
 
 
 @torch.no_grad()
-def examine(model: Model, evidence: Evidence, points: Tensor, steps: int, reporter: Reporter) -> Health:
+def examine(
+    model: GaussianModel, evidence: Evidence, points: Tensor, steps: int, reporter: Reporter
+) -> Health:
     """Look at training views; changes nothing of the model.
 
     Args:
@@ -285,7 +287,7 @@ def _brightest(view: View) -> float:
 
 
 def _look(
-    model: Model, view: View, limit: float, near: float, filters: bool
+    model: GaussianModel, view: View, limit: float, near: float, filters: bool
 ) -> tuple[ViewHealth, Tensor | None]:
     """Facts of a view, and the radii of the Gaussians in it.
 

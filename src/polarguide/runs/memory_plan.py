@@ -20,7 +20,6 @@ from polarguide.capture.layout import (
 from polarguide.core.errors import PolarguideError
 from polarguide.core.system import free_memory, resident_memory
 from polarguide.training.recipe import Recipe
-from polarguide_bench.gnerp.recipe import NeuralRecipe
 
 GIGABYTE = 10**9
 # Estimates by the tensors that there are: one training (24 steps, 1224 x 1024 x 60, 4 GB) took 12 % less than they say.
@@ -39,10 +38,6 @@ SPLAT = 600
 """Bytes a Gaussian of what a rasterizer makes of it."""
 FILLED = 0.88
 """Share of a limit up to which views are kept in memory; the rest is for gaps between what is used."""
-FIELD_COPIES = 5
-"""Copies of the parameters of a field: values, gradients, two moments, and those in the file that is written."""
-SAMPLE, READ_VIEW, TARGET_KEPT = 14_000, 60, 10
-"""Bytes a sample of a field's step, a pixel of the view it looks at, and a pixel of what is kept of each view."""
 
 
 @dataclass(frozen=True)
@@ -80,26 +75,22 @@ def plan_memory(
     step = (max(STEP, PRIORS) if guided else STEP) * largest + SPLAT * gaussians
     own = PROCESS + 4 * floats * COPIES * gaussians + max(step, 4 * floats * WRITTEN * gaussians)
     what = f" and up to {gaussians:,} Gaussians"
-    return _shared(pixels, own, of_view, limit, in_memory, what, "fewer --gaussians, or ")
+    return share_memory(pixels, own, of_view, limit, in_memory, what, "fewer --gaussians, or ")
 
 
-def plan_field_memory(
-    pixels: Sequence[int], recipe: NeuralRecipe, *, limit: float | None, in_memory: bool = False
-) -> MemoryPlan:
-    """The same for a field: ``plan_memory``."""
-    largest = max(pixels, default=0)
-    own = PROCESS + 4 * recipe.numbers * FIELD_COPIES + SAMPLE * recipe.sampling.samples + READ_VIEW * largest
-    return _shared(pixels, own, TARGET_KEPT, limit, in_memory, "", "")
-
-
-def _shared(
+def share_memory(
     pixels: Sequence[int], own: int, of_view: int, limit: float | None, in_memory: bool, what: str, less: str
 ) -> MemoryPlan:
-    """Share out memory: ``own`` is what a training takes beside its views, ``of_view`` a pixel of what it keeps of
-    them.
+    """Share out memory between a training and its views.
+
+    Args:
+        pixels: pixels of each view as it is trained on.
+        own: bytes that the training takes beside its views. of_view: bytes that it keeps of a pixel of a view.
+        limit, in_memory: as for ``plan_memory``.
+        what: for the message: needs beside the pictures. less: another remedy.
 
     Raises:
-        PolarguideError: a limit that was given is too small; ``what`` it is for beside pictures, ``less`` helps, too.
+        PolarguideError: a limit that was given is too small.
     """
     largest, total = max(pixels, default=0), sum(pixels)
     now = resident_memory() or 0

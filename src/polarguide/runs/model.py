@@ -25,8 +25,12 @@ from polarguide.raster.surface import alpha_in_front
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.model import Light, Parameters, ShadingModel
 from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
+from polarguide.training.recipe import Recipe
+from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import TrainingState
-from polarguide_bench.gnerp.model import FieldModel, Within
+
+Within = Callable[[Tensor], Tensor]
+"""Tells which places [N, 3] of the scene are shown, [N] bool."""
 
 
 def layers_of(shading: ShadingModel) -> tuple[str, ...]:
@@ -44,6 +48,13 @@ class GaussianModel:
     state: TrainingState
     shading: ShadingModel
     backend: Backend
+
+    @classmethod
+    def of(
+        cls, state: TrainingState, recipe: Recipe, settings: ResolvedSettings, backend: Backend
+    ) -> GaussianModel:
+        """The model of a training's state."""
+        return cls(state, recipe.shading.bind(settings.refractive_index), backend)
 
     @property
     def device(self) -> torch.device:
@@ -122,10 +133,6 @@ class GaussianModel:
         if footprints is not None:
             drawn = as_trained(drawn, camera, footprints)
         return alpha_in_front(drawn, camera, depth, self.backend.rasterize)
-
-
-Model = GaussianModel | FieldModel
-"""What was trained: whatever scores, shows or examines a run asks either for the same."""
 
 
 @torch.no_grad()

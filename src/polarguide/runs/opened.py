@@ -24,13 +24,11 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame, scene_frame
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
-from polarguide.runs.families import family_of
 from polarguide.runs.folder import CONFIGURATION, RunConfiguration, load_checkpoint, writing_to
 from polarguide.runs.health import Health
-from polarguide.runs.model import GaussianModel, Model
+from polarguide.runs.model import GaussianModel, Within
 from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
-from polarguide.training.recipe import Method
-from polarguide_bench.gnerp.model import Within
+from polarguide.training.recipe import Recipe
 
 Opened = TypeVar("Opened", bound="OpenedRun")
 
@@ -50,8 +48,8 @@ class OpenedRun:
         self,
         folder: Path,
         configuration: RunConfiguration,
-        recipe: Method,
-        model: Model,
+        recipe: Recipe,
+        model: GaussianModel,
         *,
         scene: Scene | PathLike | None = None,
         reporter: Reporter = SILENT,
@@ -75,7 +73,7 @@ class OpenedRun:
         cls: type[Opened],
         folder: PathLike,
         *,
-        recipe: Method | str | None = None,
+        recipe: Recipe | str | None = None,
         scene: Scene | PathLike | None = None,
         device: DeviceName = "auto",
         reporter: Reporter = SILENT,
@@ -94,7 +92,7 @@ class OpenedRun:
         """
         folder = Path(folder)
         configuration = RunConfiguration.load(folder)
-        method = recipe if isinstance(recipe, Method) else recipe_named(recipe or configuration.recipe)
+        method = recipe if isinstance(recipe, Recipe) else recipe_named(recipe or configuration.recipe)
         if method.name != configuration.recipe:
             expected, remedy = f"{configuration.recipe}, which {folder} was trained with", "Give that recipe."
             raise PolarguideError("recipe", expected=expected, found=method.name, remedy=remedy)
@@ -106,7 +104,7 @@ class OpenedRun:
                 f"{folder} was trained with other values of the recipe {method.name} than this version has; its "
                 "pictures are shaded with this version's."
             )
-        model = family_of(method).model(state, method, configuration.settings, backend)
+        model = GaussianModel.of(state, method, configuration.settings, backend)
         return cls(folder, configuration, method, model, scene=scene, reporter=reporter)
 
     @classmethod
@@ -122,28 +120,9 @@ class OpenedRun:
 
     @property
     def gaussians(self) -> dict[str, Tensor]:
-        """Parameters by name, one row a Gaussian: ``means`` [N, 3], ``log_scales`` [N, 3], ... Not to be written to.
-
-        Raises:
-            PolarguideError: the recipe learns something else.
-        """
-        gaussians = self.gaussian_model("gaussians").state.gaussians
+        """Parameters by name, one row a Gaussian: ``means`` [N, 3], ``log_scales`` [N, 3], ... Not to be written to."""
+        gaussians = self.model.state.gaussians
         return {name: gaussians[name].detach() for name in gaussians.names}
-
-    def gaussian_model(self, what: str) -> GaussianModel:
-        """The model, for what needs Gaussians; ``what`` asks for them.
-
-        Raises:
-            PolarguideError: the recipe learns something else.
-        """
-        if isinstance(self.model, GaussianModel):
-            return self.model
-        raise PolarguideError(
-            what,
-            expected="a run of Gaussians",
-            found=f"a run of {self.recipe.name}, a signed-distance field",
-            remedy="polarguide export --format mesh writes its surface.",
-        )
 
     @property
     def health(self) -> Health | None:

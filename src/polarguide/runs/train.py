@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import warnings
 from collections.abc import Callable, Sequence
@@ -19,65 +18,53 @@ from polarguide.capture.variants import mask_background, select_exposures
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import check_out, make_folder
 from polarguide.core.options import PathLike, SceneOptions, SessionOptions
-from polarguide.core.progress import SILENT, Advance, Reporter
+from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import first_difference
 from polarguide.core.system import MEBIBYTE, MemoryBound, peak_memory_mib, return_freed_memory
 from polarguide.raster import Backend, use_threads
 from polarguide.recipes import recipe_named
-from polarguide.runs.families import AnyTrainer, Family, family_of
 from polarguide.runs.folder import (
     CHECKPOINT,
     CONFIGURATION,
+    PLY,
     RunConfiguration,
-    RunLog,
     load_checkpoint,
     most_gaussians,
     resolve,
     save_checkpoint,
     writing_to,
 )
-from polarguide.runs.health import examine
-from polarguide.runs.memory_plan import MemoryPlan, in_gigabytes, pixels_of
+from polarguide.runs.health import Evidence, Polarization, examine
+from polarguide.runs.loop import Ends, Look, TrainingLoop
+from polarguide.runs.memory_plan import MemoryPlan, in_gigabytes, pixels_of, plan_memory
+from polarguide.runs.model import GaussianModel, write_run_ply
 from polarguide.runs.opened import OpenedRun, read_scene
-from polarguide.runs.painted import read_painted
-from polarguide.runs.stopwatch import Stopwatch, in_words
+from polarguide.runs.painted import FOLDER, read_painted
+from polarguide.runs.reports import report_metals, report_polarizers
+from polarguide.runs.stopwatch import in_words
+from polarguide.training.angles.polarizers import predicts_filters
+from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.distributed import Ranks, backend_of, process_group
 from polarguide.training.feed import ViewStore
-from polarguide.training.losses import refuse_diverged
-from polarguide.training.recipe import Method
-from polarguide.training.settings import ResolvedSettings, StepReport, TrainSettings
-
-LOG_EVERY = 10
-Ends = Callable[[], bool]
-"""Whether training should end."""
-Look = Callable[[Ends], None]
-"""Lets others look between two steps; asks what it is given whether training should end."""
-
-
-class TrainingStopped(KeyboardInterrupt):
-    """Training was asked to stop; its state is saved.
-
-    Attributes:
-        step: how many steps were done.
-    """
-
-    def __init__(self, step: int) -> None:
-        super().__init__(f"stopped after step {step}")
-        self.step = step
+from polarguide.training.metals.search import looks
+from polarguide.training.recipe import Recipe
+from polarguide.training.settings import ResolvedSettings, TrainSettings
+from polarguide.training.state import TrainingState
+from polarguide.training.trainer import warn_of_unused_materials
 
 
 def train(
     scene: Scene | PathLike,
     out: PathLike,
     *,
-    recipe: Method | str = "polarguide-stokes",
+    recipe: Recipe | str = "polarguide-stokes",
     settings: TrainSettings = TrainSettings(),
     session: SessionOptions = SessionOptions(),
     reading: SceneOptions = SceneOptions(),
     resume: bool = False,
     reporter: Reporter = SILENT,
     should_stop: Ends = lambda: False,
-    watch: Callable[[AnyTrainer], AbstractContextManager[Look]] | None = None,
+    watch: Callable[[AngleTrainer], AbstractContextManager[Look]] | None = None,
 ) -> OpenedRun:
     """Train a recipe on a scene, into a run folder.
 
@@ -102,19 +89,18 @@ def train(
     out = Path(out)
     use_threads(session.threads)
     chosen = recipe_named(recipe) if isinstance(recipe, str) else recipe
-    family = family_of(chosen)
     with process_group(session.device, out) as ranks, ExitStack() as locked:
         leads = ranks.rank == 0
         reporter = reporter if leads else SILENT
         _check_out(out, resume, ranks)
         backend = backend_of(ranks, session.device, reporter)
         earlier = RunConfiguration.load(out).settings if resume else None
-        plan = _planned(family, scene, chosen, settings, earlier, reading)
+        plan = _planned(scene, chosen, settings, earlier, reading)
         whole = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter, hold=plan.hold)
         loaded = select_exposures(whole, settings.exposures)
         if settings.background == "masked":
             loaded = mask_background(loaded)
-        _check_scene(loaded)
+        check_trainable(loaded)
         if settings.refractive_index is None and not resume and loaded.refractive_index is not None:
             reporter.say(f"refractive index {loaded.refractive_index:g}, as scene.json says")
         resolved = resolve(settings, loaded, chosen, earlier, processes=ranks.world)
@@ -133,36 +119,41 @@ def train(
             if leads:
                 locked.enter_context(writing_to(out))
             recorded = RunConfiguration.load(out)
-            _check_same(recorded, configuration, out)
+            check_same_run(recorded, configuration, out)
             if os.path.lexists(out / CHECKPOINT):  # a link to nowhere is no absence
                 state = load_checkpoint(out, chosen, backend.device)
-                family.check(state, resolved, out)
+                _check_state(state, resolved, out)
             else:
                 reporter.say(f"{out} has no checkpoint: the training begins at step 0")
             if recorded.painted != digest:
-                family.go_back(state, chosen, resolved, out, reporter)
+                _go_back(state, chosen, resolved, out, reporter)
                 if state is not None and leads:
                     save_checkpoint(out, state)  # before run.json says that what was painted is in it
         return_freed_memory()  # of decoded files
-        store = locked.enter_context(closing(_store(plan, backend, out, reporter)))
+        store = locked.enter_context(closing(view_store(plan, backend, out, reporter)))
         bound = MemoryBound(plan.peak)
-        trainer = family.trainer(loaded, chosen, resolved, backend, state, ranks, store, reporter, bound)
+        warn_of_unused_materials(loaded, chosen, resolved, backend, reporter.warn)
+        trainer = AngleTrainer(loaded, chosen, resolved, backend, state, ranks, store, reporter.warn, bound)
+        if trainer.polarizers.ignored:
+            reporter.warn(ignored_filters(chosen.name))
         with watch(trainer) if watch is not None else nullcontext() as look:
             ranks.barrier()
             if leads:
                 if not resume:
                     locked.enter_context(writing_to(out))
-                    if problem := _unsuitable(out, resume):  # another training has begun meanwhile
+                    if problem := unsuitable_folder(out, resume):  # another training has begun meanwhile
                         raise problem
                 configuration.save(out)
-            seconds = _Loop(trainer, out, session, reporter, should_stop, look, bound).run()
-        model = family.model(trainer.state, chosen, resolved, backend)
-        reporter.say(_taken(seconds, plan.peak))
+            seconds = TrainingLoop(trainer, out, session, reporter, should_stop, look, bound).run()
+        model = GaussianModel.of(trainer.state, chosen, resolved, backend)
+        reporter.say(resources_used(seconds, plan.peak))
         if leads:
             finished = _Warned(reporter)
-            family.finish(out, trainer, model, finished)
-            evidence = family.evidence(trainer, chosen)
-            health = examine(model, evidence, loaded.points, resolved.steps, reporter)
+            report_polarizers(out, loaded, trainer.polarizers, finished)
+            report_metals(out, trainer, model, finished)
+            centers = torch.stack([view.camera.center for view in loaded.views])
+            write_run_ply(out / PLY, model.state, model.shading, centers)
+            health = examine(model, _evidence(trainer, chosen), loaded.points, resolved.steps, reporter)
             for warning in health.warnings:
                 reporter.warn(warning)
             health = replace(health, warnings=(*health.warnings, *finished.warnings))
@@ -171,7 +162,7 @@ def train(
     return OpenedRun(out, configuration, chosen, model, scene=whole, reporter=reporter)
 
 
-def _taken(seconds: float, planned: int) -> str:
+def resources_used(seconds: float, planned: int) -> str:
     """Time and memory that a training took, and the bytes of memory that were planned."""
     peak = peak_memory_mib()
     memory = "" if peak is None else f" and {in_gigabytes(int(peak * MEBIBYTE))} of memory"
@@ -191,134 +182,9 @@ class _Warned(Reporter):
         self._to.warn(text)
 
 
-class _Loop:
-    """Trains to the end with progress, checkpoints and a log. Rank 0 alone writes."""
-
-    def __init__(
-        self,
-        trainer: AnyTrainer,
-        out: Path,
-        session: SessionOptions,
-        reporter: Reporter,
-        should_stop: Ends,
-        look: Look | None,
-        memory: MemoryBound,
-    ) -> None:
-        self._trainer, self._out, self._session, self._memory = trainer, out, session, memory
-        self._reporter, self._should_stop, self._look = reporter, should_stop, look
-        self._log = RunLog(out) if trainer.ranks.rank == 0 else None
-        if self._log is not None:
-            self._log.cut(trainer.state.step)
-        seconds, alone = self._log.elapsed() if self._log else (0.0, True)
-        self._stopwatch = Stopwatch(seconds, alone)
-
-    def run(self) -> float:
-        """Train; see ``train``. Returns the seconds that it took."""
-        trainer = self._trainer
-        with self._reporter.track("training", trainer.total) as advance:
-            meter = _Meter(advance, self._log, self._stopwatch)
-            advance(trainer.done, seconds=self._stopwatch.read()[0])
-            try:
-                stopped = self._steps(meter)
-            except KeyboardInterrupt:
-                if trainer.ranks.world == 1 and trainer.whole:
-                    self._save()
-                raise
-            meter.read()
-        self._save()
-        if stopped:
-            raise TrainingStopped(trainer.state.step)
-        return self._stopwatch.read()[0]
-
-    def _steps(self, meter: _Meter) -> bool:
-        """Steps up to the last one; True where training is to stop before."""
-        trainer, ranks = self._trainer, self._trainer.ranks
-        while trainer.state.step < trainer.settings.steps:
-            # Several ranks stop after the same step, so they have to ask each other, which takes time.
-            if (ranks.world == 1 or trainer.state.step % LOG_EVERY == 0) and ranks.any(self._should_stop()):
-                return True
-            meter.take(trainer.step())
-            self._memory.keep()
-            if trainer.state.step % self._session.checkpoint_every == 0:
-                with self._stopwatch.paused():
-                    meter.read()
-                    self._save()
-            if self._look is not None:
-                with self._stopwatch.paused():
-                    self._look(self._should_stop)
-        return False
-
-    def _save(self) -> None:
-        """A checkpoint of what all ranks have seen, by rank 0."""
-        self._trainer.exchange_statistics()
-        if self._trainer.ranks.rank == 0:
-            state = self._trainer.state
-            goes_on = state.step < self._trainer.settings.steps
-            save_checkpoint(self._out, state, optimizer=goes_on or self._session.keep_optimizer)
-
-
-class _Meter:
-    """Smooths what the steps report, hands it on, and writes every tenth into the log.
-
-    Reports are looked at ten at a time: on a GPU, looking waits for it.
-    """
-
-    def __init__(self, advance: Advance, log: RunLog | None, stopwatch: Stopwatch) -> None:
-        self._advance, self._log, self._stopwatch = advance, log, stopwatch
-        self._loss = self._psnr = math.nan
-        self._began, self._first = stopwatch.read()[0], -1
-        self._waiting: list[StepReport] = []
-
-    def take(self, report: StepReport) -> None:
-        """Take one step's report."""
-        if self._first < 0:
-            self._first = report.done - 1
-        elif report.step == 0 and self._log is not None:
-            self._log.cut(0)  # it has begun again
-        self._waiting.append(report)
-        if (report.step + 1) % LOG_EVERY == 0:
-            loss, psnr = self.read()
-            if self._log is None:
-                return
-            seconds, alone = self._stopwatch.read()
-            self._log.append(
-                step=report.step,
-                stage=report.stage,
-                loss=round(loss, 6),
-                psnr=round(psnr, 3),
-                gaussians=report.gaussians,
-                seconds=round(seconds, 3),
-                alone=alone,
-            )
-
-    def read(self) -> tuple[float, float]:
-        """Look at the reports that wait; loss and PSNR of the last.
-
-        Raises:
-            PolarguideError: a loss that is not finite.
-        """
-        if not self._waiting:
-            return math.nan, math.nan
-        last = self._waiting[-1]
-        measured = torch.stack([report.measured for report in self._waiting]).cpu()
-        self._waiting.clear()
-        refuse_diverged(measured[:, 2])
-        for loss, psnr, _ in measured.tolist():
-            keep = 0.0 if math.isnan(self._loss) else 0.98
-            self._loss = loss if keep == 0 else keep * self._loss + (1 - keep) * loss
-            self._psnr = psnr if keep == 0 else keep * self._psnr + (1 - keep) * psnr
-        seconds, _ = self._stopwatch.read()
-        rate = (last.done - self._first) / max(1e-9, seconds - self._began)
-        count = "" if last.gaussians is None else f"{last.gaussians:,} Gaussians  "
-        note = f"{last.stage}  loss {self._loss:.4f}  PSNR {self._psnr:.2f} dB  {count}{rate:.1f} it/s"
-        self._advance(last.done, note=note, seconds=seconds)
-        return loss, psnr
-
-
 def _planned(
-    family: Family,
     scene: Scene | PathLike,
-    recipe: Method,
+    recipe: Recipe,
     settings: TrainSettings,
     resumed: ResolvedSettings | None,
     reading: SceneOptions,
@@ -329,11 +195,11 @@ def _planned(
     else:
         pixels = pixels_of(Path(scene), reading.downscale)
     gaussians = most_gaussians(sum(pixels), recipe, settings, resumed)
-    return family.plan(pixels, recipe, gaussians, reading.memory, in_memory=isinstance(scene, Scene))
+    return plan_memory(pixels, recipe, gaussians, limit=reading.memory, in_memory=isinstance(scene, Scene))
 
 
 def expected_memory(
-    pixels: Sequence[int], recipe: Method, settings: TrainSettings, reading: SceneOptions
+    pixels: Sequence[int], recipe: Recipe, settings: TrainSettings, reading: SceneOptions
 ) -> int:
     """Bytes that the process of a training takes at most, as far as headers tell.
 
@@ -344,10 +210,10 @@ def expected_memory(
         PolarguideError: the limit in ``reading`` is too small.
     """
     gaussians = most_gaussians(sum(pixels), recipe, settings, None)
-    return family_of(recipe).plan(pixels, recipe, gaussians, reading.memory, in_memory=False).peak
+    return plan_memory(pixels, recipe, gaussians, limit=reading.memory).peak
 
 
-def _store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter) -> ViewStore:
+def view_store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter) -> ViewStore:
     """Where what is computed of the views is kept. What a GPU reads stays on it."""
     if plan.view_bytes is None or backend.device.type != "cpu":
         return ViewStore()
@@ -357,12 +223,12 @@ def _store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter) ->
 
 def _check_out(out: Path, resume: bool, ranks: Ranks) -> None:
     """Refuse a folder that does not suit, once for all ranks: rank 0 looks, before it writes there itself."""
-    problem = _unsuitable(out, resume) if ranks.rank == 0 else None
+    problem = unsuitable_folder(out, resume) if ranks.rank == 0 else None
     if ranks.any(problem is not None):
         raise problem or SystemExit(2)
 
 
-def _unsuitable(out: Path, resume: bool) -> PolarguideError | None:
+def unsuitable_folder(out: Path, resume: bool) -> PolarguideError | None:
     try:
         check_out(out)
         refuse_scene(out)
@@ -378,7 +244,7 @@ def _unsuitable(out: Path, resume: bool) -> PolarguideError | None:
     return PolarguideError(out, expected=expected, found=found, remedy=remedy)
 
 
-def _check_scene(scene: Scene) -> None:
+def check_trainable(scene: Scene) -> None:
     """Refuse a scene that says nothing about space: views from one place alone."""
     centers = torch.stack([view.camera.center for view in scene.train_views])
     if float((centers - centers[0]).norm(dim=1).max()) <= 1e-9 * max(1.0, float(centers.abs().max())):
@@ -395,7 +261,7 @@ def _check_scene(scene: Scene) -> None:
         warnings.warn(fault, PolarguideWarning, stacklevel=2)
 
 
-def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:
+def check_same_run(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:
     if old.settings.background == "auto":  # as the first versions recorded it
         old = replace(old, settings=replace(old.settings, background=new.settings.background))
     if old.settings != new.settings and replace(old.settings, steps=new.settings.steps) == new.settings:
@@ -417,3 +283,79 @@ def _check_same(old: RunConfiguration, new: RunConfiguration, out: Path) -> None
                 found="none" if b is None else json.dumps(b, default=str)[:120],
                 remedy="Resume with the same scene, options and program version, or train into a new folder.",
             )
+
+
+def _check_state(state: TrainingState, settings: ResolvedSettings, out: Path) -> None:
+    """Refuse a checkpoint that does not belong to the settings of its run."""
+    check_step(state.step, settings, out)
+    sums = state.statistics.gradient
+    views = sums.shape[0] if sums.ndim == 2 else 1
+    if views != settings.views_per_step:
+        raise PolarguideError(
+            out / CHECKPOINT,
+            expected=f"the state of a training with {settings.views_per_step} views a step",
+            found=f"a training with {views}",
+            remedy="Train again into a new folder.",
+        )
+
+
+def check_step(step: int, settings: ResolvedSettings, out: Path) -> None:
+    """Check that a checkpoint's step belongs to the training.
+
+    Raises:
+        PolarguideError: the step is beyond the last one.
+    """
+    if step > settings.steps:
+        raise PolarguideError(
+            out / CHECKPOINT,
+            expected=f"the state of a training of {settings.steps} steps",
+            found=f"the state after step {step}",
+            remedy="Train again into a new folder.",
+        )
+
+
+def _go_back(
+    state: TrainingState | None, recipe: Recipe, settings: ResolvedSettings, out: Path, reporter: Reporter
+) -> None:
+    """Take a run back to the last step that looks for metals, where painted materials still count.
+
+    Args:
+        state: state of the training; changed. None: it has not begun.
+
+    Raises:
+        PolarguideError: materials mean nothing to the recipe, or to a training this short.
+    """
+    last = max(looks(recipe, settings), default=None)
+    if last is None:
+        raise PolarguideError(
+            out / FOLDER,
+            expected="a training that asks at some step what is metal",
+            found=f"one of {recipe.name} in {settings.steps} steps, with --materials {settings.materials}",
+            remedy="Remove the folder, or train polarguide-stokes in 1,500 steps or more.",
+        )
+    if state is not None and state.step > last:
+        reporter.say(
+            f"{out / FOLDER} has changed: training goes on from step {last}, which decides on metals"
+        )
+        state.step = last
+        state.frozen = None
+        state.footprints = None
+
+
+def _evidence(trainer: AngleTrainer, recipe: Recipe) -> Evidence:
+    """The evidence by which a finished training is examined."""
+    views = [trainer.polarizers.believed(view) for view in trainer.scene.train_views]
+    filters = predicts_filters(recipe)
+    priors = any(stage.weights.priors for stage in recipe.stages)
+    judgments = trainer.polarizers.judgments()
+    polarization = Polarization.of(views, judgments, measured=priors, fitted=filters)
+    # A look at a view takes two renderings without gradients, a third of a step each.
+    return Evidence(views, polarization, filters=filters, steps_a_view=1.0)
+
+
+def ignored_filters(recipe: str) -> str:
+    """The warning that a recipe takes single pictures through a filter for photographs."""
+    return (
+        f"the recipe {recipe} has no term for single pictures through a filter: it takes them for "
+        "photographs without one."
+    )

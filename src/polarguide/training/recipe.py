@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from typing import Any, Literal, get_type_hints
@@ -180,32 +179,6 @@ class Propagation:
     rest_part: int = 50
 
 
-class Method(ABC):
-    """The method of a run: a recipe, of Gaussians or of another kind.
-
-    Attributes:
-        name: as given to ``--recipe``. about: one line.
-    """
-
-    name: str
-    about: str
-
-    @abstractmethod
-    def data(self) -> dict[str, Any]:
-        """All values as plain JSON types, for a run's folder."""
-
-    def as_recorded(self, data: Mapping[str, Any]) -> Method:
-        """The recipe as a run has it, whose folder has ``data``: of an earlier version it may know less."""
-        return self
-
-    def differs(self, data: Mapping[str, Any]) -> bool:
-        """True where a value differs from the one that a run's folder records; values that it lacks count as equal.
-
-        Its description is no value.
-        """
-        return _differs(self.data(), {key: value for key, value in data.items() if key != "about"})
-
-
 @dataclass(frozen=True)
 class Coarse:
     """Smaller pictures for the first steps, in which large ones show nothing that the Gaussians could take up yet.
@@ -221,8 +194,8 @@ class Coarse:
 
 
 @dataclass(frozen=True)
-class Recipe(Method):
-    """All that distinguishes one method of Gaussians from another.
+class Recipe:
+    """All that distinguishes one method from another.
 
     Attributes:
         name: as given to ``--recipe``.
@@ -308,7 +281,11 @@ class Recipe(Method):
         return {name: parameter.rate for name, parameter in self.shading.light_parameters.items()}
 
     def as_recorded(self, data: Mapping[str, Any]) -> Recipe:
-        """See ``Method``: shading that a version of before did not know is left out."""
+        """The recipe as a run of an earlier version had it.
+
+        Args:
+            data: the values in the run's folder; shading that the version did not know is left out.
+        """
         return replace(self, shading=self.shading.as_recorded(data.get("shading") or {}))
 
     def data(self) -> dict[str, Any]:
@@ -316,12 +293,24 @@ class Recipe(Method):
         plain: dict[str, Any] = json.loads(json.dumps({**asdict(self), "shading": self.shading.data()}))
         return plain
 
+    def differs(self, data: Mapping[str, Any]) -> bool:
+        """True where a value differs from the one that a run's folder records; see ``values_differ``."""
+        return values_differ(self.data(), data)
+
+
+def values_differ(own: Mapping[str, Any], recorded: Mapping[str, Any]) -> bool:
+    """True where a value of a recipe differs from a recorded one.
+
+    Values that the record lacks count as equal, and the description is no value.
+    """
+    return _differs(own, {key: value for key, value in recorded.items() if key != "about"})
+
 
 def _is_rate(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf
 
 
-def check_recipe(recipe: Method, where: str) -> None:
+def check_recipe(recipe: Recipe, where: str) -> None:
     """Check all values of a recipe that another program has made, before anything is trained.
 
     Args:
@@ -335,7 +324,7 @@ def check_recipe(recipe: Method, where: str) -> None:
         if not isinstance(text, str) or not text.isprintable() or not text.strip():
             place = f"{where} ({name})"
             raise PolarguideError(place, expected="a line of text", found=repr(text), remedy=_REMEDY)
-    if isinstance(recipe, Recipe) and not isinstance(recipe.shading, ShadingModel):
+    if not isinstance(recipe.shading, ShadingModel):
         found = repr(recipe.shading)
         raise PolarguideError(f"{where} (shading)", expected="a ShadingModel", found=found, remedy=_REMEDY)
     _check_values(recipe, where, "")

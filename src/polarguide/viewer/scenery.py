@@ -17,7 +17,6 @@ from polarguide.geometry.scene_frame import SceneFrame
 from polarguide.raster.interface import Rasterize
 from polarguide.results.rendering.picking import SurfacePoint, surface_at
 from polarguide.results.rendering.relight import RELIT_RESOLUTION, turned_cubemap
-from polarguide.runs.families import AnyTrainer
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
@@ -33,11 +32,6 @@ from polarguide.visualization.layers import (
     layer_scale,
     polarization_picture,
 )
-from polarguide_bench.gnerp.model import FieldModel
-from polarguide_bench.gnerp.trainer import FieldTrainer
-
-FIELD_SHARE = 4
-"""A field is shown with so many times fewer pixels each way: it takes seconds for a picture of full size."""
 
 
 class Scenery(Protocol):
@@ -129,48 +123,10 @@ class GaussianScenery:
         return {**self.light, cubemap.name: turned}
 
 
-@dataclass(frozen=True, eq=False)
-class FieldScenery:
-    """A field to be rendered, at a quarter of the size. status: a line about it."""
-
-    model: FieldModel
-    status: str
-
-    def render(
-        self,
-        camera: Camera,
-        *,
-        depth: bool,
-        surface: bool = False,
-        within: Callable[[Tensor], Tensor] | None = None,
-        turn: Tensor | None = None,
-    ) -> RenderResult:
-        """All layers, on the CPU: see ``GaussianScenery.render``. There is no light from afar to be turned."""
-        small = [max(1, size // FIELD_SHARE) for size in (camera.width, camera.height)]
-        view = replace(
-            camera,
-            width=small[0],
-            height=small[1],
-            fx=camera.fx * small[0] / camera.width,
-            fy=camera.fy * small[1] / camera.height,
-            cx=camera.cx * small[0] / camera.width,
-            cy=camera.cy * small[1] / camera.height,
-        )
-        return (
-            self.model.render(view, depth=depth, within=within).to("cpu").resized(camera.width, camera.height)
-        )
-
-    def stokes(self, result: RenderResult, camera: Camera) -> None:
-        """It predicts none."""
-
-
 def run_scenery(run: OpenedRun) -> Scenery:
     """A trained run."""
     model = run.model
     status = f"{run.recipe.name}, {run.steps:,} steps; {model.size}"
-    if isinstance(model, FieldModel):
-        return FieldScenery(model, f"{status}; shown at a quarter of the size")
-    model = run.gaussian_model("view")
     return GaussianScenery(
         model.state.gaussians,
         model.light,
@@ -182,14 +138,9 @@ def run_scenery(run: OpenedRun) -> Scenery:
     )
 
 
-def training_scenery(trainer: AnyTrainer) -> Scenery:
+def training_scenery(trainer: AngleTrainer) -> Scenery:
     """A training as it is between two steps, Gaussians shaded as in its present stage."""
     steps = trainer.settings.steps
-    if isinstance(trainer, FieldTrainer):
-        model = FieldModel(trainer.state, trainer.recipe, trainer.state.field.distances.device, trained=False)
-        status = f"{trainer.recipe.name}, step {trainer.state.step:,} of {steps:,}"
-        return FieldScenery(model, f"{status}; shown at a quarter of the size")
-    assert isinstance(trainer, AngleTrainer)
     state = trainer.state
     stage = trainer.schedule.at(min(state.step, steps - 1)).stage
     progress = f"step {state.step:,} of {steps:,} ({stage.name})"

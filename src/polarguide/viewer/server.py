@@ -340,7 +340,7 @@ def paintable_run(run: OpenedRun) -> Paintable | None:
     """What can be painted over a run; None where its recipe tells no metals."""
     if not run.model.shading.knows_metals:
         return None
-    model, scene = run.gaussian_model("view"), run.scene
+    model, scene = run.model, run.scene
     gaussians, rasterize = model.state.gaussians, model.backend.rasterize
     kinds = {name: number for number, name in enumerate(KINDS)}
     kinds |= {f"dielectric of index {index:g}": number for number, index in sorted(scene.indices.items())}

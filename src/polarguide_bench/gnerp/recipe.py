@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from polarguide.training.recipe import Method
+from polarguide.training.recipe import values_differ
 
 Representation = Literal["grids", "networks"]
 
@@ -100,7 +101,7 @@ class FieldRates:
 
 
 @dataclass(frozen=True)
-class NeuralRecipe(Method):
+class NeuralRecipe:
     """A method that learns a field.
 
     Attributes:
@@ -128,3 +129,7 @@ class NeuralRecipe(Method):
         """All values as plain JSON types, for a run's folder."""
         plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return plain
+
+    def differs(self, data: Mapping[str, Any]) -> bool:
+        """True where a value differs from the one that a run's folder records."""
+        return values_differ(self.data(), data)

@@ -9,18 +9,19 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 import polarguide
 from polarguide import _native, optics
-from polarguide.capture import View
+from polarguide.capture import Scene, View
 from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import peak_memory_mib
+from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 from polarguide.optics.color import shown
 from polarguide.results.evaluation.mesh import mesh_scores
@@ -28,15 +29,13 @@ from polarguide.results.evaluation.metrics import HAZE_DEPTH, Selection, normal_
 from polarguide.results.evaluation.record import METRICS_FILE, code_digest, commit, write_metrics
 from polarguide.results.evaluation.scores import ErrorsByObject, ViewScores, score_view
 from polarguide.results.evaluation.target import SceneFacts, ViewTarget
-from polarguide.results.rendering.mesh import RESOLUTION, Surface, fused_surface, implicit_surface
-from polarguide.runs.folder import RunLog
-from polarguide.runs.opened import OpenedRun
+from polarguide.results.rendering.mesh import RESOLUTION, Surface, fused_surface
+from polarguide.runs.folder import RunConfiguration, RunLog
 from polarguide.runs.stopwatch import Stopwatch
 from polarguide.shading.result import RenderResult
 from polarguide.training.angles.fit import fit_angle
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture, contact_sheet
-from polarguide_bench.gnerp.model import FieldModel
 
 ERRORS_FILE = "errors.png"
 MOST_VIEWS = 8
@@ -217,12 +216,70 @@ HELD_MORE = "the process had held more memory before it scored"
 NOT_ALONE = "other work ran on the machine meanwhile"
 
 
-def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT) -> dict[str, Any]:
+class ScoredModel(Protocol):
+    """A trained model as far as scores need it; see ``runs.model.GaussianModel``."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where it renders."""
+
+    @property
+    def gaussians(self) -> int | None:
+        """Number of Gaussians; None for another representation."""
+
+    def render(
+        self, camera: Camera, *, normals: bool = True, depth: bool = False, surface: bool = False
+    ) -> RenderResult:
+        """Render all layers."""
+
+    def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
+        """Predict Stokes vectors; None where the model predicts none."""
+
+    def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
+        """Share of each pixel's alpha nearer than a depth."""
+
+
+class ScoredRun(Protocol):
+    """A run as far as scores need it; see ``runs.opened.OpenedRun``."""
+
+    @property
+    def folder(self) -> Path:
+        """The run folder."""
+
+    @property
+    def configuration(self) -> RunConfiguration:
+        """The record of the run."""
+
+    @property
+    def model(self) -> ScoredModel:
+        """The trained model."""
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+
+    @property
+    def steps(self) -> int:
+        """Number of trained steps."""
+
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """Cameras of the scene's views by name."""
+
+
+def evaluate(
+    run: ScoredRun,
+    *,
+    speed: bool = False,
+    surface: Callable[[], Surface] | None = None,
+    reporter: Reporter = SILENT,
+) -> dict[str, Any]:
     """Score a run's test views and write ``metrics.json`` and ``errors.png`` into its folder.
 
     Args:
         run: the run; only its layers are used.
         speed: whether to measure frames a second, which makes sense only while nothing else runs.
+        surface: computes the surface for mesh scores; None: depth maps are fused.
         reporter: receives progress.
 
     Returns:
@@ -256,7 +313,7 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
     sheet.write(run.folder / ERRORS_FILE)
     memory = _peak(held_before)  # before the mesh, which is no part of what a run needs
     with reporter.track("measuring the mesh"):
-        mesh = mesh_scores(lambda: _surface(run), tests)
+        mesh = mesh_scores(surface or (lambda: _fused(run)), tests)
     objects, materials = by_object.records()
     seconds, alone = RunLog(run.folder).elapsed()
     fps = _speed(run, normals=False) if speed else None
@@ -281,7 +338,7 @@ def evaluate(run: OpenedRun, *, speed: bool = False, reporter: Reporter = SILENT
 
 
 def _score(
-    run: OpenedRun, view: View, facts: SceneFacts, by_object: ErrorsByObject, sheet: ErrorSheet
+    run: ScoredRun, view: View, facts: SceneFacts, by_object: ErrorsByObject, sheet: ErrorSheet
 ) -> ViewScores:
     """Score a view; its errors are added to those by object, and its pictures to the sheet."""
     # First what is known of it: copied later, it would have to wait until the rendering is done.
@@ -307,17 +364,15 @@ def _peak(before: float | None) -> dict[str, Any]:
     return {"peak_memory_mib": peak, "peak_memory_mib_reason": None}
 
 
-def _surface(run: OpenedRun) -> Surface:
-    """The surface that mesh scores measure: the zero set of a field, the fused depths of Gaussians."""
-    if isinstance(run.model, FieldModel):
-        return implicit_surface(run.cameras, run.model, resolution=RESOLUTION)
-    fused, _, _ = fused_surface(
+def _fused(run: ScoredRun) -> Surface:
+    """The surface that the depth maps of all views give."""
+    surface, _, _ = fused_surface(
         run.cameras, lambda camera: run.model.render(camera, depth=True, surface=True), resolution=RESOLUTION
     )
-    return fused
+    return surface
 
 
-def _speed(run: OpenedRun, *, normals: bool = True, depth: bool = False) -> float | None:
+def _speed(run: ScoredRun, *, normals: bool = True, depth: bool = False) -> float | None:
     def draw(view: View) -> None:
         run.model.render(view.camera, normals=normals, depth=depth)
         if run.model.device.type == "cuda":
@@ -331,7 +386,7 @@ def _device(device: torch.device) -> str:
     return f"{device} ({name}, {_native.thread_count()} threads)"
 
 
-def _provenance(run: OpenedRun) -> dict[str, Any]:
+def _provenance(run: ScoredRun) -> dict[str, Any]:
     configuration = run.configuration
     return {
         "recipe": configuration.recipe,

@@ -49,7 +49,7 @@ from polarguide.results.export.presented import Presented
 from polarguide.results.export.splat_glb import COLOR_SPACES, Encoding, write_splat_glb
 from polarguide.results.export.splats import write_sog, write_spz
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
-from polarguide.results.rendering.mesh import RESOLUTION, implicit_mesh, scene_mesh
+from polarguide.results.rendering.mesh import RESOLUTION, scene_mesh
 from polarguide.results.rendering.relight import (
     mirrored_light,
     needs_radiance,
@@ -60,7 +60,6 @@ from polarguide.results.rendering.relight import (
 from polarguide.runs.model import write_run_ply
 from polarguide.runs.opened import OpenedRun
 from polarguide.visualization import figures
-from polarguide_bench.gnerp.model import FieldModel
 
 PANORAMA_HEIGHT = 512
 SPLATS = ("ply", "spz", "sog", "splat-glb", "splat-usdz", "points")
@@ -129,8 +128,6 @@ def export(
     if fields != "release" and format != "ply":
         expected = "release, but for --format ply"
         raise PolarguideError("fields", expected=expected, found=fields, remedy="Leave it out.")
-    if format in SPLATS:
-        run.gaussian_model(f"format {format}")
     # Formats without Gaussians print no number of them.
     heard = SILENT if format in ("environment", "cameras") else reporter
     presented = Presented(run, axes=axes, masked=model.masked, reporter=heard)
@@ -157,7 +154,7 @@ def _ply(
 ) -> Path:
     with temporary_folder(path.with_suffix(".whole")) as folder:
         whole = folder / path.name
-        model = run.gaussian_model("format ply")
+        model = run.model
         color = presented.presentation.color
         write_run_ply(
             whole,
@@ -216,10 +213,7 @@ def _splat_usdz(run: OpenedRun, presented: Presented, path: Path) -> list[Path]:
 def _mesh(
     run: OpenedRun, presented: Presented, folder: Path, resolution: int, reporter: Reporter
 ) -> list[Path]:
-    if isinstance(run.model, FieldModel):
-        mesh = implicit_mesh(run.cameras, run.model, resolution=resolution)
-    else:
-        mesh = scene_mesh(run.cameras, presented.surface_view(run, "format mesh"), resolution=resolution)
+    mesh = scene_mesh(run.cameras, presented.surface_view(run, "format mesh"), resolution=resolution)
     mesh = mesh.within(presented.subject.holds(torch.from_numpy(mesh.surface.vertices)).numpy())
     colors = colored(torch.from_numpy(mesh.colors), presented.presentation.color).clamp(max=1)
     mesh = replace(mesh, colors=colors.numpy())
@@ -343,7 +337,7 @@ def _all(
 
 
 def _points(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
-    path, model, placement = folder / "points.ply", run.gaussian_model("format points"), presented.placement
+    path, model, placement = folder / "points.ply", run.model, presented.placement
     assert presented.gaussians is not None
     views, rasterize = run.scene.views, model.backend.rasterize
     places, normals, linear = surface_points(presented.gaussians, model.shading, views, rasterize)

@@ -114,7 +114,7 @@ class Presented:
 
     def surface_view(self, run: OpenedRun, what: str) -> Callable[[Camera], RenderResult]:
         """Renders a view of the Gaussians of the subject, with the surface at the median depth."""
-        model = run.gaussian_model(what)
+        model = run.model
         gaussians = self.gaussians
         assert gaussians is not None
 

@@ -51,7 +51,7 @@ def share(
         raise PolarguideError(
             "out", expected="a name that ends in .html", found=str(path), remedy="Choose such a name."
         )
-    model = run.gaussian_model("share")
+    model = run.model
     views = run.scene.test_views + run.scene.train_views
     presented = Presented(run, reporter=reporter)
     assert presented.gaussians is not None

@@ -135,7 +135,7 @@ def path_cameras(
 
 
 def _turntable(run: OpenedRun, cameras: list[Camera], frames: int) -> list[Camera]:
-    means = run.gaussian_model("turntable").state.gaussians["means"].detach()
+    means = run.model.state.gaussians["means"].detach()
     inner = means[subject_of(run).holds(means)].cpu().double()
     center = inner.median(dim=0).values
     radius = float((inner - center).norm(dim=1).quantile(FILLED))

@@ -20,7 +20,6 @@ from polarguide.geometry.camera import Camera, seen_at
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.vectors import dot, unit
 from polarguide.shading.result import RenderResult
-from polarguide_bench.gnerp.model import FieldModel
 
 TRUNCATION = 4.0  # voxels
 _SLAB = 1 << 21  # voxels at a time
@@ -235,50 +234,6 @@ def fused_surface(
 def _some(points: Tensor, count: int) -> Tensor:
     """At most ``count`` of points [M, 3], evenly."""
     return points[:: max(1, -(-len(points) // count))].clone()
-
-
-def implicit_surface(cameras: Mapping[str, Camera], model: FieldModel, *, resolution: int) -> Surface:
-    """The zero set of a model's distance, where at least two cameras may see it: nearer than their own distance.
-
-    Args:
-        cameras: at least two. model: model of the run. resolution: voxels along the longest side.
-
-    Raises:
-        PolarguideError: there is no surface, or a library is missing.
-    """
-    optional_import("skimage.measure", "a mesh")
-    around = scene_frame(list(cameras.values()))
-    reach = around.distance
-    coarse = 2 * reach / COARSE
-    whole = Box(around.center - reach, coarse, (COARSE, COARSE, COARSE))
-    places, distance = _sampled(whole, model)
-    near = places[(distance.abs() < coarse) & (_in_pictures(cameras, places) >= 2)]
-    box = box_around([near], around.center, reach, resolution)
-    places, distance = _sampled(box, model)
-    counts = _in_pictures(cameras, places)
-    return surface_of(box, distance, counts)
-
-
-def implicit_mesh(cameras: Mapping[str, Camera], model: FieldModel, *, resolution: int) -> ColoredMesh:
-    """``implicit_surface`` with the model's own normals and colors; see there."""
-    surface = implicit_surface(cameras, model, resolution=resolution)
-    normals, colors = model.surface(torch.from_numpy(surface.vertices))
-    return ColoredMesh(Surface(surface.vertices, surface.faces, normals.numpy()), colors.clamp(0, 1).numpy())
-
-
-def _sampled(box: Box, model: FieldModel) -> tuple[Tensor, Tensor]:
-    """Places [X, Y, Z, 3] of a box's voxels, and the distances [X, Y, Z] there."""
-    x, y, z = (box.low[k] + box.size * (torch.arange(n) + 0.5) for k, n in enumerate(box.counts))
-    return torch.stack(torch.meshgrid(x, y, z, indexing="ij"), dim=-1), model.lattice((x, y, z))
-
-
-def _in_pictures(cameras: Mapping[str, Camera], places: Tensor) -> Tensor:
-    """How many cameras have places [..., 3] in their pictures, hidden ones included: [...]."""
-    counts = torch.zeros(places.shape[:-1])
-    for camera in cameras.values():
-        for part, count in zip(places, counts, strict=True):
-            count += seen_at((part - camera.center).view(-1, 3), camera)[2].view(count.shape)
-    return counts
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from polarguide.core.records import to_json
 from polarguide.geometry.camera import Camera
 from polarguide.optics import luminance
 from polarguide.results.rendering.relight import write_exr
+from polarguide.runs.model import Within
 from polarguide.runs.opened import OpenedRun, checked_layers
 from polarguide.shading.result import POLARIZED, RenderResult
 from polarguide.visualization import figures
@@ -35,7 +36,6 @@ from polarguide.visualization.layers import (
     true_depths,
     true_name,
 )
-from polarguide_bench.gnerp.model import Within
 
 SHEET_VIEWS = 8
 CONTACT_SHEET = "contact_sheet.png"

@@ -15,9 +15,8 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import Reporter
 from polarguide.core.text import command
 from polarguide.geometry.camera import Camera, seen_at
-from polarguide.runs.model import GaussianModel
+from polarguide.runs.model import GaussianModel, Within
 from polarguide.runs.opened import OpenedRun
-from polarguide_bench.gnerp.model import Within
 
 Inside = Callable[[NDArray[Any]], NDArray[np.bool_]]
 """Which places [N, 3] of the scene belong to the subject."""

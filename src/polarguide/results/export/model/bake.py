@@ -99,7 +99,7 @@ def bake(
         color: the layer, or the photographs. voxel: side of those that the surface was fused in.
         reporter: receives progress.
     """
-    model = run.gaussian_model("a textured model")
+    model = run.model
     points, facing = torch.from_numpy(places), torch.from_numpy(normals)
     total = torch.zeros(len(points), sum(CHANNELS.values()))
     weights = torch.zeros(len(points))

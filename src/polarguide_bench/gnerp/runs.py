@@ -1,0 +1,208 @@
+"""Runs of a field: training, resuming and opening. They have no viewer, no export and no page."""
+
+from __future__ import annotations
+
+import os
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from polarguide.capture import Scene
+from polarguide.capture.variants import mask_background, select_exposures
+from polarguide.core.errors import PolarguideError
+from polarguide.core.options import DeviceName, PathLike, SceneOptions, SessionOptions, index_of
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.system import MemoryBound, return_freed_memory
+from polarguide.geometry.camera import Camera
+from polarguide.raster import choose_backend, use_threads
+from polarguide.results.rendering.mesh import RESOLUTION, Surface
+from polarguide.runs.folder import CHECKPOINT, RunConfiguration, checkpoint_tensors, writing_to
+from polarguide.runs.loop import Ends, TrainingLoop
+from polarguide.runs.memory_plan import pixels_of
+from polarguide.runs.opened import read_scene
+from polarguide.runs.train import (
+    check_same_run,
+    check_step,
+    check_trainable,
+    ignored_filters,
+    resources_used,
+    unsuitable_folder,
+    view_store,
+)
+from polarguide.training.settings import ResolvedSettings, TrainSettings
+from polarguide_bench.gnerp.memory import plan_field_memory
+from polarguide_bench.gnerp.model import FieldModel
+from polarguide_bench.gnerp.recipe import NeuralRecipe
+from polarguide_bench.gnerp.state import FieldState
+from polarguide_bench.gnerp.surface import implicit_surface
+from polarguide_bench.gnerp.trainer import FieldTrainer
+
+
+@dataclass(frozen=True, eq=False)
+class FieldRun:
+    """A trained run of a field, as far as a comparison scores and shows it.
+
+    Attributes:
+        folder: the run folder. configuration: its record. recipe: the method. model: the trained field.
+    """
+
+    folder: Path
+    configuration: RunConfiguration
+    recipe: NeuralRecipe
+    model: FieldModel
+
+    @property
+    def steps(self) -> int:
+        """Number of trained steps."""
+        return self.model.steps
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene of the training, read on first use.
+
+        Raises:
+            PolarguideError: the scene cannot be read.
+        """
+        configuration = self.configuration
+        reading = SceneOptions(configuration.downscale, configuration.transfer, split="every-8th")
+        whole = read_scene(configuration.scene, reading, SILENT, configuration.test_views)
+        return _trained_on(whole, configuration.settings)
+
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """Cameras of the scene's views by name."""
+        return {view.name: view.camera for view in self.scene.views}
+
+    def surface(self) -> Surface:
+        """The zero set of the signed distance, for mesh scores.
+
+        Raises:
+            PolarguideError: there is no surface.
+        """
+        return implicit_surface(self.cameras, self.model, resolution=RESOLUTION)
+
+
+def train_field(
+    scene: PathLike,
+    out: PathLike,
+    *,
+    recipe: NeuralRecipe,
+    settings: TrainSettings,
+    session: SessionOptions = SessionOptions(),
+    reading: SceneOptions = SceneOptions(),
+    resume: bool = False,
+    reporter: Reporter = SILENT,
+    should_stop: Ends = lambda: False,
+) -> FieldRun:
+    """Train a field on a scene, into a run folder.
+
+    Args:
+        scene: the scene folder. out: folder to write. recipe: the method.
+        settings: steps, seed and other settings of the training.
+        session: device, threads, and how often the state is saved. reading: how the scene is read.
+        resume: go on with the run in ``out``, to the same result.
+        reporter: receives progress. should_stop: asked between steps.
+
+    Raises:
+        PolarguideError: wrong input, a folder that does not suit, or a loss that is not finite.
+        TrainingStopped: ``should_stop`` returned true; the state is saved.
+    """
+    out = Path(out)
+    use_threads(session.threads)
+    if problem := unsuitable_folder(out, resume):
+        raise problem
+    backend = choose_backend(session.device, say=reporter.say)
+    plan = plan_field_memory(pixels_of(Path(scene), reading.downscale), recipe, limit=reading.memory)
+    earlier = RunConfiguration.load(out) if resume else None
+    whole = read_scene(scene, reading, reporter, hold=plan.hold)
+    resolved = resolve_field(settings, whole, recipe, None if earlier is None else earlier.settings)
+    loaded = _trained_on(whole, resolved)
+    check_trainable(loaded)
+    configuration = RunConfiguration.of(loaded, recipe, resolved, backend.device)
+    if not all(view.is_determined for view in loaded.train_views):
+        reporter.warn(ignored_filters(recipe.name))
+    return_freed_memory()  # of decoded files
+    with writing_to(out), closing(view_store(plan, backend, out, reporter)) as store:
+        state = None
+        if earlier is not None:
+            check_same_run(earlier, configuration, out)
+            if os.path.lexists(out / CHECKPOINT):
+                state = load_field(out, recipe, backend.device)
+                check_step(state.step, resolved, out)
+        trainer = FieldTrainer(loaded, recipe, resolved, backend.device, state, store)
+        configuration.save(out)
+        loop = TrainingLoop(trainer, out, session, reporter, should_stop, None, MemoryBound(plan.peak))
+        seconds = loop.run()
+    reporter.say(resources_used(seconds, plan.peak))
+    return FieldRun(out, configuration, recipe, FieldModel(trainer.state, recipe, backend.device))
+
+
+def open_field(folder: PathLike, recipe: NeuralRecipe, *, device: DeviceName = "auto") -> FieldRun:
+    """Open the run of a field.
+
+    Raises:
+        PolarguideError: the folder is no run, is damaged, or belongs to another recipe.
+    """
+    folder = Path(folder)
+    configuration = RunConfiguration.load(folder)
+    backend = choose_backend(device)
+    state = load_field(folder, recipe, backend.device)
+    return FieldRun(folder, configuration, recipe, FieldModel(state, recipe, backend.device))
+
+
+def load_field(folder: Path, recipe: NeuralRecipe, device: torch.device | str = "cpu") -> FieldState:
+    """Read the state of a field's training.
+
+    Raises:
+        PolarguideError: there is no checkpoint, or it is damaged.
+    """
+    with checkpoint_tensors(folder) as tensors:
+        return FieldState.from_tensors(tensors, recipe, device)
+
+
+def resolve_field(
+    settings: TrainSettings,
+    scene: Scene,
+    recipe: NeuralRecipe,
+    resumed: ResolvedSettings | None = None,
+) -> ResolvedSettings:
+    """The settings of a field's training, with nothing left open.
+
+    Args:
+        settings: as specified. scene, recipe: those of the training.
+        resumed: settings of the run that is resumed, which come before those of the scene.
+
+    Raises:
+        PolarguideError: a setting that means nothing for a field.
+    """
+    recorded: dict[str, Any] = {} if resumed is None else resumed.specified()
+    values: dict[str, Any] = {
+        **vars(settings),
+        "steps": recipe.steps,
+        "refractive_index": index_of(None, scene.refractive_index),
+        "views_per_step": 1,
+        "gaussians": 0,
+        **{name: recorded[name] for name in ("steps", "refractive_index") if name in recorded},
+        **settings.specified(),
+    }
+    if values["background"] == "auto":
+        values["background"] = "scene"
+    for name, most in (("gaussians", 0), ("views_per_step", 1)):
+        if values[name] > most:
+            raise PolarguideError(
+                name,
+                expected=f"{most} with the recipe {recipe.name}, a field",
+                found=str(values[name]),
+                remedy="Leave it out.",
+            )
+    return ResolvedSettings(**values)
+
+
+def _trained_on(scene: Scene, settings: ResolvedSettings) -> Scene:
+    """The scene with the pictures and the background that the training uses."""
+    chosen = select_exposures(scene, settings.exposures)
+    return mask_background(chosen) if settings.background == "masked" else chosen
