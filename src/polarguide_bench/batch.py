@@ -22,7 +22,6 @@ from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.record import read_metrics
 from polarguide.results.evaluation.table import COLUMNS, Metric
 from polarguide.runs.folder import CHECKPOINT, RunConfiguration
-from polarguide.runs.health import recorded_health
 from polarguide.training.settings import TrainSettings
 from polarguide.visualization.pages import page
 from polarguide_bench.children import STDERR
@@ -43,6 +42,7 @@ from polarguide_bench.compare import locked
 from polarguide_bench.job_queue import Job, run_jobs, training_progress
 from polarguide_bench.options import BatchOptions
 from polarguide_bench.plan import jobs_at_a_time, own_gpus
+from polarguide_bench.report import recorded_health
 from polarguide_bench.tables import csv_text, formatted
 
 PAGE, TABLE = "index.html", "results.csv"

@@ -30,7 +30,9 @@ if TYPE_CHECKING:
     from distributed import Worker
 
 
-PACKAGE = Path(__file__).parents[1]
+SOURCES = Path(__file__).parents[1]
+"""The folder of all packages."""
+PACKAGES = ("polarguide", "polarguide_shots", "polarguide_synth", "polarguide_bench")
 PROLOGUE = (
     "import gc, sys; gc.disable(); "  # while names are imported, which stay: a fifth of the seconds
     "sys.path[:] = [path for path in sys.path if path]; "  # what is empty is the current folder
@@ -38,17 +40,16 @@ PROLOGUE = (
     "from polarguide_bench.worker import main; gc.enable(); sys.exit(main())"
 )
 """What a child runs: it imports this package from where it is here, and nothing from the current folder."""
-COMMAND = (sys.executable, "-c", PROLOGUE, str(PACKAGE.parent))
+COMMAND = (sys.executable, "-c", PROLOGUE, str(SOURCES))
 
 
 @cache
 def files_digest() -> str:
-    """Sixteen hexadecimal digits that change with any byte of this package's code."""
+    """Sixteen hexadecimal digits that change with any byte of the code of all packages."""
     digest = hashlib.sha256()
-    for path in sorted(
-        (*PACKAGE.rglob("*.py"), *PACKAGE.glob("_native.*.so"), *PACKAGE.glob("_native.*.pyd"))
-    ):
-        digest.update(f"{path.relative_to(PACKAGE).as_posix()} {path.stat().st_size}\n".encode())
+    kinds = ("**/*.py", "_native.*.so", "_native.*.pyd")
+    for path in sorted(path for name in PACKAGES for kind in kinds for path in (SOURCES / name).glob(kind)):
+        digest.update(f"{path.relative_to(SOURCES).as_posix()} {path.stat().st_size}\n".encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -13,10 +13,10 @@ from typing import Any
 
 from polarguide import __version__
 from polarguide.capture.layout import refuse_scene
-from polarguide.capture.variants import count_of
+from polarguide.capture.variants import EVERY
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import check_out, make_folder, require_inside, write_text
-from polarguide.core.options import MOST, ComputeOptions, PathLike, check_choice, check_count
+from polarguide.core.options import MOST, ComputeOptions, Exposures, PathLike, check_choice, check_count
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import decode
 from polarguide.core.system import only_writer
@@ -409,3 +409,12 @@ def _write_charts(comparison: Comparison, scenes: Sequence[SceneEntry], results:
     for name, text in drawn.items():
         if text is not None:
             write_text(comparison.out / name, text)
+
+
+def count_of(exposures: Exposures, views: int) -> int:
+    """How many pictures ``select_exposures`` leaves of a number of training views with four each."""
+    each = {"three": 3, "two": 2, "one": 1, "unknown": 1, "none": 1}
+    fourth = -(-views // EVERY)
+    if exposures == "mixed":
+        return views + 3 * fourth
+    return 4 * fourth if exposures == "sparse" else each.get(exposures, 4) * views

@@ -7,6 +7,7 @@ and whatever changes gets a folder of its own.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import os
 import shlex
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from safetensors import SafetensorError, safe_open
 
 from polarguide import __version__
 from polarguide.capture import View
@@ -26,21 +28,13 @@ from polarguide.core.options import Exposures, SceneOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import free_memory
 from polarguide.raster import Backend
-from polarguide.results.evaluation.record import code_digest, model_digest, read_metrics
+from polarguide.results.evaluation.record import PACKAGE, _digest, code_digest, read_metrics
 from polarguide.results.evaluation.target import SceneFacts
-from polarguide.runs.folder import (
-    CHECKPOINT,
-    CONFIGURATION,
-    PLY,
-    RunConfiguration,
-    compared_steps,
-    trained_steps,
-)
-from polarguide.runs.memory_plan import pixels_of
+from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, PLY, RunConfiguration, most_gaussians
+from polarguide.runs.memory_plan import pixels_of, plan_memory
 from polarguide.runs.opened import read_scene
-from polarguide.runs.train import expected_memory
 from polarguide.training.recipe import Recipe
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import STEPS, TrainSettings
 from polarguide_bench.gnerp.memory import plan_field_memory
 from polarguide_bench.options import ClusterOptions, CompareOptions
 from polarguide_bench.recipes import AnyRecipe, ablations_of
@@ -356,3 +350,45 @@ def jobs_at_a_time(options: ClusterOptions, count: int, memory: int, gpus: Seque
     if free is not None and memory:
         room = min(room, int(SHARE * free) // memory)
     return max(1, min(room, count))
+
+
+def trained_steps(run: Path) -> int | None:
+    """Number of training steps completed at a run's checkpoint.
+
+    None if the run has no checkpoint, or if the checkpoint does not record the number.
+    """
+    try:
+        with safe_open(run / CHECKPOINT, framework="pt") as file:
+            record = (file.metadata() or {}).get("polarguide", "")
+        return int(record.rpartition(" ")[2])
+    except (SafetensorError, OSError, ValueError):
+        return None
+
+
+def compared_steps(*specified: int | None) -> int:
+    """Steps of a run of a comparison: the first number that was specified, else ``STEPS``.
+
+    They do not follow from the size of the pictures: scenes are compared.
+    """
+    return next((steps for steps in specified if steps is not None), STEPS)
+
+
+def expected_memory(
+    pixels: Sequence[int], recipe: Recipe, settings: TrainSettings, reading: SceneOptions
+) -> int:
+    """Bytes that the process of a training takes at most, as far as headers tell.
+
+    Args:
+        pixels: of each view, as ``memory_plan.pixels_of`` reads them. recipe, settings, reading: of the training.
+
+    Raises:
+        PolarguideError: the limit in ``reading`` is too small.
+    """
+    gaussians = most_gaussians(sum(pixels), recipe, settings, None)
+    return plan_memory(pixels, recipe, gaussians, limit=reading.memory).peak
+
+
+def model_digest(kind: type) -> str:
+    """Digest of the file that defines a plug-in's shading model; empty for models of this package."""
+    file = Path(inspect.getfile(kind))
+    return "" if PACKAGE in file.parents else _digest(file.parent, [file])

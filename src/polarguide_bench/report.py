@@ -21,26 +21,18 @@ from numpy.typing import NDArray
 
 from polarguide.capture import Scene, View
 from polarguide.capture.ground_truth import METAL_CLASSES
+from polarguide.core.errors import PolarguideError
 from polarguide.core.files import write_text
 from polarguide.core.progress import Reporter
 from polarguide.results.evaluation.metrics import normal_angles_deg
 from polarguide.results.evaluation.table import COLUMNS, Metric
 from polarguide.runs.folder import RunLog
-from polarguide.runs.health import recorded_health
+from polarguide.runs.health import Health
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.visualization import figures
 from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture
-from polarguide.visualization.pages import (
-    BASE,
-    LAYERS,
-    EmbeddedView,
-    Tile,
-    chosen_views,
-    embed,
-    page,
-    page_part,
-    templates,
-)
+from polarguide.visualization.pages import BASE, LAYERS, page, page_part, templates
+from polarguide_bench.embedding import EmbeddedView, Tile, chosen_views, embed
 from polarguide_bench.gnerp.runs import FieldRun
 from polarguide_bench.opened import open_compared
 from polarguide_bench.plan import Comparison, PlannedRun, SceneEntry
@@ -452,3 +444,15 @@ def _facts(results: Results) -> dict[str, str]:
         views = f"{scene.views} views, test: {', '.join(scene.test_views)}"
         stated[f"scene {scene.name}"] = f"{views}; digest {scene.digest[:16]}{index}"
     return stated
+
+
+def recorded_health(run: Path) -> tuple[str | None, tuple[str, ...]]:
+    """What ``health.json`` says of a run's polarization, None where it says nothing, and its warnings.
+
+    A damaged file is a warning: other runs are not concerned.
+    """
+    try:
+        health = Health.load(run)
+    except PolarguideError as error:
+        return None, (str(error),)
+    return (None, ()) if health is None else (health.polarization.text, health.warnings)

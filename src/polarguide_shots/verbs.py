@@ -1,4 +1,4 @@
-"""Verbs of shots without poses and of the camera: measure, priors, calibrate."""
+"""Verbs of shots without poses and of the camera: measure, priors, calibrate, scale."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ import tyro
 import polarguide
 from polarguide.cli.console import ConsoleReporter, console, print_error, say, use_threads
 from polarguide.core.errors import PolarguideError
-from polarguide.core.options import SceneOptions, ThreadOptions
+from polarguide.core.files import make_folder, read_file, write_whole
+from polarguide.core.options import SceneOptions, ThreadOptions, check_finite
 from polarguide.core.records import option_name
 from polarguide.core.system import StopSignals
 from polarguide.preparation.settings import CalibrationOptions
 from polarguide_shots.calibration.settings import CalibrateSettings
 from polarguide_shots.options import MeasureOptions, ShotOptions, WatchOptions
+from polarguide_shots.ring_scale import ring_scale
 
 
 def measure(
@@ -240,3 +242,25 @@ def calibrate(
     say(f"calibration: {outcome.path}   picture: {outcome.picture}")
     option = f"--sensor {settings.sensor} --calibration {shlex.quote(str(outcome.path))}"
     say(f"next: polarguide prepare RAW --out SCENE {option}")
+
+
+def scale(*, diameter: float, out: Path = Path("filter-scale.svg")) -> None:
+    """Print a scale of angles for the ring of a polarizing filter: an SVG file in exact millimeters.
+
+    The paper ring is fixed to the lens around the filter's turning ring and read from the front, where angles count
+    clockwise: as prepare reads them, they count counter-clockwise from behind the camera. docs/how-to/capture.md says
+    how to use it.
+
+    Args:
+        diameter: Outer diameter of the filter's turning ring in mm: measure it (a 67 mm filter has about 70).
+        out: SVG file to write.
+    """
+    check_finite("diameter", diameter, 20.0, 160.0)
+    data = ring_scale(diameter).encode()
+    if out.exists() and (out.is_dir() or read_file(out) != data):
+        raise PolarguideError(
+            out, expected="a new file", found="a file with other contents", remedy="Give another --out."
+        )
+    make_folder(out.parent)
+    write_whole(out, data)
+    console.print(f"scale: {out} (print at 100 %, and measure the 50 mm line)", markup=False)

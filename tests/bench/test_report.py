@@ -18,7 +18,8 @@ from comparison_records import part, results, run, unfinished
 
 from polarguide.capture import GroundTruth, Scene
 from polarguide.capture.ground_truth import Material, SceneObject
-from polarguide.visualization.pages import Tile, chosen_views, data_uri, embed
+from polarguide.visualization.pages import data_uri
+from polarguide_bench.embedding import Tile, chosen_views, embed
 from polarguide_bench.report import Curve, _ground_truth_tile, report_html
 from polarguide_bench.results import Results
 from polarguide_bench.tables import sections

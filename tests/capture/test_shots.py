@@ -29,10 +29,10 @@ from polarguide.capture.filter.camera_files import (
     read_camera_raw,
     read_exposure_data,
 )
-from polarguide.capture.filter.ring_scale import BAND, place, ring_scale
 from polarguide.geometry.polarizer import malus
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
+from polarguide_shots.ring_scale import BAND, place, ring_scale
 from polarguide_synth.sensor import FilterShot, Sensor, behind_filter, exif_tags, filter_jpeg
 
 PLAIN = PrepareSettings(poses="none", gains="none", align=False)

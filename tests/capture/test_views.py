@@ -22,7 +22,6 @@ from polarguide.capture import box_filter as boxes
 from polarguide.capture.exposures import FOUR, PLAIN
 from polarguide.capture.variants import (
     SmallerViews,
-    count_of,
     empty_pixels,
     has_black_background,
     mask_background,
@@ -33,6 +32,7 @@ from polarguide.core.options import Exposures
 from polarguide.geometry.camera import Camera, look_at
 from polarguide.training.priors import view_priors
 from polarguide.training.recipe import Priors
+from polarguide_bench.compare import count_of
 from tests.helpers.tiny import make_scene
 
 

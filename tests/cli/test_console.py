@@ -19,7 +19,6 @@ from polarguide.cli.app import VERBS, function_of, options_of, run
 from polarguide.cli.console import (
     UNKNOWN_TIME,
     ConsoleReporter,
-    JobReporter,
     Lines,
     Rate,
     bars,
@@ -32,6 +31,7 @@ from polarguide.core.errors import PolarguideWarning
 from polarguide.core.text import printable
 from polarguide.results.evaluation import table
 from polarguide.results.evaluation.table import METRICS, OBJECT_METRICS
+from polarguide_bench.verbs.console import JobReporter
 
 HOSTILE = "\x1b[2J\x1b]0;mine\x07\u202e"
 

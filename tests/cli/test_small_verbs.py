@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from made_sensor import made_sensor, write_codes, write_polarizer_shots
 
-from polarguide.capture.filter.ring_scale import ring_scale
 from polarguide.cli.app import run
 from polarguide.core.errors import install_extra
 from polarguide.recipes import recipe_named
@@ -24,6 +23,7 @@ from polarguide.training.settings import TrainSettings
 from polarguide_bench.options import CompareOptions
 from polarguide_bench.plan import Comparison, plan_runs, scene_entries
 from polarguide_bench.record import read_results
+from polarguide_shots.ring_scale import ring_scale
 from polarguide_synth.schema import SceneSpec
 from polarguide_synth.settings import Variant, choose_variant
 

@@ -23,21 +23,13 @@ from polarguide.core.progress import SILENT
 from polarguide.geometry.camera import Camera
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
-from polarguide.runs.health import (
-    HEALTH,
-    Evidence,
-    Health,
-    Limits,
-    Polarization,
-    examine,
-    recorded_health,
-    warnings_of,
-)
+from polarguide.runs.health import HEALTH, Evidence, Health, Limits, Polarization, examine, warnings_of
 from polarguide.runs.model import GaussianModel
 from polarguide.shading.result import RenderResult
 from polarguide.training.angles.polarizers import Polarizers
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
+from polarguide_bench.report import recorded_health
 
 STOKES = RECIPES["polarguide-stokes"]
 BURNED = Path(__file__).parent / "burned"

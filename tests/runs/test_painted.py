@@ -15,10 +15,11 @@ import polarguide
 from polarguide.capture import load_scene
 from polarguide.core.options import SceneOptions
 from polarguide.recipes import RECIPES
-from polarguide.runs.folder import RunConfiguration, RunLog, trained_steps
+from polarguide.runs.folder import RunConfiguration, RunLog
 from polarguide.runs.painted import FOLDER, read_painted, write_painted
 from polarguide.training.metals.search import looks
 from polarguide.training.settings import TrainSettings
+from polarguide_bench.plan import trained_steps
 
 READING = SceneOptions(downscale=4)
 STEPS = 60

@@ -8,9 +8,9 @@ from plugins import install
 from toy_shading import TOY, SkyShading
 
 import polarguide
-from polarguide.results.evaluation.record import model_digest
 from polarguide.shading.deferred import DeferredShading
 from polarguide_bench.compare import ablated
+from polarguide_bench.plan import model_digest
 
 
 def test_a_recipe_object_goes_all_the_way(tmp_path: Path, demo_scene: Path) -> None:

@@ -164,15 +164,6 @@ def select_exposures(scene: Scene, exposures: Exposures) -> Scene:
     return replace(scene, views=tuple(view for view in views if view is not None))
 
 
-def count_of(exposures: Exposures, views: int) -> int:
-    """How many pictures ``select_exposures`` leaves of a number of training views with four each."""
-    each = {"three": 3, "two": 2, "one": 1, "unknown": 1, "none": 1}
-    fourth = -(-views // EVERY)
-    if exposures == "mixed":
-        return views + 3 * fourth
-    return 4 * fourth if exposures == "sparse" else each.get(exposures, 4) * views
-
-
 def _some(view: View, *places: int, known: bool = True) -> View:
     chosen = tuple(FOUR[place] if known else Exposure() for place in places)
     return view.changed(lambda codes: torch.stack([codes[place] for place in places]), chosen)

@@ -27,7 +27,7 @@ from polarguide.core.system import check_variables, interrupts
 VERBS = {
     "demo": ("polarguide.cli.runs", "demo"),
     "calibrate": ("polarguide_shots.verbs", "calibrate"),
-    "scale": ("polarguide.cli.captures", "scale"),
+    "scale": ("polarguide_shots.verbs", "scale"),
     "prepare": ("polarguide.cli.captures", "prepare"),
     "inspect": ("polarguide.cli.captures", "inspect"),
     "train": ("polarguide.cli.runs", "train"),

@@ -97,7 +97,7 @@ class Rate:
     """
 
     def __init__(self, total: int | None, clock: Callable[[], float] = time.monotonic) -> None:
-        self.total, self._clock = total, clock
+        self.total, self.clock = total, clock
         self._first: tuple[float, int] | None = None
 
     def left(self, done: int, total: int | None = None, seconds: float | None = None) -> float | None:
@@ -107,7 +107,7 @@ class Rate:
             done, total, seconds: see ``core.progress.Advance``.
         """
         self.total = total or self.total
-        now = self._clock() if seconds is None else seconds
+        now = self.clock() if seconds is None else seconds
         if self._first is None:  # a training that is resumed does not begin at step 0
             self._first = (now, done)
         begin, first = self._first
@@ -117,7 +117,7 @@ class Rate:
         return (now - begin) / steps * max(0, self.total - done)
 
 
-def _clock(seconds: float | None) -> str:
+def clock(seconds: float | None) -> str:
     """Hours, minutes and seconds."""
     if seconds is None:
         return UNKNOWN_TIME
@@ -148,7 +148,7 @@ class Lines:
     """Progress of one piece of work as lines, for logs: not more often than every ``LINE_SECONDS``."""
 
     def __init__(self, label: str, total: int | None, clock: Callable[[], float] = time.monotonic) -> None:
-        self._label, self._clock = label, clock
+        self._label, self.clock = label, clock
         self._rate = Rate(total, clock)
         self._last = clock()
         self._line = ""
@@ -157,9 +157,9 @@ class Lines:
         self, done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
     ) -> None:
         """See ``core.progress.Advance``."""
-        now = self._clock()
+        now = self.clock()
         left = self._rate.left(done, total, seconds)
-        time_left = f", {_clock(left)} left" if left else ""
+        time_left = f", {clock(left)} left" if left else ""
         of = "" if self._rate.total is None else f"/{self._rate.total}"
         self._line = f"{self._label} {done}{of}{time_left}" + (f"  {note}" if note else "")
         if now - self._last >= LINE_SECONDS:
@@ -204,7 +204,7 @@ class ConsoleReporter(Reporter):
                 done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
             ) -> None:
                 progress.live.transient = not note
-                left = _clock(rate.left(done, total, seconds))
+                left = clock(rate.left(done, total, seconds))
                 progress.update(task, completed=done, total=total, note=note, left=left)
 
             yield advance
@@ -225,41 +225,6 @@ def lines(label: str, total: int | None) -> Iterator[Advance]:
         yield advance
     finally:
         printer.close(last=noted)
-
-
-class JobReporter(ConsoleReporter):
-    """Prints as ``ConsoleReporter``, with one display for all bars that are open together."""
-
-    def __init__(self) -> None:
-        self._open = 0
-        self._progress = bars()
-
-    @contextlib.contextmanager
-    def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
-        """A progress bar below those that are open already."""
-        if not console.is_terminal:
-            with lines(label, total) as tell:
-                yield tell
-            return
-        if not self._open:
-            self._progress.start()
-        self._open += 1
-        task = self._progress.add_task(label, total=total, note="", left=UNKNOWN_TIME)
-        rate = Rate(total)
-
-        def advance(
-            done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
-        ) -> None:
-            left = _clock(rate.left(done, total, seconds))
-            self._progress.update(task, completed=done, total=total, note=note, left=left)
-
-        try:
-            yield advance
-        finally:
-            self._progress.remove_task(task)
-            self._open -= 1
-            if not self._open:
-                self._progress.stop()
 
 
 if TYPE_CHECKING:

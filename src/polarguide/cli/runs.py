@@ -55,9 +55,8 @@ def train(
             model in sparse/0.
         out: Run folder to write (configuration, checkpoint, log, PLY).
         recipe: Which method: polarguide-stokes (renders the measured polarization, too), polarguide (PolarGuide-GSDR's
-            stages with repaired physics), polarguide-paper; 3dgs, 3dgs-dr and ref-gs, which ignore polarization; gnerp,
-            a field in place of Gaussians; an ablation of one, such as polarguide:without-normals; or a recipe of an
-            installed package.
+            stages with repaired physics), polarguide-paper; 3dgs, 3dgs-dr and ref-gs, which ignore polarization; an
+            ablation of one, such as polarguide:without-normals; or a recipe of an installed package.
         resume: Go on with the run in --out.
     """
     with StopSignals() as should_stop:

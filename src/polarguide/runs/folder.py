@@ -240,19 +240,6 @@ def checkpoint_tensors(run: Path) -> Iterator[dict[str, Tensor]]:
         ) from None
 
 
-def trained_steps(run: Path) -> int | None:
-    """Number of training steps completed at a run's checkpoint.
-
-    None if the run has no checkpoint, or if the checkpoint does not record the number.
-    """
-    try:
-        with safe_open(run / CHECKPOINT, framework="pt") as file:
-            record = (file.metadata() or {}).get("polarguide", "")
-        return int(record.rpartition(" ")[2])
-    except (SafetensorError, OSError, ValueError):
-        return None
-
-
 @contextlib.contextmanager
 def writing_to(run: Path) -> Iterator[None]:
     """Keep others from writing to a run folder, which is made; the lock of a process that was killed is nobody's.
@@ -363,14 +350,6 @@ def most_gaussians(
     recorded = {} if resumed is None else _recorded(resumed)
     by_size = min(int(pixels / method.densification.pixels_each), MOST_GAUSSIANS)
     return recorded.get("gaussians", by_size) if settings.gaussians is None else settings.gaussians
-
-
-def compared_steps(*specified: int | None) -> int:
-    """Steps of a run of a comparison: the first number that was specified, else ``STEPS``.
-
-    They do not follow from the size of the pictures: scenes are compared.
-    """
-    return next((steps for steps in specified if steps is not None), STEPS)
 
 
 def resolve(

@@ -24,7 +24,6 @@ from polarguide.capture import View
 from polarguide.capture.exposures import analyzers
 from polarguide.capture.variants import BLACK, black_pixels
 from polarguide.capture.view import listed
-from polarguide.core.errors import PolarguideError
 from polarguide.core.files import write_text
 from polarguide.core.progress import Reporter
 from polarguide.core.records import read_record
@@ -207,18 +206,6 @@ class Health:
         if not os.path.lexists(run / HEALTH):
             return None
         return read_record(run / HEALTH, cls, remedy="Remove it: nothing but warnings is lost.")
-
-
-def recorded_health(run: Path) -> tuple[str | None, tuple[str, ...]]:
-    """What ``health.json`` says of a run's polarization, None where it says nothing, and its warnings.
-
-    A damaged file is a warning: other runs are not concerned.
-    """
-    try:
-        health = Health.load(run)
-    except PolarguideError as error:
-        return None, (str(error),)
-    return (None, ()) if health is None else (health.polarization.text, health.warnings)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -196,21 +196,6 @@ def _planned(
         pixels = pixels_of(Path(scene), reading.downscale)
     gaussians = most_gaussians(sum(pixels), recipe, settings, resumed)
     return plan_memory(pixels, recipe, gaussians, limit=reading.memory, in_memory=isinstance(scene, Scene))
-
-
-def expected_memory(
-    pixels: Sequence[int], recipe: Recipe, settings: TrainSettings, reading: SceneOptions
-) -> int:
-    """Bytes that the process of a training takes at most, as far as headers tell.
-
-    Args:
-        pixels: of each view, as ``memory_plan.pixels_of`` reads them. recipe, settings, reading: of the training.
-
-    Raises:
-        PolarguideError: the limit in ``reading`` is too small.
-    """
-    gaussians = most_gaussians(sum(pixels), recipe, settings, None)
-    return plan_memory(pixels, recipe, gaussians, limit=reading.memory).peak
 
 
 def view_store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter) -> ViewStore:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import tyro
 
-from polarguide.cli.console import JobReporter, say, use_threads
+from polarguide.cli.console import say, use_threads
 from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.files import read_rows, stored
 from polarguide.core.options import EXPORT_PACKAGES, SceneOptions, check_finite
@@ -24,6 +24,7 @@ from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.collection import NO_FILES, source_stamp
 from polarguide_bench.options import BatchOptions
+from polarguide_bench.verbs.console import JobReporter
 
 if TYPE_CHECKING:
     from polarguide_bench.batch import Capture

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 import polarguide
-from polarguide.cli.console import JobReporter, say, use_threads
+from polarguide.cli.console import say, use_threads
 from polarguide.core.errors import PolarguideError
 from polarguide.core.text import whole_number
 from polarguide.training.settings import Background, Materials, TrainSettings
 from polarguide_bench.options import BenchOptions, CompareOptions, LayoutName
+from polarguide_bench.verbs.console import JobReporter
 
 if TYPE_CHECKING:
     from polarguide_bench.results import Results

@@ -18,7 +18,7 @@ from polarguide.capture import Scene
 from polarguide.capture.variants import select_exposures
 from polarguide.geometry.vectors import dot, unit
 from polarguide.recipes.baselines import ABLATIONS_GNERP, RECIPE_GNERP
-from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint, trained_steps
+from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint
 from polarguide.runs.train import train
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.gnerp.field import NetworkField
@@ -27,6 +27,7 @@ from polarguide_bench.gnerp.model import FieldModel
 from polarguide_bench.gnerp.recipe import FieldShape, NeuralRecipe, Sampling
 from polarguide_bench.gnerp.state import FieldState
 from polarguide_bench.gnerp.trainer import FieldTrainer, aolp_loss, color_loss, eikonal_loss, guidance_loss
+from polarguide_bench.plan import trained_steps
 
 CPU = torch.device("cpu")
 

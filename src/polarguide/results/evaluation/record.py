@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import hashlib
-import inspect
 import json
 import math
 import subprocess
@@ -26,8 +25,12 @@ PACKAGE = Path(__file__).parents[2]
 COMMIT = "_commit.txt"
 """Beside the package's modules in a wheel: the commit it was built from, empty where that was not known."""
 DIGITS = 16
-NOT_TRAINING = ("results", "inspection", "viewer", "synth", "experiments", "api", "cli", "__main__.py")
-"""Rooms below ``runs`` in the order of imports: no training can reach them."""
+NOT_TRAINING = ("results", "inspection", "viewer", "api", "cli", "__main__.py")
+"""Parts of the package that no training can reach."""
+BENCH = "polarguide_bench"
+"""The neighboring package with the recipes of comparisons."""
+BENCH_TRAINING = ("recipes.py", "gnerp")
+"""Parts of that package that a training can reach."""
 
 
 @lru_cache
@@ -37,19 +40,21 @@ def code_digest(package: Path = PACKAGE, *, training: bool = False) -> str:
     Comments and docstrings do not count, so that editing them invalidates no result.
 
     Args:
-        package: folder of the package.
+        package: folder of the package; the bench is beside it.
         training: only the code that a training can reach, so that a change of scoring repeats no training.
     """
     compiled = [path for path in package.glob("_native.*") if path.suffix != ".pyi"]
-    left_out = NOT_TRAINING if training else ()
-    code = [path for path in package.rglob("*.py") if path.relative_to(package).parts[0] not in left_out]
-    return _digest(package, [*code, *compiled])
+    bench = package.with_name(BENCH)
+    own = _modules(package)
+    neighbors = _modules(bench)
+    if training:
+        own = [path for path in own if path.relative_to(package).parts[0] not in NOT_TRAINING]
+        neighbors = [path for path in neighbors if path.relative_to(bench).parts[0] in BENCH_TRAINING]
+    return _digest(package.parent, [*own, *neighbors, *compiled])
 
 
-def model_digest(kind: type) -> str:
-    """Digest of the file that defines a plug-in's shading model; empty for models of this package."""
-    file = Path(inspect.getfile(kind))
-    return "" if PACKAGE in file.parents else _digest(file.parent, [file])
+def _modules(package: Path) -> list[Path]:
+    return [*package.rglob("*.py")]
 
 
 def _digest(folder: Path, files: Sequence[Path]) -> str:
