@@ -9,69 +9,79 @@ import pytest
 
 PACKAGE = "polarguide"
 FOLDERS = ("src", "benchmarks", "examples", "tests")
-SOURCE = Path(__file__).resolve().parents[1] / "src" / PACKAGE
+SOURCE = Path(__file__).resolve().parents[1] / "src"
+
+# The packages, and which others each of them may import.
+PACKAGES = {
+    "polarguide": (),
+    "polarguide_shots": ("polarguide",),
+    "polarguide_synth": ("polarguide",),
+    "polarguide_bench": ("polarguide", "polarguide_synth"),
+}
 
 # From the top down. A room may import from itself and from every room before it. A folder in a room may have a place of
 # its own, named with the room's.
 ROOMS = (
-    "core",
-    "geometry",
-    "_native",
-    "optics",
-    "capture",
-    "preparation",
-    "gaussians",
-    "raster",
-    "shading",
-    "visualization",
-    "shots.calibration",
-    "shots",
-    "shots.measurement",
-    "training",
-    "training.angles",
-    "fields",
-    "recipes",
-    "runs",
-    "results.rendering",
-    "results.evaluation",
-    "results.export",
-    "inspection",
-    "viewer",
-    "synth",
-    "experiments",
-    "api",
-    "cli",
-    "__main__",
+    "polarguide.core",
+    "polarguide.geometry",
+    "polarguide._native",
+    "polarguide.optics",
+    "polarguide.capture",
+    "polarguide.preparation",
+    "polarguide.gaussians",
+    "polarguide.raster",
+    "polarguide.shading",
+    "polarguide.visualization",
+    "polarguide.training",
+    "polarguide.training.angles",
+    "polarguide.recipes",
+    "polarguide.runs",
+    "polarguide.results.rendering",
+    "polarguide.results.evaluation",
+    "polarguide.results.export",
+    "polarguide.inspection",
+    "polarguide.viewer",
+    "polarguide.api",
+    "polarguide.cli",
+    "polarguide.__main__",
+    "polarguide_shots.calibration",
+    "polarguide_shots",
+    "polarguide_shots.measurement",
+    "polarguide_shots.api",
+    "polarguide_shots.verbs",
+    "polarguide_synth",
+    "polarguide_synth.verbs",
+    "polarguide_bench.gnerp",
+    "polarguide_bench",
+    "polarguide_bench.verbs",
 )
 # What ``polarguide/__init__.py`` defines itself (its version) is for everyone. It names what others define for type
 # checkers, and loads it by name when it is asked for.
-ROOT = ""
+ROOT = "polarguide"
 
 
 def room_of(parts):
-    """The room of a module's path below the package, ROOT for the package itself."""
-    inner = ".".join(parts[:2])
-    return inner if inner in ROOMS else parts[0] if parts and parts[0] != "__init__" else ROOT
+    """The room of a module's path, ROOT for the package itself: the longest name of a room that it begins with."""
+    parts = [part for part in parts if part != "__init__"]
+    names = [".".join(parts[:count]) for count in (3, 2, 1) if count <= len(parts)]
+    return next((name for name in names if name in ROOMS), ".".join(parts[:2]))
 
 
-def imported_rooms(node, parts, rooms):
+def imported_rooms(node, parts):
     """The rooms that one import statement of the module at ``parts`` reaches; [] where it is not ours."""
     if isinstance(node, ast.Import):
         names = [alias.name.split(".") for alias in node.names]
-        return [room_of(name[1:]) for name in names if name[0] == PACKAGE]
+        return [room_of(name) for name in names if name[0] in PACKAGES]
     if node.level:
-        base = list(parts[: len(parts) - node.level])
-        path = base + (node.module.split(".") if node.module else [])
+        path = list(parts[: len(parts) - node.level]) + (node.module.split(".") if node.module else [])
     else:
         path = (node.module or "").split(".")
-        if path[0] != PACKAGE:
-            return []
-        path = path[1:]
-    if path:  # what is imported may be a room in a room
-        return sorted({room_of([*path, alias.name]) for alias in node.names})
-    # ``from polarguide import x``: a room, or something the package itself defines.
-    known = {room.partition(".")[0] for room in rooms}
-    return [alias.name if alias.name in known else ROOT for alias in node.names]
+    if not path or path[0] not in PACKAGES:
+        return []
+    # What is imported may be a room, or something that the module itself defines.
+    within = {room for room in ROOMS if room.startswith(".".join(path) + ".")}
+    found = {room_of([*path, alias.name]) for alias in node.names}
+    return sorted(room if room in within or path != [PACKAGE] else ROOT for room in found)
 
 
 def imports(node, deferred=False, typing=False):
@@ -85,15 +95,15 @@ def imports(node, deferred=False, typing=False):
             yield from imports(inner, deferred, typing)
 
 
-def faults(source, rooms=ROOMS):
-    """What breaks the order in the package at ``source``, one line each."""
+def faults(source):
+    """What breaks the order in the packages at ``source``, one line each."""
     found = []
     for path in sorted(source.rglob("*.py")):
         parts = path.relative_to(source).with_suffix("").parts
         room = room_of(parts)
         where = path.relative_to(source).as_posix()
-        gathers = parts[1:] == ("__init__",) and any(each.startswith(f"{room}.") for each in rooms)
-        if room != ROOT and room not in rooms and not gathers:
+        gathers = parts[2:] == ("__init__",) and any(each.startswith(f"{room}.") for each in ROOMS)
+        if room != ROOT and room not in ROOMS and not gathers:
             found.append(f"{where}: the room {room} has no place in the order")
             continue
         tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
@@ -101,18 +111,21 @@ def faults(source, rooms=ROOMS):
             line = f"{where}:{node.lineno}"
             if any(alias.name == "*" for alias in node.names):
                 found.append(f"{line}: star import")
-            targets = imported_rooms(node, parts, rooms)
+            targets = imported_rooms(node, parts)
             if room == ROOT and typing:
                 continue
             if targets and deferred:
                 found.append(f"{line}: project import inside a function")
             for target in targets:
+                package = target.partition(".")[0]
                 if target in (ROOT, room):
                     continue
-                if target not in rooms:
+                if package not in (parts[0], *PACKAGES[parts[0]]):
+                    found.append(f"{line}: {parts[0]} imports {package}, which it may not")
+                elif target not in ROOMS:
                     found.append(f"{line}: imports {target}, which has no place in the order")
-                elif room == ROOT or rooms.index(target) > rooms.index(room):
-                    found.append(f"{line}: {room or PACKAGE} imports {target}, which is further down")
+                elif room == ROOT or ROOMS.index(target) > ROOMS.index(room):
+                    found.append(f"{line}: {room} imports {target}, which is further down")
     return found
 
 
@@ -133,7 +146,8 @@ def test_the_package_itself_imports_nothing_heavy():
 
 def clients_of_the_command_line(root):
     """Files that import ``polarguide.cli`` and are no part of it, below the folders of a checkout."""
-    allowed = ("src/polarguide/cli/", "src/polarguide/__main__.py", "tests/cli/", "tests/robustness/")
+    verbs = ("src/polarguide_shots/verbs", "src/polarguide_synth/verbs", "src/polarguide_bench/verbs")
+    allowed = ("src/polarguide/cli/", "src/polarguide/__main__.py", *verbs, "tests/cli/", "tests/robustness/")
     found = []
     for path in sorted(p for folder in FOLDERS for p in (root / folder).rglob("*.py")):
         name, text = path.relative_to(root).as_posix(), path.read_text(encoding="utf-8")
@@ -154,7 +168,7 @@ def clients_of_the_command_line(root):
 
 
 def test_nothing_but_itself_imports_the_command_line():
-    assert clients_of_the_command_line(SOURCE.parents[1]) == []
+    assert clients_of_the_command_line(SOURCE.parent) == []
 
 
 @pytest.mark.parametrize(
@@ -198,10 +212,10 @@ def test_upward_and_outside_imports_are_fine(package):
     ]
     source = package(
         {
-            "__init__.py": "__version__ = '1'",
-            "cli/run.py": "\n".join(cli),
-            "optics/stokes.py": "\n".join(stokes),
-            "optics/frames.py": "\n".join(frames),
+            "polarguide/__init__.py": "__version__ = '1'",
+            "polarguide/cli/run.py": "\n".join(cli),
+            "polarguide/optics/stokes.py": "\n".join(stokes),
+            "polarguide/optics/frames.py": "\n".join(frames),
         }
     )
     assert faults(source) == []
@@ -213,70 +227,96 @@ def test_upward_and_outside_imports_are_fine(package):
         (
             "__init__.py",
             "from polarguide.api import load",
-            "__init__.py:1: polarguide imports api, which is further down",
+            ":1: polarguide imports polarguide.api, which is further",
         ),
         (
             "optics/a.py",
             "from polarguide.training import loop",
-            "optics/a.py:1: optics imports training, which is",
+            ":1: polarguide.optics imports polarguide.training",
         ),
         (
             "optics/a.py",
             "from polarguide import cli",
-            "optics/a.py:1: optics imports cli, which is further down",
+            ":1: polarguide.optics imports polarguide.cli, which is further",
         ),
         (
             "optics/a.py",
             "import polarguide.raster.cpu as c",
-            "optics/a.py:1: optics imports raster, which is",
+            ":1: polarguide.optics imports polarguide.raster",
         ),
         (
             "optics/a.py",
             "from ..raster import x",
-            "optics/a.py:1: optics imports raster, which is further down",
+            ":1: polarguide.optics imports polarguide.raster, which is further",
         ),
         (
             "optics/__init__.py",
             "from .. import raster",
-            "optics/__init__.py:1: optics imports raster, which is",
+            ":1: polarguide.optics imports polarguide.raster, which is",
         ),
-        ("core/a.py", "from ..optics import x", "core/a.py:1: core imports optics, which is further down"),
+        (
+            "core/a.py",
+            "from ..optics import x",
+            ":1: polarguide.core imports polarguide.optics, which is further",
+        ),
         (
             "results/export/a.py",
             "from polarguide.viewer import x",
-            "results/export/a.py:1: results.export imports viewer, which is further down",
+            ":1: polarguide.results.export imports polarguide.",
         ),
         (
             "results/rendering/a.py",
             "from polarguide.results import export",
-            "results/rendering/a.py:1: results.rendering imports results.export, which is further down",
+            ":1: polarguide.results.rendering imports",
         ),
         (
             "__init__.py",
             "from .core.errors import E",
-            "__init__.py:1: polarguide imports core, which is further down",
+            ":1: polarguide imports polarguide.core, which is further",
         ),
+        ("cli/a.py", "def f():\n    from polarguide.optics import x", ":2: project import inside a function"),
+        ("cli/a.py", "class A:\n  def f(self):\n    from . import b", ":3: project import inside a function"),
+        ("cli/a.py", "from math import *", ":1: star import"),
         (
             "cli/a.py",
-            "def f():\n    from polarguide.optics import x",
-            "cli/a.py:2: project import inside a function",
+            "from polarguide.nowhere import x",
+            ":1: imports polarguide.nowhere, which has no place",
         ),
-        (
-            "cli/a.py",
-            "class A:\n  def f(self):\n    from . import b",
-            "cli/a.py:3: project import inside a function",
-        ),
-        ("cli/a.py", "from math import *", "cli/a.py:1: star import"),
-        ("cli/a.py", "from polarguide.nowhere import x", "cli/a.py:1: imports nowhere, which has no place"),
-        ("attic/a.py", "", "attic/a.py: the room attic has no place in the order"),
+        ("attic/a.py", "", ": the room polarguide.attic has no place in the order"),
         (
             "optics/a.py",
             "if TYPE_CHECKING:\n    from ..cli import x",
-            "optics/a.py:2: optics imports cli, which is",
+            ":2: polarguide.optics imports polarguide.cli",
+        ),
+        (
+            "cli/a.py",
+            "from polarguide_shots.read import x",
+            ":1: polarguide imports polarguide_shots, which",
+        ),
+        (
+            "viewer/a.py",
+            "import polarguide_bench",
+            ":1: polarguide imports polarguide_bench, which it may not",
         ),
     ],
 )
 def test_what_breaks_the_order_is_found(package, name, text, fault):
-    found = faults(package({name: text + "\n"}))
+    found = faults(package({f"polarguide/{name}": text + "\n"}))
     assert len(found) == 1
-    assert found[0].startswith(fault)
+    assert found[0].startswith(f"polarguide/{name}{fault}")
+
+
+@pytest.mark.parametrize(
+    ("name", "imported", "allowed"),
+    [
+        ("polarguide_shots/a.py", "polarguide.raster.cpu", True),
+        ("polarguide_shots/a.py", "polarguide_bench.plan", False),
+        ("polarguide_synth/a.py", "polarguide_shots.read", False),
+        ("polarguide_bench/a.py", "polarguide_synth.render", True),
+        ("polarguide_bench/a.py", "polarguide_shots.read", False),
+        ("polarguide_bench/gnerp/a.py", "polarguide_bench.plan", False),
+        ("polarguide_bench/a.py", "polarguide_bench.gnerp.runs", True),
+    ],
+)
+def test_neighbors_import_the_product_and_the_bench_imports_synth(package, name, imported, allowed):
+    assert (faults(package({name: f"from {imported} import x\n"})) == []) is allowed

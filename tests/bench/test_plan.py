@@ -13,7 +13,7 @@ from heard import Heard
 
 import polarguide
 from polarguide.core.options import SceneOptions
-from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
+from polarguide.recipes import RECIPES, recipe_named
 from polarguide.results.evaluation.evaluate import evaluate
 from polarguide.results.evaluation.record import code_digest
 from polarguide.runs.opened import OpenedRun
@@ -22,6 +22,7 @@ from polarguide_bench import plan as plans
 from polarguide_bench.compare import ablated, collect, compare
 from polarguide_bench.options import CompareOptions
 from polarguide_bench.plan import Comparison, PlannedRun, SceneEntry, plan_runs, run_key, scene_entries
+from polarguide_bench.recipes import ABLATIONS
 from polarguide_bench.record import read_results
 
 SETTINGS = TrainSettings(40, 0)

@@ -12,11 +12,10 @@ import pytest
 from faults import Fault
 from made_sensor import COLORS, MadeSensor, made_sensor, true_calibration
 
-from polarguide.capture.sensor.analyzer_file import read_analyzers
+from polarguide.capture.sensor.analyzer_file import read_analyzers, write_analyzers
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration, correction_matrices, spread_to_cells
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.geometry.polarizer import ANGLES
-from polarguide_shots.calibration.analyzer_file import write_analyzers
 
 SENSORS = ("IMX250MZR", "IMX250MYR")
 LIGHT = np.array([0.8, 0.05, -0.06])

@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 from faults import Fault
 
-from polarguide.cli import batch as verb
 from polarguide.cli.app import run
 from polarguide_bench import batch as batches
 from polarguide_bench.batch import Capture, Row
 from polarguide_bench.options import BatchOptions
+from polarguide_bench.verbs import batch as verb
 
 OPTIONS = BatchOptions(jobs=1, device="cpu")
 HEAD = "name,path,sensor,options\n"

@@ -10,7 +10,6 @@ import pytest
 import torch
 from faults import Fault
 from other_device import BACKEND, OtherDevice, unfused_adam
-from polarguide.cli.compare import chosen_steps
 
 from polarguide.api.runs import Run, open_run
 from polarguide.capture import load_scene
@@ -28,6 +27,7 @@ from polarguide.runs import opened as opening
 from polarguide.viewer import run_scenery
 from polarguide.viewer.scenery import Appearance, Painter
 from polarguide_bench.record import read_results
+from polarguide_bench.verbs.compare import chosen_steps
 
 
 @pytest.fixture
@@ -168,11 +168,11 @@ def test_a_field_is_compared_with_gaussians(
     assert run(command) == 0
     assert "finished before: 2" in capsys.readouterr().out
     folder = next(str(out / r["folder"]) for r in record["runs"] if r["recipe"] == "gnerp")
-    assert (
-        run(["render", folder, "--layers", "final,normal,depth,specular", "--out", str(tmp_path / "r")]) == 0
-    )
-    assert "no layer specular" in capsys.readouterr().out
-    assert run(["export", folder, "--format", "mesh", "--resolution", "24"]) == 0
+    for words in (["render", folder, "--out", str(tmp_path / "r")], ["export", folder, "--format", "mesh"]):
+        assert run(words) == 2
+        refused = " ".join(capsys.readouterr().err.split())
+        assert "expected a recipe of Gaussians, found gnerp, a signed-distance field" in refused
+        assert "polarguide compare SCENE --recipes gnerp" in refused
     for refused in (["export", folder, "--format", "ply"], ["share", folder]):
         capsys.readouterr()
         assert run(refused) == 2

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 import polarguide
-from polarguide.recipes import ABLATIONS, RECIPES
+from polarguide.recipes import RECIPES
 from polarguide.results.evaluation.table import METRICS
+from polarguide_bench.recipes import ABLATIONS
 from polarguide_shots.measurement.fields import FORMAT, KEYS
 
 ROOT = Path(__file__).resolve().parents[2]

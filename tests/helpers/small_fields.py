@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-from polarguide.recipes.baselines import RECIPE_GNERP
 from polarguide_bench.gnerp.recipe import FieldShape, NeuralRecipe, Sampling
+from polarguide_bench.recipes import RECIPE_GNERP
 
 SMALL_SHAPE = FieldShape(resolutions=(8, 16), channels=2, width=16, background=(8,))
 SMALL_SAMPLING = Sampling(rays=48, coarse=12, fine=8, background=4, neighbors=2)

@@ -12,8 +12,8 @@ from polarguide.geometry.camera import Camera, look_at
 from polarguide.raster import Splats, rasterize_reference
 from polarguide.recipes.baselines import SHADING_3DGS_DR
 from polarguide.recipes.polarguide import RECIPE_POLARGUIDE
-from polarguide.recipes.registry import release_rates
 from polarguide.training.recipe import Recipe, Repeat, Stage, Weights
+from polarguide_bench.recipes import release_rates
 
 WIDTH, HEIGHT, VIEWS, GAUSSIANS = 24, 20, 6, 40
 STEPS = 60

@@ -14,12 +14,12 @@ from faults import Fault
 from made_sensor import made_sensor, true_calibration, write_codes
 
 from polarguide.capture.calibration import Calibration
+from polarguide.capture.sensor.analyzer_file import write_analyzers
 from polarguide.geometry.polarizer import ANGLES, stokes_of_four
 from polarguide.inspection.capture import read_capture
 from polarguide.inspection.corrections import analyzer_check, corrected
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide_shots.calibration.analyzer_file import write_analyzers
 
 SIZE = (64, 96)
 PLAIN = PrepareSettings(sensor="IMX250MZR", poses="none", gains="none", bits=12)

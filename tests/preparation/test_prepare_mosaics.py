@@ -25,10 +25,10 @@ from heard import Heard
 from made_sensor import MadeSensor, made_sensor, true_calibration, write_codes
 
 from polarguide.capture.calibration import Calibration
+from polarguide.capture.sensor.analyzer_file import write_analyzers
 from polarguide.geometry.polarizer import stokes_of_four
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
-from polarguide_shots.calibration.analyzer_file import write_analyzers
 
 COLORED = PrepareSettings(sensor="IMX250MYR", poses="none", gains="none", demosaic="quarter")
 GRAY = replace(COLORED, sensor="IMX250MZR")

@@ -8,8 +8,9 @@ import pytest
 from faults import Fault
 from plugins import install
 
-from polarguide.recipes import ABLATIONS, RECIPES, ablations_of, recipe_named
+from polarguide.recipes import RECIPES, recipe_named
 from polarguide.training.recipe import Stage
+from polarguide_bench.recipes import ABLATIONS, ablations_of
 
 MODULE = """
 from dataclasses import replace

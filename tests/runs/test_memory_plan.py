@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 import torch
 from faults import Fault
-from textured_ball import cameras
 from torch import Tensor
 
 from polarguide.capture import Scene
@@ -16,10 +15,8 @@ from polarguide.recipes import RECIPES
 from polarguide.runs import memory_plan
 from polarguide.runs import train as training
 from polarguide.runs.folder import MOST_GAUSSIANS, resolve
-from polarguide.runs.memory_plan import GIBIBYTE, MemoryPlan, plan_field_memory, plan_memory
+from polarguide.runs.memory_plan import GIBIBYTE, MemoryPlan, plan_memory
 from polarguide.training.settings import STEPS, ResolvedSettings, TrainSettings
-from polarguide_bench.gnerp.recipe import NeuralRecipe
-from polarguide_bench.gnerp.state import FieldState
 
 STOKES = RECIPES["polarguide-stokes"]
 LARGE = [1224 * 1024] * 60
@@ -113,22 +110,6 @@ def test_options_take_a_limit() -> None:
     assert SceneOptions(memory=2.5).memory == 2.5
     assert SceneOptions().memory is None
     Fault("memory", "", "0").raised_by(SceneOptions, memory=0.0)
-
-
-def test_a_field_is_planned_for_by_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory_plan, "resident_memory", lambda: 400_000_000)
-    field = RECIPES["gnerp"]
-    assert isinstance(field, NeuralRecipe)
-    learned = 4 * field.numbers
-    state = FieldState.first(field, cameras(4, 8, 6), 0)
-    exact = 4 * sum(values.numel() for values in state.field.parameters())
-    assert exact < learned * 1.02
-    assert learned < exact * 1.1
-    plan = plan_field_memory(SMALL, field, limit=4)
-    assert plan.view_bytes is None
-    assert plan.peak > 400_000_000 + 4 * learned
-    error = Fault("memory").raised_by(plan_field_memory, SMALL, field, limit=0.01)
-    assert "Gaussians" not in str(error)
 
 
 @pytest.mark.parametrize("exposures", ["three", "one"])

@@ -20,7 +20,7 @@ from polarguide.core.system import MemoryBound
 from polarguide.recipes import recipe_named
 from polarguide.runs import train as training
 from polarguide.runs.folder import CONFIGURATION
-from polarguide.runs.train import TrainingStopped
+from polarguide.runs.loop import TrainingStopped
 from polarguide.training.recipe import Schedule
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.options import CompareOptions

@@ -1,6 +1,6 @@
 """Refractive indices of single Gaussians in the deferred shading model: what they change, and what they leave."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import pytest
 import shaded_gaussians
@@ -125,14 +125,6 @@ def test_colors_attributes_and_the_page() -> None:
     )
     assert_close(page.values["share"] * drawn, plain.values["share"] * own)
     assert float(page.values["share"].max()) <= 1
-
-
-@pytest.mark.parametrize("part", ["rough", "metal", "indices"])
-def test_runs_recorded_before_there_was_a_part_are_without(part: str) -> None:
-    whole = DeferredShading("fresnel", local=True, rough=True, metal=True, indices=True)
-    recorded = {name: value for name, value in whole.data().items() if name != part}
-    assert whole.as_recorded(recorded) == replace(whole, **{part: False})
-    assert whole.as_recorded(whole.data()) == whole
 
 
 @pytest.fixture(scope="module")

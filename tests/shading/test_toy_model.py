@@ -17,7 +17,7 @@ from polarguide.capture.presentation import Crop
 from polarguide.gaussians.ply import read_ply
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.raster import choose_backend
-from polarguide.recipes import ablations_of, recipe_named
+from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.scores import score_view
 from polarguide.results.evaluation.target import ViewTarget
 from polarguide.results.export.mesh import surface_points
@@ -35,6 +35,7 @@ from polarguide.training.state import TrainingState
 from polarguide.training.trainer import Trainer
 from polarguide.viewer import training_scenery
 from polarguide.viewer.scenery import Appearance, Painter
+from polarguide_bench.recipes import ablations_of
 
 SETTINGS = TrainSettings(steps=150, seed=2, refractive_index=1.4)
 STOP = 70  # after rounds of the density control, and before others

@@ -19,9 +19,9 @@ from polarguide.capture import Scene, View
 from polarguide.optics.fresnel import reflectances_from_cosine
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.recipes import RECIPES
-from polarguide.runs.families import METALS_PICTURE, report_metals
 from polarguide.runs.folder import load_checkpoint, resolve, save_checkpoint
 from polarguide.runs.model import GaussianModel
+from polarguide.runs.reports import METALS_PICTURE, report_metals
 from polarguide.shading.metal import any_nonzero
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.metals.cut import INFINITE, Graph, decide, minimum_cut, surfaces, unary

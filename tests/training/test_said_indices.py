@@ -19,7 +19,7 @@ from polarguide.raster import choose_backend
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import CHECKPOINT
-from polarguide.runs.train import TrainingStopped
+from polarguide.runs.loop import TrainingStopped
 from polarguide.training.feed import Feed, ViewStore
 from polarguide.training.metals.observations import index_offsets, index_picture
 from polarguide.training.settings import TrainSettings

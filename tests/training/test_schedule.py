@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 from faults import Fault
 
-from polarguide.recipes import ABLATIONS, RECIPES, recipe_named
+from polarguide.recipes import RECIPES, recipe_named
 from polarguide.training.recipe import Recipe, Repeat, Rounds, Schedule, Stage
+from polarguide_bench.recipes import ABLATIONS
 
 OF_GAUSSIANS = {name: recipe for name, recipe in RECIPES.items() if isinstance(recipe, Recipe)}
 EVERY_RECIPE = pytest.mark.parametrize("recipe", OF_GAUSSIANS.values(), ids=OF_GAUSSIANS.keys())

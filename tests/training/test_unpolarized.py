@@ -8,7 +8,8 @@ from trainings import different, trained
 
 from polarguide import optics
 from polarguide.capture import Scene, View
-from polarguide.recipes import RECIPES, ablations_of, recipe_named
+from polarguide.recipes import RECIPES, recipe_named
+from polarguide_bench.recipes import ablations_of
 
 STEPS = 30
 CONTROLS = [r.name for base in RECIPES for r in ablations_of(base) if ":unpolarized" in r.name]

@@ -1,6 +1,5 @@
 """What the viewer shows of Gaussians and of fields, against the renderer itself."""
 
-import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,33 +9,31 @@ import pytest
 import torch
 from faults import Fault
 from random_runs import KINDS, random_state, ring
-from small_fields import small
 from textured_ball import textured_ball
 from viewer_scenes import frame_of_scene, photograph, shown
 
 from polarguide.capture.presentation import Crop
-from polarguide.geometry.camera import quaternion
 from polarguide.geometry.scene_frame import scene_frame
-from polarguide.geometry.trajectory import read_path
+from polarguide.raster import choose_backend
 from polarguide.raster.magnification import footprints
+from polarguide.recipes import recipe_named
 from polarguide.runs.folder import resolve
 from polarguide.runs.train import train
 from polarguide.shading.result import LAYERS, POLARIZED
+from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.settings import TrainSettings
-from polarguide.viewer.cameras import FRAMES_PER_SECOND, Keyframes, free_camera, letterbox, window_fov
 from polarguide.viewer.scenery import (
     BESIDE,
     MEASURED,
     Appearance,
-    FieldScenery,
     Painter,
+    Scenery,
     run_scenery,
     training_scenery,
 )
 from polarguide.viewer.server import view_run
 from polarguide.visualization import figures
 from polarguide.visualization.layers import polarization_picture
-from polarguide_bench.gnerp.trainer import FieldTrainer
 
 CAMERAS = ring()
 CAMERA = CAMERAS["v1"]
@@ -229,41 +226,32 @@ def test_gaussians_are_drawn_with_the_blur_of_their_training() -> None:
 
 
 @pytest.fixture(scope="module")
-def field(tmp_path_factory: pytest.TempPathFactory) -> FieldScenery:
-    folder = tmp_path_factory.mktemp("field") / "run"
-    made = run_scenery(train(SCENE, folder, recipe=small(), settings=TrainSettings(steps=3)))
-    assert isinstance(made, FieldScenery)
-    return made
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Scenery:
+    folder = tmp_path_factory.mktemp("trained") / "run"
+    return run_scenery(train(SCENE, folder, recipe="3dgs", settings=TrainSettings(steps=3)))
 
 
 @pytest.mark.parametrize("layer", ["final", "normal", "depth", "alpha", "photograph", "error"])
-def test_pictures_have_the_windows_size(field: FieldScenery, layer: str) -> None:
+def test_pictures_have_the_windows_size(trained: Scenery, layer: str) -> None:
     view = SCENE.views[0]
-    picture = Painter(AROUND).paint(field, view.camera, Appearance(layer=layer), view)
+    picture = Painter(AROUND).paint(trained, view.camera, Appearance(layer=layer), view)
     assert picture.shape == (32, 40, 3)
 
 
-def test_a_layer_that_there_is_not_is_not_drawn(field: FieldScenery) -> None:
-    assert Painter(AROUND).paint(field, SCENE.views[0].camera, Appearance(layer="specular")) is None
+def test_a_layer_that_there_is_not_is_not_drawn(trained: Scenery) -> None:
+    assert Painter(AROUND).paint(trained, SCENE.views[0].camera, Appearance(layer="specular")) is None
 
 
-def test_blocks_of_four_are_one_pixel(field: FieldScenery) -> None:
-    camera = SCENE.views[1].camera
-    blocks = field.render(camera, depth=False).final.view(8, 4, 10, 4, 3)
-    torch.testing.assert_close(blocks, blocks[:, :1, :, :1].expand_as(blocks))
-    exact = field.model.render(camera.downscaled(4)).final
-    torch.testing.assert_close(blocks[:, 0, :, 0], exact)
-
-
-def test_what_is_cropped_is_black(field: FieldScenery) -> None:
+def test_what_is_cropped_is_black(trained: Scenery) -> None:
     nothing = Crop((0.9, 0.9, 0.9), (0.91, 0.91, 0.91))
-    picture = Painter(AROUND).paint(field, SCENE.views[0].camera, Appearance(crop=nothing))
+    picture = Painter(AROUND).paint(trained, SCENE.views[0].camera, Appearance(crop=nothing))
     assert int(picture.max()) < 5
 
 
-def test_a_training_is_shown_without_a_change(tmp_path: Path) -> None:
+def test_a_training_is_shown_without_a_change() -> None:
+    recipe = recipe_named("3dgs")
     looked, alone = (
-        FieldTrainer(SCENE, small(), resolve(TrainSettings(steps=20), SCENE, small()), torch.device("cpu"))
+        AngleTrainer(SCENE, recipe, resolve(TrainSettings(steps=20), SCENE, recipe), choose_backend("cpu"))
         for _ in range(2)
     )
     for _ in range(20):
@@ -273,79 +261,3 @@ def test_a_training_is_shown_without_a_change(tmp_path: Path) -> None:
         made.render(SCENE.views[0].camera.downscaled(2), depth=True)
     one, other = looked.state.tensors(), alone.state.tensors()
     assert [name for name in one if one[name].numpy().tobytes() != other[name].numpy().tobytes()] == []
-
-
-LENS = next(iter(ring().values()))
-
-
-def project(camera, point):
-    x, y, z = (camera.rotation @ point + camera.translation).tolist()
-    return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-
-
-def test_a_free_camera_takes_the_pose_of_its_quaternion_and_the_fov_from_top_to_bottom():
-    camera = free_camera(quaternion(LENS.rotation.T), LENS.center.tolist(), 2 * math.atan(0.5), (300, 200))
-    assert torch.allclose(camera.rotation, LENS.rotation, atol=1e-9)
-    assert torch.allclose(camera.center, LENS.center, atol=1e-9)
-    ahead, down = LENS.rotation[2], LENS.rotation[1]
-    assert project(camera, camera.center + 3 * ahead) == pytest.approx((150, 100))
-    assert project(camera, camera.center + 2 * ahead + down) == pytest.approx((150, 200))
-
-
-@pytest.mark.parametrize("size", [(640, 480), (1000, 300), (200, 900), (64, 48), (31, 17)])
-def test_a_photograph_fits_into_a_window_and_its_camera_with_it(size):
-    placement = letterbox(LENS, size)
-    camera = LENS.extended(*size)
-    assert (camera.width, camera.height) == size
-    corners = np.array([(0, 0), (LENS.width, LENS.height)])
-    inside = corners * placement.scale + (placement.left, placement.top)
-    assert (inside >= -1e-9).all()
-    assert (inside <= np.array(size) + 1e-9).all()
-    assert np.isclose(inside, [(0, 0), size]).all(axis=0).any()  # it touches two borders
-    point = LENS.center + LENS.rotation.T @ torch.tensor([0.3, -0.2, 2.0], dtype=torch.float64)
-    before, after = np.array(project(LENS, point)), np.array(project(camera, point))
-    assert after == pytest.approx(before * placement.scale + (placement.left, placement.top))
-
-
-@pytest.mark.parametrize("scale", [1, 3])
-def test_a_placed_picture_lies_where_the_camera_sees_it(scale):
-    size = (scale * LENS.width + 20, scale * LENS.height)
-    picture = np.random.default_rng(0).integers(0, 255, (LENS.height, LENS.width, 3), dtype=np.uint8)
-    apply = letterbox(LENS, size).apply(picture)
-    assert apply.shape == (size[1], size[0], 3)
-    middles = apply[scale // 2 :: scale, 10 + scale // 2 : -10 : scale]
-    assert np.array_equal(middles, picture)
-    assert (apply[:, :9] == 64).all()
-
-
-@pytest.mark.parametrize("aspect", [0.5, 4 / 3, 3.0])
-def test_the_window_holds_the_photograph(aspect):
-    fov = window_fov(LENS, aspect)
-    high, wide = math.tan(fov / 2), aspect * math.tan(fov / 2)
-    assert high >= LENS.height / 2 / LENS.fy - 1e-9
-    assert wide >= LENS.width / 2 / LENS.fx - 1e-9
-    assert min(high - LENS.height / 2 / LENS.fy, wide - LENS.width / 2 / LENS.fx) < 1e-9
-
-
-def test_a_path_goes_through_its_poses(tmp_path):
-    keyframes, poses = Keyframes((80, 50)), list(ring().values())[:3]
-    for camera in poses:
-        keyframes.add(camera)
-    file = tmp_path / "path.json"
-    file.write_text(keyframes.to_json(1.5))
-    cameras, speed = read_path(file)
-    step = round(1.5 * FRAMES_PER_SECOND)
-    assert (speed, len(cameras)) == (FRAMES_PER_SECOND, 1 + 2 * step)
-    assert {(c.width, c.height) for c in cameras} == {(80, 50)}
-    for pose, camera in zip(poses, cameras[::step], strict=True):
-        assert torch.allclose(camera.center, pose.center, atol=1e-9)
-        assert torch.allclose(camera.rotation, pose.rotation, atol=1e-9)
-        # The same from top to bottom.
-        assert camera.height / camera.fy == pytest.approx(pose.height / pose.fy)
-
-
-def test_one_pose_is_a_path_of_one_and_none_is_none():
-    keyframes = Keyframes((80, 50))
-    assert keyframes.path(2.0) == []
-    keyframes.add(ring()["v0"])
-    assert len(keyframes.path(2.0)) == 1

@@ -182,8 +182,8 @@ def found(exposure: Exposure, angle: float, gain: float) -> Exposure:
 TABLE = "angles.csv"
 _COLUMNS = ("file", "view", "angle", "gain", "modulation", "note")
 _NEEDED = ("file", "angle")
-# Columns that a training writes, and that are not read; ``certainty`` in earlier versions.
-_WRITTEN_BY_TRAINING = ("modulation", "note", "certainty")
+# Columns that a training writes, and that are not read.
+_WRITTEN_BY_TRAINING = ("modulation", "note")
 # A camera exposes over some twenty stops either way; more leaves no numbers in single precision.
 _LARGEST_GAIN = 1e6
 _REMEDY = "Columns are file, angle (degrees, unknown or none) and, where wanted, view and gain, with commas between."

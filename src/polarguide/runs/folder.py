@@ -82,7 +82,7 @@ class RunConfiguration:
         settings: steps, seed, refractive index, with what was taken where nothing was specified.
         downscale: side of the averaged pixel boxes. transfer: how the files were read.
         device: what it trained on. version: version of the program.
-        test_views: those held out; None in runs of the first versions, which held out every 8th without a split.json.
+        test_views: the held-out views.
         painted: digest of the materials that were painted over the run and are in it, see ``runs.painted``; None: none.
     """
 
@@ -94,8 +94,8 @@ class RunConfiguration:
     downscale: int
     transfer: Transfer
     device: str
+    test_views: tuple[str, ...]
     version: str = __version__
-    test_views: tuple[str, ...] | None = None
     painted: str | None = None
 
     @classmethod
@@ -347,7 +347,7 @@ def most_gaussians(
     Args:
         pixels: pixels of the training views. asked, resumed: as for ``resolve``.
     """
-    recorded = {} if resumed is None else _recorded(resumed)
+    recorded = {} if resumed is None else resumed.specified()
     by_size = min(int(pixels / method.densification.pixels_each), MOST_GAUSSIANS)
     return recorded.get("gaussians", by_size) if settings.gaussians is None else settings.gaussians
 
@@ -370,7 +370,7 @@ def resolve(
     Raises:
         PolarguideError: a setting that is out of range.
     """
-    recorded = {} if resumed is None else _recorded(resumed)
+    recorded = {} if resumed is None else resumed.specified()
     sizes = [view.camera.width * view.camera.height for view in scene.train_views]
     values: dict[str, Any] = {
         **vars(settings),
@@ -384,11 +384,6 @@ def resolve(
     if values["background"] == "auto":
         values["background"] = "black" if has_black_background(scene.train_views) else "scene"
     return ResolvedSettings(**values)
-
-
-def _recorded(resumed: ResolvedSettings) -> dict[str, Any]:
-    """Settings that a run recorded; the first versions recorded 0 and "auto" for open ones."""
-    return {name: value for name, value in resumed.specified().items() if value != 0}
 
 
 def _steps(sizes: Sequence[int]) -> int:

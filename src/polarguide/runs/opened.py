@@ -96,7 +96,6 @@ class OpenedRun:
         if method.name != configuration.recipe:
             expected, remedy = f"{configuration.recipe}, which {folder} was trained with", "Give that recipe."
             raise PolarguideError("recipe", expected=expected, found=method.name, remedy=remedy)
-        method = method.as_recorded(configuration.recipe_data)
         backend = choose_backend(device, say=reporter.say)
         state = load_checkpoint(folder, method, backend.device)
         if method.differs(configuration.recipe_data):
@@ -167,7 +166,7 @@ class OpenedRun:
             raise PolarguideError("scene", expected=expected, found=reading, remedy="Load it like that.")
         if scene.digest != configuration.scene_digest:
             _warn(f"{scene.root} has changed since {self.folder} was trained on it.")
-        if recorded is not None and recorded != scene.test_names:
+        if recorded != scene.test_names:
             names = {view.name for view in scene.views}
             scene = replace(scene, test_names=tuple(name for name in recorded if name in names))
         scene = select_exposures(scene, configuration.settings.exposures)

@@ -247,8 +247,6 @@ def check_trainable(scene: Scene) -> None:
 
 
 def check_same_run(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:
-    if old.settings.background == "auto":  # as the first versions recorded it
-        old = replace(old, settings=replace(old.settings, background=new.settings.background))
     if old.settings != new.settings and replace(old.settings, steps=new.settings.steps) == new.settings:
         raise PolarguideError(
             f"{out}/{CONFIGURATION} (steps)",

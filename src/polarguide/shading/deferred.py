@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -103,12 +103,6 @@ class DeferredShading(ShadingModel):
     indices: bool = False
 
     stream: ClassVar[int] = 1
-
-    def as_recorded(self, data: Mapping[str, Any]) -> ShadingModel:
-        """Without what there could not be then: rough dielectrics, metals, indices."""
-        names = ("rough", "metal", "indices")
-        parts = {name: getattr(self, name) and data.get(name, False) for name in names}
-        return replace(self, **parts)
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:

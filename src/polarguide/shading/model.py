@@ -172,10 +172,6 @@ class ShadingModel(ABC):
         del values["refractive_index"]
         return {"model": type(self).__name__, **values}
 
-    def as_recorded(self, data: Mapping[str, Any]) -> ShadingModel:
-        """The model as a run has it, given what ``data`` was then: without parameters that came later."""
-        return self
-
     # What is learned
 
     @property

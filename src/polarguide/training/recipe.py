@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Any, Literal, get_type_hints
 
 from polarguide.core.errors import PolarguideError
@@ -279,14 +279,6 @@ class Recipe:
     def light_rates(self) -> dict[str, float]:
         """Learning rates of the learned light's parameters."""
         return {name: parameter.rate for name, parameter in self.shading.light_parameters.items()}
-
-    def as_recorded(self, data: Mapping[str, Any]) -> Recipe:
-        """The recipe as a run of an earlier version had it.
-
-        Args:
-            data: the values in the run's folder; shading that the version did not know is left out.
-        """
-        return replace(self, shading=self.shading.as_recorded(data.get("shading") or {}))
 
     def data(self) -> dict[str, Any]:
         """All values as plain JSON types, for a run's folder."""

@@ -64,7 +64,7 @@ class TrainingState:
         angles: [F, P, ``ANGLE_COLUMNS``] float64, polarizers of P pictures in F successive fits, see
             ``angles.polarizers``; None before the first fit.
         footprints: [N] size of a training pixel at each Gaussian, see ``raster.magnification``; None before the end of
-            the training, and in runs of earlier versions.
+            the training.
     """
 
     step: int
@@ -105,8 +105,7 @@ class TrainingState:
         environment = Environment.from_state(tensors, rates) if rates else None
         statistics = DensityStatistics.of(tensors["statistics.gradient"], tensors["statistics.seen"])
         frozen = {key[7:]: value for key, value in tensors.items() if key.startswith("frozen.")}
-        # The first checkpoints had a third.
-        step, frozen_until = (int(x) for x in tensors["scalars"][:2])
+        step, frozen_until = (int(x) for x in tensors["scalars"])
         angles = tensors["angles"].cpu() if "angles" in tensors else None
         return cls(
             step,

@@ -33,12 +33,12 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import network_address
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.results.rendering.picking import gray_world
-from polarguide.runs.families import AnyTrainer
 from polarguide.runs.model import layers_of
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.painted import FOLDER, read_painted, write_painted
 from polarguide.runs.train import Ends, Look
 from polarguide.shading.model import ShadingModel
+from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.viewer.cameras import Photograph, photographs
 from polarguide.viewer.guard import Gate, guarded
 from polarguide.viewer.messages import Accepts, checked
@@ -381,7 +381,7 @@ def save_to_run(run: OpenedRun, chosen: Presentation) -> str:
 
 @contextmanager
 def watched(
-    trainer: AnyTrainer,
+    trainer: AngleTrainer,
     host: str,
     port: int,
     visitors: VisitorOptions = VisitorOptions(),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-from polarguide.cli.console import UNKNOWN_TIME, ConsoleReporter, Rate, clock, bars, console, lines
+from polarguide.cli.console import UNKNOWN_TIME, ConsoleReporter, Rate, bars, clock, console, lines
 from polarguide.core.progress import Advance
 
 

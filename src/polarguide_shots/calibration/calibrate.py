@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.sensor.analyzer_file import SUFFIX
+from polarguide.capture.sensor.analyzer_file import SUFFIX, write_analyzers
 from polarguide.capture.sensor.analyzers import (
     FARTHEST_ANGLE,
     LEAST_DIATTENUATION,
@@ -24,7 +24,6 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.visualization.figures import write_png
-from polarguide_shots.calibration.analyzer_file import write_analyzers
 from polarguide_shots.calibration.report import Position, calibration_picture, lines, positions
 from polarguide_shots.calibration.settings import CalibrateSettings
 from polarguide_shots.calibration.shots import ShotMeans, Shots

@@ -2,32 +2,36 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from faults import Fault
 from safetensors import safe_open
 from small_fields import small
-from textured_ball import ball_radius, textured_ball
+from textured_ball import ball_radius, cameras, textured_ball
 
-import polarguide
 from polarguide import optics
 from polarguide.capture import Scene
 from polarguide.capture.variants import select_exposures
+from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.geometry.vectors import dot, unit
-from polarguide.recipes.baselines import ABLATIONS_GNERP, RECIPE_GNERP
-from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint
-from polarguide.runs.train import train
+from polarguide.results.evaluation.evaluate import evaluate
+from polarguide.runs import memory_plan
+from polarguide.runs.folder import CHECKPOINT, save_checkpoint
+from polarguide.runs.loop import TrainingStopped
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.gnerp.field import NetworkField
 from polarguide_bench.gnerp.march import _strata
+from polarguide_bench.gnerp.memory import plan_field_memory
 from polarguide_bench.gnerp.model import FieldModel
 from polarguide_bench.gnerp.recipe import FieldShape, NeuralRecipe, Sampling
+from polarguide_bench.gnerp.runs import FieldRun, load_field, open_field, resolve_field, train_field
 from polarguide_bench.gnerp.state import FieldState
 from polarguide_bench.gnerp.trainer import FieldTrainer, aolp_loss, color_loss, eikonal_loss, guidance_loss
 from polarguide_bench.plan import trained_steps
+from polarguide_bench.recipes import ABLATIONS_GNERP, RECIPE_GNERP
 
 CPU = torch.device("cpu")
 
@@ -40,7 +44,7 @@ def ball() -> Scene:
 
 def trainer(scene: Scene, steps: int, recipe: NeuralRecipe | None = None) -> FieldTrainer:
     recipe = recipe or small()
-    return FieldTrainer(scene, recipe, resolve(TrainSettings(steps=steps), scene, recipe), CPU)
+    return FieldTrainer(scene, recipe, resolve_field(TrainSettings(steps=steps), scene, recipe), CPU)
 
 
 def normal_error(model: FieldModel, scene: Scene) -> float:
@@ -95,9 +99,9 @@ def test_resumed_is_uninterrupted(ball: Scene, tmp_path: Path) -> None:
         while parts.state.step < stop:
             parts.step()
         save_checkpoint(tmp_path, parts.state)
-        state = load_checkpoint(tmp_path, small())
+        state = load_field(tmp_path, small())
         assert isinstance(state, FieldState)
-        parts = FieldTrainer(ball, small(), resolve(TrainSettings(steps=40), ball, small()), CPU, state)
+        parts = FieldTrainer(ball, small(), resolve_field(TrainSettings(steps=40), ball, small()), CPU, state)
         assert trained_steps(tmp_path) == stop
     assert bits(parts.state) == bits(whole.state)
 
@@ -163,44 +167,83 @@ def test_a_foreign_checkpoint_is_refused(
         FieldState.from_tensors(spoiled(made.state.tensors(), name, values), small(), CPU)
 
 
-def test_a_run_folder_is_trained_scored_and_exported(ball: Scene, tmp_path: Path) -> None:
-    run = polarguide.Run.of(train(ball, tmp_path / "run", recipe=small(), settings=TrainSettings(steps=12)))
-    assert run.layers == ("final", "base", "normal", "depth", "alpha")
-    assert "numbers" in repr(run)
-    record = run.evaluate()
-    assert record["gaussians"] is None
-    assert record["steps"] == 12
-    assert record["specular_psnr"] is None
-    again = polarguide.open_run(tmp_path / "run", recipe=small(), scene=ball, device="cpu")
-    camera = ball.test_views[0].camera
-    torch.testing.assert_close(again.render(camera)["final"], run.render(camera)["final"])
-    pytest.importorskip("skimage")
-    pytest.importorskip("trimesh")
-    assert [path.name for path in run.export("mesh", resolution=24)] == ["mesh.glb", "mesh.ply"]
+READING = SceneOptions(downscale=8)
 
 
-@pytest.mark.parametrize("format", ["ply", "spz", "sog", "points"])
-def test_splats_of_a_field_are_refused_in_one_line(ball: Scene, tmp_path: Path, format: str) -> None:
-    run = polarguide.Run.of(train(ball, tmp_path / "run", recipe=small(), settings=TrainSettings(steps=1)))
-    for refused in (partial(run.export, format), run.share, partial(getattr, run, "gaussians")):
-        Fault(expected="a run of Gaussians", found="signed-distance field").raised_by(refused)
-    assert not (tmp_path / "run" / "export").exists()
-
-
-@pytest.mark.parametrize(("name", "value"), [("gaussians", 500), ("views_per_step", 2)])
-def test_settings_that_mean_nothing_are_refused(ball: Scene, tmp_path: Path, name: str, value: int) -> None:
-    settings = replace(TrainSettings(steps=5), **{name: value})
-    Fault(name, "gnerp-small", str(value)).raised_by(
-        train, ball, tmp_path / "run", recipe=small(), settings=settings
+def field_trained(scene: Path, out: Path, steps: int | None = 6, **options: Any) -> FieldRun:
+    """A run of the small recipe on a folder, on one thread."""
+    settings = TrainSettings(steps=steps, **options.pop("settings", {}))
+    session = SessionOptions(threads=1, device="cpu")
+    return train_field(
+        scene, out, recipe=small(), settings=settings, session=session, reading=READING, **options
     )
 
 
-def test_steps_are_the_recipes_where_nobody_says_how_many(ball: Scene, tmp_path: Path) -> None:
-    run = train(ball, tmp_path / "run", recipe=replace(small(), steps=3), settings=TrainSettings())
+def test_a_run_folder_is_trained_and_scored(demo_scene: Path, tmp_path: Path) -> None:
+    run = field_trained(demo_scene, tmp_path / "run")
+    record = evaluate(run, surface=run.surface)
+    assert record["gaussians"] is None
+    assert record["steps"] == 6
+    assert record["specular_psnr"] is None
+    assert record["mesh_reason"] is None or record["mesh_accuracy_1"] is None
+    again = open_field(tmp_path / "run", small(), device="cpu")
+    camera = run.scene.test_views[0].camera
+    torch.testing.assert_close(again.model.render(camera).final, run.model.render(camera).final)
+
+
+def test_a_stopped_training_goes_on_to_the_same_bits(demo_scene: Path, tmp_path: Path) -> None:
+    whole = field_trained(demo_scene, tmp_path / "whole")
+    asked = iter([False, False, True])
+    with pytest.raises(TrainingStopped):
+        field_trained(demo_scene, tmp_path / "parts", should_stop=lambda: next(asked))
+    assert trained_steps(tmp_path / "parts") == 2
+    parts = field_trained(demo_scene, tmp_path / "parts", resume=True)
+    assert bits(parts.model.state) == bits(whole.model.state)
+
+
+def test_a_run_with_other_steps_is_not_resumed(demo_scene: Path, tmp_path: Path) -> None:
+    field_trained(demo_scene, tmp_path / "run", 2)
+    Fault("steps", "2, as this training was begun", "3").raised_by(
+        field_trained, demo_scene, tmp_path / "run", 3, resume=True
+    )
+
+
+@pytest.mark.parametrize(("name", "value"), [("gaussians", 500), ("views_per_step", 2)])
+def test_settings_that_mean_nothing_are_refused(
+    demo_scene: Path, tmp_path: Path, name: str, value: int
+) -> None:
+    Fault(name, "gnerp-small", str(value)).raised_by(
+        field_trained, demo_scene, tmp_path / "run", settings={name: value}
+    )
+
+
+def test_steps_are_the_recipes_where_nobody_says_how_many(demo_scene: Path, tmp_path: Path) -> None:
+    run = train_field(
+        demo_scene,
+        tmp_path / "run",
+        recipe=replace(small(), steps=3),
+        settings=TrainSettings(),
+        reading=READING,
+    )
     assert run.steps == 3
     assert trained_steps(tmp_path / "run") == 3
     with safe_open(tmp_path / "run" / CHECKPOINT, framework="pt") as file:
         assert not any(name.startswith("adam.") for name in file.keys()), "as of other runs"  # noqa: SIM118
+
+
+def test_a_field_is_planned_for_by_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory_plan, "resident_memory", lambda: 400_000_000)
+    learned = 4 * RECIPE_GNERP.numbers
+    state = FieldState.first(RECIPE_GNERP, cameras(4, 8, 6), 0)
+    exact = 4 * sum(values.numel() for values in state.field.parameters())
+    assert exact < learned * 1.02
+    assert learned < exact * 1.1
+    pixels = [100 * 100] * 10
+    plan = plan_field_memory(pixels, RECIPE_GNERP, limit=4)
+    assert plan.view_bytes is None
+    assert plan.peak > 400_000_000 + 4 * learned
+    error = Fault("memory").raised_by(plan_field_memory, pixels, RECIPE_GNERP, limit=0.01)
+    assert "Gaussians" not in str(error)
 
 
 def test_strata_are_even_and_apart() -> None:

@@ -231,15 +231,15 @@ def test_code_counts_and_scoring_repeats_no_training(
     tmp_path: Path, name: str, text: str, changes: tuple[bool, bool]
 ) -> None:
     for file in ("optics/a.py", "results/a.py", "_native.so", "_native.pyi", "data/picture.png"):
-        (tmp_path / file).parent.mkdir(exist_ok=True)
-        (tmp_path / file).write_text("first = 1")
+        (tmp_path / "polarguide" / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "polarguide" / file).write_text("first = 1")
 
     def digests() -> list[str]:
         code_digest.cache_clear()
-        return [code_digest(tmp_path, training=training) for training in (False, True)]
+        return [code_digest(tmp_path / "polarguide", training=training) for training in (False, True)]
 
     before = digests()
-    (tmp_path / name).write_text(text)
+    (tmp_path / "polarguide" / name).write_text(text)
     assert tuple(now != then for now, then in zip(digests(), before, strict=True)) == changes
     assert {len(digest) for digest in before} == {16}
 

@@ -17,8 +17,8 @@ from polarguide.capture import Scene, View
 from polarguide.capture.exposures import FOUR, Exposure, read_table
 from polarguide.capture.variants import select_exposures
 from polarguide.recipes import RECIPES, recipe_named
-from polarguide.runs.families import report_polarizers
 from polarguide.runs.folder import resolve
+from polarguide.runs.reports import report_polarizers
 from polarguide.training.angles.polarizers import Polarizers, mean_angle
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.checked import refuse_foreign

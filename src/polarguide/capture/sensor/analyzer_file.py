@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
 from polarguide.capture.sensor.analyzers import (
     FARTHEST_ANGLE,
@@ -21,7 +22,7 @@ from polarguide.capture.sensor.analyzers import (
 )
 from polarguide.capture.sensor.pattern import SENSORS
 from polarguide.core.errors import PolarguideError
-from polarguide.core.files import in_utf8, require_file
+from polarguide.core.files import in_utf8, require_file, write_whole
 from polarguide.core.records import decode
 
 FORMAT, VERSION = "polarguide-analyzers", 1
@@ -68,6 +69,24 @@ def is_analyzer_file(path: Path) -> bool:
     return path.suffix.lower() == SUFFIX or (
         start[8:9] == b"{" and int.from_bytes(start[:8], "little") <= _LONGEST_HEADER
     )
+
+
+def write_analyzers(path: Path, calibration: AnalyzerCalibration) -> str:
+    """Write the file of a calibration, which is the same bytes for the same content; returns the checksum.
+
+    Raises:
+        PolarguideError: the file cannot be written.
+    """
+    vectors = np.ascontiguousarray(calibration.vectors, np.float32)
+    metadata = _Metadata(
+        FORMAT, VERSION, calibration.sensor, calibration.lens, *calibration.size, *calibration.offset,
+        calibration.block, calibration.reference, calibration.polarizer_extinction, UNITS, "",
+    )  # fmt: skip
+    metadata.sha256 = _checksum(metadata, vectors)
+    # One entry: safetensors writes several in any order.
+    text = json.dumps(msgspec.to_builtins(metadata), ensure_ascii=False)
+    write_whole(path, save({_TENSOR: vectors}, metadata={_ENTRY: text}))
+    return metadata.sha256
 
 
 def read_analyzers(path: Path) -> AnalyzerCalibration:
