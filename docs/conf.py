@@ -25,7 +25,7 @@ exclude_patterns = ["_extensions", "generated"]
 suppress_warnings = ["config.cache"]
 # References into the package have to lead somewhere; those into other packages are shown as they are.
 nitpicky = True
-nitpick_ignore_regex = [("py:.*", r"(?!polarguide\.).*|.*\[.*|.*\.T")]  # the last: type variables
+nitpick_ignore_regex = [("py:.*", r"(?!polarguide[._]).*|.*\[.*|.*\.T")]  # the last: type variables
 
 myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3

@@ -1,6 +1,6 @@
 """Pages that are made from the program itself, so that they cannot go stale.
 
-reference/api/*.md           a page for each room of the package, with all its public modules
+reference/api/*.md           a page for each room of the product and for each neighbor, with all public modules
 generated/command-line.md    every verb and option, as the program's own help states them
 generated/rooms.md           the order of the rooms, as tests/test_imports.py enforces it
 generated/python.md          the names of ``import polarguide``
@@ -26,11 +26,11 @@ from sphinx.application import Sphinx
 
 PACKAGE = "polarguide"
 # Rooms without an interface for Python: the command line has a page of its own.
-NOT_LIBRARY = ("_native", "api", "cli", "__main__")
+NOT_LIBRARY = tuple(f"{PACKAGE}.{room}" for room in ("_native", "api", "cli", "__main__"))
 
 
 def rooms(docs: Path) -> tuple[str, ...]:
-    """The rooms of the package from the top down: the tuple ROOMS of tests/test_imports.py."""
+    """Full names of the rooms from the top down: the tuple ROOMS of tests/test_imports.py."""
     tree = ast.parse((docs.parent / "tests" / "test_imports.py").read_text(encoding="utf-8"))
     for node in tree.body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "ROOMS":
@@ -40,7 +40,7 @@ def rooms(docs: Path) -> tuple[str, ...]:
 
 def source_of(name: str) -> Path:
     """The file of a module of the package, found without importing it."""
-    package = find_spec(PACKAGE)
+    package = find_spec(name.partition(".")[0])
     assert package is not None
     assert package.submodule_search_locations
     path = Path(package.submodule_search_locations[0]).joinpath(*name.split(".")[1:])
@@ -75,23 +75,26 @@ def module_section(name: str, level: int) -> str:
     """A heading and everything public that a module defines itself."""
     is_package = source_of(name).name == "__init__.py"
     members = "" if is_package else "\n   :members:\n   :ignore-module-all:"
-    title = name if level == 1 else name.removeprefix(f"{PACKAGE}.")
+    title = name if level == 1 else name.partition(".")[2]
     return f"{'#' * level} `{title}`\n\n```{{eval-rst}}\n.. automodule:: {name}{members}\n```\n"
+
+
+def page_of(room: str) -> str:
+    """The name of the page that documents a room: of the room at the top of the product, or of the neighbor."""
+    package, _, rest = room.partition(".")
+    return f"{package}.{rest.partition('.')[0]}" if package == PACKAGE else package
 
 
 def api_pages(docs: Path) -> dict[str, str]:
     """Text of the pages below reference/api by name."""
     pages = {}
-    for room in dict.fromkeys(room.partition(".")[0] for room in rooms(docs)):
-        name = f"{PACKAGE}.{room}"
-        if room in NOT_LIBRARY or not exists(name):
+    for name in dict.fromkeys(page_of(room) for room in rooms(docs)):
+        if name in NOT_LIBRARY or not exists(name):
             continue
         first, *others = public_modules(name)
         parts = [module_section(first, 1), *(module_section(other, 2) for other in others)]
-        pages[room] = "\n".join(parts)
-    lines = [
-        f"| [`{PACKAGE}.{room}`]({room}.md) | {escaped(summary(f'{PACKAGE}.{room}'))} |" for room in pages
-    ]
+        pages[name] = "\n".join(parts)
+    lines = [f"| [`{name}`]({name}.md) | {escaped(summary(name))} |" for name in pages]
     contents = ["```{toctree}", ":hidden:", "", *pages, "```"]
     index = [
         "# The library, room by room",
@@ -118,7 +121,7 @@ def rooms_table(docs: Path) -> str:
     """The rooms in order, with the first sentence of each."""
     lines = ["| | room | what is in it |", "|---:|---|---|"]
     for number, room in enumerate(rooms(docs), 1):
-        lines.append(f"| {number} | `{room}` | {escaped(summary(f'{PACKAGE}.{room}'))} |")
+        lines.append(f"| {number} | `{room}` | {escaped(summary(room))} |")
     return "\n".join(lines) + "\n"
 
 

@@ -289,6 +289,8 @@ def _near(word: str) -> str:
 def _as_flag(error: PolarguideError, verb: str | None) -> str:
     """The message; a parameter that is at fault is called as on the command line."""
     text = str(error)
-    if verb is not None and not error.is_path and error.where in options_of(function_of(verb)):
+    if verb in (None, error.where) or error.is_path:  # a verb as the place: its package is missing
+        return text
+    if error.where in options_of(function_of(verb)):
         return f"{_flag(error.where)}{text.removeprefix(error.where)}"
     return text
