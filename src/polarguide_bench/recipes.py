@@ -323,7 +323,7 @@ def ablations_of(name: str) -> tuple[AnyRecipe, ...]:
     Raises:
         PolarguideError: there is no recipe of that name.
     """
+    if name in ABLATIONS or name in registry.RECIPES:
+        return ABLATIONS.get(name, ())
     recipe_named(name)
-    if name in ABLATIONS:
-        return ABLATIONS[name]
     return registry.variations_offered(name)

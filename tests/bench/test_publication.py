@@ -7,11 +7,11 @@ from comparison_records import results, run
 from faults import Fault
 
 import polarguide
-from polarguide.recipes import recipe_named
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.join import join_tables
 from polarguide_bench.options import CompareOptions
 from polarguide_bench.publication import LAYOUTS, measured_section, published_section
+from polarguide_bench.recipes import recipe_named
 
 FIRST = LAYOUTS["publication-1"]
 

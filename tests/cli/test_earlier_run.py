@@ -1,4 +1,4 @@
-"""A run that commit 239ddd2 trained and scored opens, is scored, rendered and exported, with the values it had then.
+"""A run that commit 40ab877f trained and scored opens, is scored, rendered and exported, with the values it had then.
 
 Made by that commit's command line from the scene that ``earlier`` writes:
 ``train SCENE --out run --steps 30 --downscale 4 --background black --gaussians 150 --threads 1 --device cpu`` and
@@ -17,7 +17,7 @@ from plyfile import PlyData
 import polarguide
 from polarguide.cli.app import run as command
 
-ARCHIVE = Path(__file__).with_name("run-239ddd2.tar.xz")
+ARCHIVE = Path(__file__).with_name("run-40ab877f.tar.xz")
 HEADER, EVERY = 3, 40
 THEN = "metrics-then.json"
 """Copy of the scores of that commit; a test's evaluation replaces metrics.json."""
@@ -60,7 +60,8 @@ def test_it_opens_without_a_warning(earlier: Path) -> None:
     run = polarguide.open_run(earlier)
     assert (run.recipe.name, run.steps, run.model.size) == ("polarguide-stokes", 30, "122 Gaussians")
     assert run.scene.test_names == ("v000", "v022", "v044", "v066")
-    assert run.health is None
+    assert run.health is not None
+    assert run.health.polarization.word == "measured"
     roughness = run.render("v000", "roughness")["roughness"]
     assert bool((roughness == roughness[0, 0]).all()), "all its surfaces are mirrors"
 

@@ -123,6 +123,7 @@ def configuration() -> RunConfiguration:
         downscale=2,
         transfer="linear",
         device="cpu",
+        test_views=("v000",),
     )
 
 

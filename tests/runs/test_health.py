@@ -73,9 +73,7 @@ class StandIn:
 
 
 def evidence(scene: Scene, views: tuple[View, ...] | None = None) -> Evidence:
-    return Evidence(
-        views or scene.train_views, Polarization(len(scene.views), 0, 0), filters=True, steps_a_view=1.0
-    )
+    return Evidence(views or scene.train_views, Polarization(len(scene.views), 0, 0), filters=True)
 
 
 def examined(model: Any, scene: Scene, views: tuple[View, ...] | None = None) -> Health:

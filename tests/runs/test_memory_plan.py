@@ -90,8 +90,6 @@ def test_what_is_not_specified_follows_from_the_size_or_is_that_of_the_run_to_re
     )
     assert resolve(asked, tiny_scene, STOKES, older) == older
     assert resolve(older, tiny_scene, STOKES) == older
-    first = resolve(asked, tiny_scene, STOKES, replace(older, gaussians=0, background="auto"))
-    assert (first.gaussians, first.background) == (found.gaussians, found.background)
 
 
 def test_the_refractive_index_is_the_one_asked_for_or_the_scenes(tiny_scene: Scene) -> None:

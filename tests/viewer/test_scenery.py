@@ -1,4 +1,4 @@
-"""What the viewer shows of Gaussians and of fields, against the renderer itself."""
+"""Pictures of the viewer, against the renderer itself."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,26 +9,20 @@ import pytest
 import torch
 from faults import Fault
 from random_runs import KINDS, random_state, ring
-from textured_ball import textured_ball
+from trainings import make_trainer
 from viewer_scenes import frame_of_scene, photograph, shown
 
+from polarguide.capture import Scene
 from polarguide.capture.presentation import Crop
 from polarguide.geometry.scene_frame import scene_frame
-from polarguide.raster import choose_backend
 from polarguide.raster.magnification import footprints
 from polarguide.recipes import recipe_named
-from polarguide.runs.folder import resolve
-from polarguide.runs.train import train
 from polarguide.shading.result import LAYERS, POLARIZED
-from polarguide.training.angles.trainer import AngleTrainer
-from polarguide.training.settings import TrainSettings
 from polarguide.viewer.scenery import (
     BESIDE,
     MEASURED,
     Appearance,
     Painter,
-    Scenery,
-    run_scenery,
     training_scenery,
 )
 from polarguide.viewer.server import view_run
@@ -225,39 +219,14 @@ def test_gaussians_are_drawn_with_the_blur_of_their_training() -> None:
         assert float((pictures[1] - pictures[0]).max()) > 0.05
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Scenery:
-    folder = tmp_path_factory.mktemp("trained") / "run"
-    return run_scenery(train(SCENE, folder, recipe="3dgs", settings=TrainSettings(steps=3)))
-
-
-@pytest.mark.parametrize("layer", ["final", "normal", "depth", "alpha", "photograph", "error"])
-def test_pictures_have_the_windows_size(trained: Scenery, layer: str) -> None:
-    view = SCENE.views[0]
-    picture = Painter(AROUND).paint(trained, view.camera, Appearance(layer=layer), view)
-    assert picture.shape == (32, 40, 3)
-
-
-def test_a_layer_that_there_is_not_is_not_drawn(trained: Scenery) -> None:
-    assert Painter(AROUND).paint(trained, SCENE.views[0].camera, Appearance(layer="specular")) is None
-
-
-def test_what_is_cropped_is_black(trained: Scenery) -> None:
-    nothing = Crop((0.9, 0.9, 0.9), (0.91, 0.91, 0.91))
-    picture = Painter(AROUND).paint(trained, SCENE.views[0].camera, Appearance(crop=nothing))
-    assert int(picture.max()) < 5
-
-
-def test_a_training_is_shown_without_a_change() -> None:
-    recipe = recipe_named("3dgs")
-    looked, alone = (
-        AngleTrainer(SCENE, recipe, resolve(TrainSettings(steps=20), SCENE, recipe), choose_backend("cpu"))
-        for _ in range(2)
-    )
+def test_a_training_is_shown_without_a_change(tiny_scene: Scene) -> None:
+    looked, alone = (make_trainer(tiny_scene, recipe_named("3dgs"), 20) for _ in range(2))
+    camera = tiny_scene.views[0].camera
     for _ in range(20):
-        looked.step(), alone.step()
+        looked.step()
+        alone.step()
         made = training_scenery(looked)
         assert f"step {looked.state.step} of 20" in made.status
-        made.render(SCENE.views[0].camera.downscaled(2), depth=True)
+        made.render(camera, depth=True)
     one, other = looked.state.tensors(), alone.state.tensors()
     assert [name for name in one if one[name].numpy().tobytes() != other[name].numpy().tobytes()] == []

@@ -215,17 +215,15 @@ class Evidence:
     Attributes:
         views: all training views, with what is believed of their pictures. polarization: what it rests on.
         filters: whether the recipe learns what is behind filters.
-        steps_a_view: how many steps take as long as a look at a view, at most.
     """
 
     views: Sequence[View]
     polarization: Polarization
     filters: bool
-    steps_a_view: float
 
     def chosen(self, steps: int) -> list[View]:
         """Views to look at after a training of so many steps, spread evenly: see ``TIME_SHARE``."""
-        count = min(MOST_VIEWS, len(self.views), int(TIME_SHARE * steps / self.steps_a_view))
+        count = min(MOST_VIEWS, len(self.views), int(TIME_SHARE * steps))
         places = torch.linspace(0, len(self.views) - 1, count).round().long().tolist() if count else []
         return [self.views[place] for place in places]
 

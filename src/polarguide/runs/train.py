@@ -332,8 +332,7 @@ def _evidence(trainer: AngleTrainer, recipe: Recipe) -> Evidence:
     priors = any(stage.weights.priors for stage in recipe.stages)
     judgments = trainer.polarizers.judgments()
     polarization = Polarization.of(views, judgments, measured=priors, fitted=filters)
-    # A look at a view takes two renderings without gradients, a third of a step each.
-    return Evidence(views, polarization, filters=filters, steps_a_view=1.0)
+    return Evidence(views, polarization, filters=filters)
 
 
 def ignored_filters(recipe: str) -> str:

@@ -2,12 +2,12 @@
 
 from polarguide.core.options import LOOPBACK
 from polarguide.viewer.cameras import photographs
-from polarguide.viewer.scenery import GaussianScenery, run_scenery, training_scenery
+from polarguide.viewer.scenery import Scenery, run_scenery, training_scenery
 from polarguide.viewer.server import Viewer, viewing_address
 
 __all__ = [
     "LOOPBACK",
-    "GaussianScenery",
+    "Scenery",
     "Viewer",
     "photographs",
     "run_scenery",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -34,31 +33,9 @@ from polarguide.visualization.layers import (
 )
 
 
-class Scenery(Protocol):
-    """The source of a viewer's pictures."""
-
-    @property
-    def status(self) -> str:
-        """A line about it."""
-
-    def render(
-        self,
-        camera: Camera,
-        *,
-        depth: bool,
-        surface: bool = False,
-        within: Callable[[Tensor], Tensor] | None = None,
-        turn: Tensor | None = None,
-    ) -> RenderResult:
-        """All layers, on the CPU: see ``GaussianScenery.render``."""
-
-    def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
-        """The Stokes vectors [3, H, W, 3] that a result predicts; None: none."""
-
-
 @dataclass(frozen=True, eq=False)
-class GaussianScenery:
-    """Gaussians to be rendered.
+class Scenery:
+    """Gaussians to be rendered: the source of a viewer's pictures.
 
     Attributes:
         gaussians: the Gaussians. light: learned, by name.
@@ -127,7 +104,7 @@ def run_scenery(run: OpenedRun) -> Scenery:
     """A trained run."""
     model = run.model
     status = f"{run.recipe.name}, {run.steps:,} steps; {model.size}"
-    return GaussianScenery(
+    return Scenery(
         model.state.gaussians,
         model.light,
         model.shading,
@@ -145,7 +122,7 @@ def training_scenery(trainer: AngleTrainer) -> Scenery:
     stage = trainer.schedule.at(min(state.step, steps - 1)).stage
     progress = f"step {state.step:,} of {steps:,} ({stage.name})"
     status = f"{trainer.recipe.name}, {progress}; {len(state.gaussians):,} Gaussians"
-    return GaussianScenery(
+    return Scenery(
         state.gaussians,
         state.light,
         trainer.shading if stage.reflection else PLAIN,

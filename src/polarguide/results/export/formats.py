@@ -213,7 +213,7 @@ def _splat_usdz(run: OpenedRun, presented: Presented, path: Path) -> list[Path]:
 def _mesh(
     run: OpenedRun, presented: Presented, folder: Path, resolution: int, reporter: Reporter
 ) -> list[Path]:
-    mesh = scene_mesh(run.cameras, presented.surface_view(run, "format mesh"), resolution=resolution)
+    mesh = scene_mesh(run.cameras, presented.surface_view(run), resolution=resolution)
     mesh = mesh.within(presented.subject.holds(torch.from_numpy(mesh.surface.vertices)).numpy())
     colors = colored(torch.from_numpy(mesh.colors), presented.presentation.color).clamp(max=1)
     mesh = replace(mesh, colors=colors.numpy())
@@ -246,7 +246,7 @@ def _charted(
     reporter: Reporter,
     kind: str,
 ) -> Charted:
-    view = presented.surface_view(run, f"format {kind}")
+    view = presented.surface_view(run)
     with temporary_folder(folder / kind) as parts:
         inside = presented.subject.inside
         return charted_subject(run, view, inside, options, resolution, parts, reporter)
@@ -288,7 +288,7 @@ def _stl(
     reporter: Reporter,
 ) -> list[Path]:
     """For 3D printing: closed, in millimeters where the scale is known, and with up along z, as slicers have it."""
-    view, options = presented.surface_view(run, "format stl"), replace(options, close_bottom=True)
+    view, options = presented.surface_view(run), replace(options, close_bottom=True)
     inside = presented.subject.inside
     surface, _, _ = subject_surface(run, view, inside, options, resolution, reporter)
     right, up, back = run.frame.panorama_axes().numpy().T
@@ -338,7 +338,6 @@ def _all(
 
 def _points(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
     path, model, placement = folder / "points.ply", run.model, presented.placement
-    assert presented.gaussians is not None
     views, rasterize = run.scene.views, model.backend.rasterize
     places, normals, linear = surface_points(presented.gaussians, model.shading, views, rasterize)
     colors = srgb_encode(colored(linear, presented.presentation.color).clamp(0, 1))

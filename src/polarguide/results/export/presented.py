@@ -15,7 +15,6 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.geometry.camera import Camera
 from polarguide.results.export.placement import Origin, Placement, comments
 from polarguide.results.rendering.subject import Subject, subject_of
-from polarguide.runs.model import GaussianModel
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import Parameters
@@ -51,11 +50,10 @@ class Presented:
         if self.poses is not None or self.presentation.crop is not None:
             self.subject = subject_of(run, masked=masked)
         model = run.model
-        self.gaussians: Parameters | None = None
-        self.footprints: Tensor | None = None
-        self.inside: Tensor | None = None
-        if isinstance(model, GaussianModel):
-            self._choose(model, run, reporter)
+        self.inside = self._chosen(run, reporter)
+        self.gaussians: Parameters = model.state.gaussians.only(self.inside)
+        footprints = model.state.footprints
+        self.footprints = None if footprints is None else footprints[self.inside]
         chosen = self.presentation.up_axis is not None
         around = run.frame if chosen or (axes == "upright" and self.poses is not None) else None
         self.placement = Placement.of(self.presentation, around)
@@ -78,11 +76,9 @@ class Presented:
         )
         return None
 
-    def _choose(self, model: GaussianModel, run: OpenedRun, reporter: Reporter) -> None:
-        """Take the Gaussians of the subject."""
-        gaussians = model.state.gaussians
-        footprints = model.state.footprints
-        inside = self.subject.holds(gaussians["means"])
+    def _chosen(self, run: OpenedRun, reporter: Reporter) -> Tensor:
+        """Which Gaussians belong to the subject, [N] bool."""
+        inside = self.subject.holds(run.model.state.gaussians["means"])
         kept = int(inside.sum())
         if not kept:
             raise PolarguideError(
@@ -93,9 +89,7 @@ class Presented:
             )
         if line := self.subject.told(kept, len(inside), run):
             reporter.say(line)
-        self.inside = inside
-        self.gaussians = gaussians.only(inside)
-        self.footprints = None if footprints is None else footprints[inside]
+        return inside
 
     @property
     def centers(self) -> Tensor | None:
@@ -112,16 +106,14 @@ class Presented:
         """For the head of a file."""
         return comments(self.origin, self.placement)
 
-    def surface_view(self, run: OpenedRun, what: str) -> Callable[[Camera], RenderResult]:
+    def surface_view(self, run: OpenedRun) -> Callable[[Camera], RenderResult]:
         """Renders a view of the Gaussians of the subject, with the surface at the median depth."""
         model = run.model
-        gaussians = self.gaussians
-        assert gaussians is not None
 
         @torch.no_grad()
         def surface_view(camera: Camera) -> RenderResult:
             return render(
-                gaussians,
+                self.gaussians,
                 camera,
                 model.backend.rasterize,
                 RenderRequest(depth=True, at_median_depth=True),

@@ -54,7 +54,6 @@ def share(
     model = run.model
     views = run.scene.test_views + run.scene.train_views
     presented = Presented(run, reporter=reporter)
-    assert presented.gaussians is not None
     scored = (run.folder / METRICS_FILE).exists()
     record = read_metrics(run.folder) if scored else None
     scores = [] if record is None else shown_metrics(record, scores_only=True)

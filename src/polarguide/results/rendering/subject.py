@@ -15,7 +15,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import Reporter
 from polarguide.core.text import command
 from polarguide.geometry.camera import Camera, seen_at
-from polarguide.runs.model import GaussianModel, Within
+from polarguide.runs.model import Within
 from polarguide.runs.opened import OpenedRun
 
 Inside = Callable[[NDArray[Any]], NDArray[np.bool_]]
@@ -92,8 +92,8 @@ def subject_of(run: OpenedRun, *, masked: bool = False) -> Subject:
     return Subject(_looked_at([*run.poses.values()]), "what most of the cameras have in their pictures")
 
 
-def part_shown(run: OpenedRun, reporter: Reporter) -> Within | None:
-    """The part of a run that a film shows, as renderings take it; None: all, as for a field.
+def part_shown(run: OpenedRun, reporter: Reporter) -> Within:
+    """The part of a run that a film shows, as renderings take it.
 
     Args:
         run: the run. reporter: receives the line of ``Subject``.
@@ -101,8 +101,6 @@ def part_shown(run: OpenedRun, reporter: Reporter) -> Within | None:
     Raises:
         PolarguideError: the scene is not there any more.
     """
-    if not isinstance(run.model, GaussianModel):
-        return None
     subject = subject_of(run)
     inside = subject.holds(run.model.state.gaussians["means"])
     if line := subject.told(int(inside.sum()), len(inside), run):
