@@ -14,7 +14,6 @@ from viewer_scenes import frame_of_scene, photograph, shown
 
 from polarguide.capture import Scene
 from polarguide.capture.presentation import Crop
-from polarguide.geometry.scene_frame import scene_frame
 from polarguide.raster.magnification import footprints
 from polarguide.recipes import recipe_named
 from polarguide.shading.result import LAYERS, POLARIZED
@@ -203,10 +202,6 @@ def test_colors_of_depths_stay_while_the_camera_moves():
     moving = painter.paint(seen, nearer, depth, settled=False)
     assert not np.array_equal(moving, painter.paint(seen, nearer, depth, settled=True))
     assert np.array_equal(painter.paint(seen, CAMERA, depth), first)
-
-
-SCENE = textured_ball(views=6, width=40, height=32, tests=1, radius=1.2)
-AROUND = scene_frame([view.camera for view in SCENE.views])
 
 
 def test_gaussians_are_drawn_with_the_blur_of_their_training() -> None:
