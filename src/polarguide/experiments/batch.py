@@ -30,10 +30,11 @@ from polarguide.experiments.collection import (
     source_stamp,
 )
 from polarguide.experiments.compare import locked
+from polarguide.experiments.csv_files import csv_text
 from polarguide.experiments.job_queue import Job, run_jobs, training_progress
 from polarguide.experiments.options import BatchOptions
 from polarguide.experiments.plan import jobs_at_a_time, own_gpus
-from polarguide.experiments.tables import csv_text, formatted
+from polarguide.experiments.tables import formatted
 from polarguide.inspection.report import FILE as INSPECTION_PAGE
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.raster import choose_backend
