@@ -11,13 +11,13 @@ from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 from msgspec import UNSET
 
 from polarguide.core.files import write_text
-from polarguide.core.text import plain, printable
+from polarguide.core.text import printable
 from polarguide.results.evaluation.table import COLUMNS, MESH_LABEL, PART_METRICS, Metric
 from polarguide.visualization.pages import templates
+from polarguide_bench.csv_files import csv_text
 from polarguide_bench.record import RunRecord
 from polarguide_bench.results import (
     Cell,
@@ -428,8 +428,3 @@ def write_tables(out: Path, results: Results) -> None:
 def readable(tables: Sequence[Section], name: str) -> str:
     """Tables with their notes, as ``results.md`` or ``results.tex``."""
     return _TEXTS.get_template(name).render(sections=tables)
-
-
-def csv_text(frame: pd.DataFrame) -> str:
-    """A frame in full precision; nothing in it is a formula to a spreadsheet."""
-    return frame.map(plain).to_csv(index=False, lineterminator="\n")

@@ -16,7 +16,7 @@ from polarguide.capture.exposures import FOUR
 from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
 from polarguide.capture.filter.develop import align_shots, estimate_shifts, linear_intensities, moved_shots
 from polarguide.capture.filter.encoding import transfer_of_set
-from polarguide.capture.filter.shots import Shots, read_shots, require_four_shots, stacked
+from polarguide.capture.filter.shots import _READ, Shots, read_stack, require_four_shots, stacked
 from polarguide.capture.layout import (
     KEPT,
     READ,
@@ -41,7 +41,7 @@ from polarguide.capture.view_reader import ViewData, read_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_file
 from polarguide.preparation.mosaic_source import MosaicFiles, block_intensities, sample_blocks
-from polarguide.preparation.shot_exposures import corrected_note, exposures_of_view, stated_exposures
+from polarguide.preparation.shot_exposures import exposures_of_view, stated_exposures
 from polarguide_shots.maps import (
     Developed,
     Map,
@@ -58,6 +58,7 @@ from polarguide_shots.options import ShotOptions
 from polarguide_shots.samples import (
     SetSamples,
     behind_lens,
+    corrected_note,
     levels_of_shot,
     piled_up,
     read_set,
@@ -440,3 +441,14 @@ def _undistorted(
         pair_ratio=pair_ratio(gray, good),
         notes=(),
     )
+
+
+def read_shots(files: dict[int, Path], *, levels: Levels | None = None) -> Shots:
+    """Read the four shots of a view, as ``read_stack`` does.
+
+    Raises:
+        PolarguideError: one cannot be read, or they differ in size, depth or orientation.
+    """
+    remedy = "Make the pictures smaller, all by the same factor."
+    require_memory_of_each(list(files.values()), _READ, "four shots", remedy=remedy)
+    return read_stack([files[angle] for angle in ANGLES], levels=levels)

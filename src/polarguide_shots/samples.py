@@ -27,7 +27,7 @@ from polarguide.capture.sensor.pattern import FULL_16, Levels, clipping_bits, es
 from polarguide.capture.view import View
 from polarguide.capture.view_reader import ViewData, require_alike
 from polarguide.core.errors import PolarguideError
-from polarguide.preparation.shot_exposures import corrected_note, stated_exposures
+from polarguide.preparation.shot_exposures import stated_exposures
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.sets import SetPicture, known_places, read_frames
 
@@ -333,3 +333,8 @@ def _degrees(angle: Angle) -> float:
 def _unused(count: int) -> tuple[str, ...]:
     """The note about pictures that a fit cannot use."""
     return (f"{count} pictures without a known angle are not used.",) if count else ()
+
+
+def corrected_note(stated: Sequence[float]) -> str:
+    """The exposures of a single shot that its files state, for the user."""
+    return f"The files state exposures that differ by a factor of {max(stated) / min(stated):.3g}; corrected."

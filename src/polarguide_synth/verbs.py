@@ -30,8 +30,8 @@ def synth(
 ) -> None:
     """Render a polarized scene with ground truth: a preset (figure, kit, car, cup, water, proof, ...) or a scene file.
 
-    Needs Mitsuba (pip install '.[synth]' in polarguide's source folder). A rendering that was stopped goes on with the
-    same command. docs/reference/scene-files.md describes scene files and what is written.
+    Needs Mitsuba (pip install 'mitsuba==3.9.*'). A rendering that was stopped goes on with the same command.
+    docs/reference/scene-files.md describes scene files and what is written.
 
     Args:
         scene: Name of a preset (docs/how-to/synthesize.md lists them), or path of a scene file in JSON.

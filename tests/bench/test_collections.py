@@ -129,10 +129,14 @@ def test_a_capture_is_known_by_its_content(tmp_path: Path) -> None:
     Fault(str(folder), "(stamp)", "files that have changed").raised_by(old.require, again, folder)
 
 
-def test_damaged_health_is_a_remark_of_its_capture(tmp_path: Path) -> None:
+@pytest.mark.parametrize("content", ["{", "[]", '{"views": 3}', "\0", None])
+def test_damaged_health_is_a_remark_of_its_capture(tmp_path: Path, content: str | None) -> None:
     folder = tmp_path / "captures" / "a"
     (folder / "run").mkdir(parents=True)
-    (folder / "run" / "health.json").write_text("{")
+    if content is None:
+        (folder / "run" / "health.json").symlink_to("nowhere")
+    else:
+        (folder / "run" / "health.json").write_text(content)
     request = _task(Capture("a", tmp_path, PrepareSettings()), tmp_path, OPTIONS).request
     row = Row(
         "a",
@@ -144,7 +148,8 @@ def test_damaged_health_is_a_remark_of_its_capture(tmp_path: Path) -> None:
     )
     first, second = row.remarks()
     assert first == "x"
-    assert "health.json: expected a JSON file" in second
+    assert "health.json" in second
+    assert "expected a" in second
 
 
 def test_settings_survive_their_way(tmp_path: Path) -> None:

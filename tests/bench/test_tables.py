@@ -12,6 +12,7 @@ import pytest
 from comparison_records import part, results, run, unfinished
 
 from polarguide.results.evaluation.table import COLUMNS
+from polarguide_bench.csv_files import csv_text
 from polarguide_bench.report import (
     curves_svg,
     exposure_svg,
@@ -26,7 +27,6 @@ from polarguide_bench.tables import (
     Section,
     against_section,
     control_section,
-    csv_text,
     latex_text,
     notes,
     part_section,
@@ -222,14 +222,26 @@ def test_what_polarization_buys_by_object_is_paired_by_seed() -> None:
 
 
 def test_frames_are_the_csv_files(tmp_path: Path) -> None:
-    runs = [seen("x, y", "r", s, ball=ball(psnr=30.123456789 + s), rock=part(None, psnr=1.0)) for s in (0, 1)]
-    found = results([*runs, *(run("x, y", FREE, s, psnr=28.0) for s in (0, 1)), run("z", "r", 0, psnr=1.0)])
+    parts = {
+        "ball": ball(psnr=30.123456789, metal_share=0.75),
+        "rock": part(None, psnr=1.0),
+    }
+    runs = [seen("x, y", "r", s, **parts) for s in (0, 1)]
+    runs += [run("x, y", FREE, s, psnr=28.0, haze=0.125 + s / 8) for s in (0, 1)]
+    found = results([*runs, run("z", "r", 0, psnr=1.0)])
     write_tables(tmp_path, found)
     scores = pd.read_csv(tmp_path / "results.csv")
-    pd.testing.assert_frame_equal(scores, found.scores, check_dtype=False)
-    assert scores.columns.tolist() == [
-        "scene", "recipe", "runs", *(f"{c.key}{end}" for c in COLUMNS for end in ("", "_spread")),
-    ]  # fmt: skip
+    assert scores.columns.tolist()[:5] == ["scene", "recipe", "runs", "psnr", "psnr_spread"]
+    assert len(scores.columns) == 3 + 2 * len(COLUMNS)
+    same = [name for name in scores.columns if name in found.scores.columns]
+    pd.testing.assert_frame_equal(scores[same], found.scores[same], check_dtype=False)
+    # Shares are in percent, as tables show them, and their names say so.
+    assert {c.key for c in COLUMNS} - set(same) == {
+        c.key for c in COLUMNS if c.unit == "%" and c.factor == 100
+    }
+    free = scores.set_index(["scene", "recipe"]).loc[("x, y", FREE)]
+    assert free["haze_percent"] == 18.75
+    assert free["haze_percent_spread"] == pytest.approx(12.5 / 2**0.5)
     differences = pd.read_csv(tmp_path / "differences.csv")
     assert differences["mean"].tolist() == found.differences["mean"].tolist()
     parts = pd.read_csv(tmp_path / "parts.csv").set_index("name")
@@ -237,8 +249,9 @@ def test_frames_are_the_csv_files(tmp_path: Path) -> None:
         "object",
         "metal",
         2,
-        30.623456789,
+        30.123456789,
     ]
+    assert parts.loc["ball", "metal_share_percent"] == 75
     # What an earlier comparison in the folder had, and this one has not, goes.
     write_tables(tmp_path, results([run("z", "r", 0, psnr=1.0)]))
     assert sorted(path.suffix for path in tmp_path.iterdir()) == [".csv", ".json", ".md", ".tex"]

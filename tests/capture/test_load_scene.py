@@ -180,6 +180,18 @@ def test_materials_of_lossy_files_are_refused(
         Fault(str(path), expected="lossless", remedy="PNG").raised_by(load_scene, capture.root)
 
 
+@pytest.mark.parametrize("folder", ["materials", "masks", "gt"])
+@pytest.mark.parametrize("how", ["link", "file"])
+def test_a_folder_of_a_scene_that_is_none_is_refused(capture: TinyCapture, folder: str, how: str) -> None:
+    path = capture.root / folder
+    shutil.rmtree(path, ignore_errors=True)
+    if how == "link":
+        path.symlink_to("nowhere")
+    else:
+        path.write_text("labels")
+    Fault(str(path), "a folder of files called like the views").raised_by(load_scene, capture.root)
+
+
 def test_materials_of_any_number_of_views(capture: TinyCapture) -> None:
     numbers = np.zeros((10, 12), np.uint8)
     numbers[:, 4:8], numbers[:, 8:] = 1, 2

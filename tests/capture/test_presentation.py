@@ -44,6 +44,10 @@ def test_what_is_written_is_read_and_what_is_missing_is_left_out(tmp_path: Path)
     assert json.loads((tmp_path / PRESENTATION_FILE).read_text()) == {"author": "A"}
 
 
+def with_matrix(matrix: str) -> str:
+    return f'{{"chart": {{"matrix": {matrix}, "delta_e": 1, "delta_e_worst": 1, "patches": 9, "view": "v"}}}}'
+
+
 @pytest.mark.parametrize(
     ("text", "fault"),
     [
@@ -60,11 +64,10 @@ def test_what_is_written_is_read_and_what_is_missing_is_left_out(tmp_path: Path)
         ('{"licence": "CC0"}', Fault(expected="only white_balance, chart", found="licence")),
         ('{"title": "' + 1001 * "x" + '"}', Fault("(title)")),
         ("[]", Fault(expected="JSON object")),
-        (
-            '{"chart": {"matrix": [[1, 0, 0], [0, -1, 0.5], [0, 0, 1]], "delta_e": 1, "delta_e_worst": 1, '
-            '"patches": 9, "view": "v"}}',
-            Fault("matrix", expected="positive sums", found="-0.5"),
-        ),
+        (with_matrix("[[1, 0, 0], [0, -1, 0.5], [0, 0, 1]]"), Fault("matrix", "positive sums", "-0.5")),
+        (with_matrix("[[-1, 0, 0], [0, -1, 0], [0, 0, -1]]"), Fault("matrix", "positive sums", "-1")),
+        (with_matrix("[[0, 0, 0], [0, 0, 0], [0, 0, 0]]"), Fault("matrix", "an inverse")),
+        (with_matrix("[[1, 0, 0], [0, 1, 0], [0, 0, NaN]]"), Fault("matrix")),
     ],
 )
 def test_what_is_wrong_is_refused_by_name(text: str, fault: Fault, tmp_path: Path) -> None:

@@ -74,6 +74,19 @@ def test_what_has_no_value_is_named_once_and_a_reason_keeps_its_brackets(
     assert "n/a (pip install 'a[b]')" in printed
 
 
+@pytest.mark.parametrize("label", ["[/b]", "[red]", HOSTILE])
+def test_labels_and_units_of_plug_ins_are_rows_of_the_table(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, label: str
+) -> None:
+    plugged = table.Metric("mine", label, label, 1, "lower")
+    monkeypatch.setattr(table, "METRICS", (*METRICS, plugged))
+    print_scores({"mine": 0.5, "objects": {}}, "scores")
+    printed = capsys.readouterr().out
+    assert printable(label) in printed
+    assert f"0.500 {printable(label)}" in printed
+    assert "\x1b" not in printed
+
+
 def test_lines_are_shown_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
     say(f"trained: o[/red]{HOSTILE}")
     said = capsys.readouterr().out

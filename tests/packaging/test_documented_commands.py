@@ -105,6 +105,16 @@ def single_shots(folder: Path) -> None:
         shutil.copy(shots / str(ANGLES[number % 4]) / f"{name}.png", folder / f"{name}.png")
 
 
+def photographs(folder: Path) -> None:
+    """Pictures of the relief in color, without a filter."""
+    shots = folder.with_name("shots-of-photographs")
+    folder.mkdir()
+    for name in write_relief(shots):
+        pair = [cv2.imread(str(shots / angle / f"{name}.png"), cv2.IMREAD_UNCHANGED) for angle in ("0", "90")]
+        light = (pair[0] / 2 + pair[1] / 2) * [0.6, 0.8, 1.0]
+        cv2.imwrite(str(folder / f"{name}.png"), light.astype(np.uint16))
+
+
 def polarizer_shots(folder: Path) -> None:
     """A polarizer before the sensor, every 15 degrees."""
     write_polarizer_shots(folder.parent, made_sensor("IMX250MYR"), [15.0 * k for k in range(12)])
@@ -129,8 +139,8 @@ def misnamed(folder: Path) -> None:
 
 INPUTS: dict[str, dict[str, Callable[[Path], object]]] = {
     "calibrate": {"SHOTS": polarizer_shots},
-    "prepare": {"RAW": raw_mosaics, "SHOTS": write_relief, "PHOTOS": single_shots},
-    "prepare --angles": {"SHOTS": single_shots, "PHOTOS": single_shots},
+    "prepare": {"RAW": raw_mosaics, "SHOTS": write_relief, "PHOTOS": photographs},
+    "prepare --angles": {"SHOTS": single_shots},
     "inspect --fix": {"SCENE": misnamed},
     "priors": {"part.png": one_part},
     "measure": {"PARTS": lambda folder: write_mosaics(folder, 2, color=False)},

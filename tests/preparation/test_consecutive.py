@@ -96,20 +96,41 @@ def test_every_picture_alone_is_said(tmp_path: Path) -> None:
     assert any("Every picture is a view of its own" in text for text in heard.said)
 
 
-def test_pictures_without_a_sign_of_a_filter_are_photographs(tmp_path: Path) -> None:
-    write_shots_in_a_row(tmp_path / "in", (0,))
+def colored(bits: int) -> np.ndarray:
+    return (np.random.default_rng(0).uniform(0, 1, (48, 64, 3)) * (2**bits - 1)).astype(f"u{bits // 8}")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "pixels"),
+    [
+        ("jpg", colored(8)),
+        ("png", colored(8)),
+        ("png", colored(16)),
+        ("tif", colored(16)),
+        ("jpg", colored(8)[..., 0]),  # mosaics are no JPEG files
+    ],
+)
+def test_pictures_without_a_sign_of_a_filter_are_photographs(
+    tmp_path: Path, suffix: str, pixels: np.ndarray
+) -> None:
+    (tmp_path / "in").mkdir()
+    for name in "abc":
+        assert cv2.imwrite(str(tmp_path / "in" / f"{name}.{suffix}"), pixels)
     heard = Heard()
     prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN, heard)
     assert any("Nothing tells of a filter" in text for text in heard.said)
-    assert (tmp_path / "out" / "polar" / "DSC_0001_none.png").exists()
+    assert (tmp_path / "out" / "polar" / "a_none.png").exists()
 
 
-def test_gray_pictures_may_be_mosaics(tmp_path: Path) -> None:
+@pytest.mark.parametrize("suffix", ["png", "tif", "bmp"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_gray_pictures_may_be_mosaics(tmp_path: Path, suffix: str, channels: int) -> None:
+    (tmp_path / "in").mkdir()
+    gray = np.repeat(colored(8)[..., :1], channels, axis=2)
     for name in "abc":
-        write_picture(tmp_path / "in" / f"{name}.png", np.full((48, 64, 3), 0.4))
-    Fault(expected="shots through a filter, raw mosaics").raised_by(
-        prepare_scene, tmp_path / "in", tmp_path / "out", PLAIN
-    )
+        assert cv2.imwrite(str(tmp_path / "in" / f"{name}.{suffix}"), gray)
+    fault = Fault(expected="photographs in color", found="a." + suffix, remedy="--angles none")
+    fault.raised_by(prepare_scene, tmp_path / "in", tmp_path / "out", PLAIN)
 
 
 def write_video(path: Path, frames: int = 60) -> None:

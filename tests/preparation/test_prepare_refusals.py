@@ -77,7 +77,7 @@ MOSAICS: dict[str, tuple[Callable[[Path], object], PrepareSettings, Fault]] = {
     "width of other files": (lambda d: None, replace(MOSAIC, width=32), Fault(expected="32x48", found="64x48")),
     "no sensor": (
         lambda d: None, replace(MOSAIC, sensor=None),
-        Fault(expected="with --sensor,", found="3 pictures", remedy="--sensor IMX250MYR")
+        Fault(expected="photographs in color", found="which is gray", remedy="Raw mosaics: --sensor, one of IMX250MYR")
     ),
     "unknown sensor": (lambda d: None, replace(MOSAIC, sensor="IMX1"), Fault("--sensor", "IMX250MYR,", "IMX1")),
     "gray white balance": (

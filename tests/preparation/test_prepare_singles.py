@@ -395,6 +395,14 @@ def test_one_file_in_two_forms_of_unicode_is_listed_twice(tmp_path: Path) -> Non
     )
 
 
+@pytest.mark.parametrize("again", ["./a.png", "../in/a.png", "link.png"])
+def test_one_file_under_two_spellings_is_listed_twice(tmp_path: Path, again: str) -> None:
+    write_three(tmp_path / "in", ("a.png", "b.png"))
+    (tmp_path / "in" / "link.png").symlink_to("a.png")
+    (tmp_path / "in" / "angles.csv").write_text(f"file,angle\na.png,0\n{again},20\nb.png,1\n")
+    refused(tmp_path, PLAIN, Fault("line 3", expected="one line for each file", found="two for a.png"))
+
+
 def test_a_table_with_semicolons_and_another_form_of_unicode(tmp_path: Path) -> None:
     write_three(tmp_path / "in", ("u\u0308.png", "b.png"))
     (tmp_path / "in" / "angles.csv").write_text("file;angle\n\u00fc.png;22.5\nb.png;0\n", encoding="utf-8")

@@ -101,6 +101,9 @@ def test_frames_of_a_video(tmp_path: Path) -> None:
     np.testing.assert_allclose(maps.stokes, SMALL, atol=0.02)
     (tmp_path / "turn.csv").write_text("frame,angle\n0,0\n8,60\n99,120\n")
     Fault(expected="frame 99").raised_by(read_shot, path)
+    for number in ("9" * 4301, "-1", "1e400", "1.5"):
+        (tmp_path / "turn.csv").write_text(f"frame,angle\n0,0\n{number},60\n")
+        Fault("line 3", expected="a frame", found=number[:80]).raised_by(read_shot, path)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from polarguide.capture.colmap.model import holds_model, view_of_name
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
 from polarguide.capture.exposures import TABLE, angles_of_names, folders_of_angles, parse_angle
-from polarguide.capture.filter.camera_files import QUARTER_TURNS, TURNS, is_camera_raw
+from polarguide.capture.filter.camera_files import QUARTER_TURNS, TURNS
 from polarguide.capture.filter.consecutive import extract_frames, find_videos, shots_of_one_place
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
 from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, read_picture
@@ -179,9 +179,17 @@ def _require_photographs(root: Path) -> None:
             one place, as shots through a filter do.
     """
     files = list(index_files(root, SHOT_SUFFIXES).values())
-    mosaics = index_files(root, tuple(set(RAW_SUFFIXES) - set(SHOT_SUFFIXES)))
-    if mosaics or not files or not all(map(_is_colored, {files[0], files[-1]})):
+    if not files or index_files(root, tuple(set(RAW_SUFFIXES) - set(SHOT_SUFFIXES))):
         raise _unknown_layout(root)
+    gray = [path.name for path in (files[0], files[-1]) if _may_be_mosaic(path)]
+    if gray:
+        raise PolarguideError(
+            root,
+            expected="photographs in color, or an option that says what gray pictures are",
+            found=f"{gray[0]}, which is gray",
+            remedy=f"Raw mosaics: --sensor, one of {SENSOR_NAMES}. Ordinary photographs: --angles none. Shots through "
+            "a filter: --angles unknown, or angles in their names.",
+        )
     each = shots_of_one_place(files)
     if each is not None:
         angles = ",".join(f"{180 * k / each:g}" for k in range(each))
@@ -194,12 +202,12 @@ def _require_photographs(root: Path) -> None:
         )
 
 
-def _is_colored(path: Path) -> bool:
-    """True where a picture has colors. Mosaics have none."""
-    if is_camera_raw(path):
-        return True
+def _may_be_mosaic(path: Path) -> bool:
+    """Whether a picture may be a raw mosaic: it has no colors, and its kind of file holds mosaics."""
+    if path.suffix.lower() not in RAW_SUFFIXES:
+        return False
     pixels = decode_picture(path, read_picture(path))
-    return bool((pixels[..., 0] != pixels[..., 1]).any())
+    return not (pixels[..., 0] != pixels[..., 1]).any()
 
 
 def frames_of_video(
@@ -254,18 +262,11 @@ def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
 
 
 def _unknown_layout(root: Path) -> PolarguideError:
-    """The error that nothing tells mosaics from ordinary pictures: what is there, and the commands for either."""
-    photographs = index_files(root, tuple(set(SHOT_SUFFIXES) - set(RAW_SUFFIXES)))
+    """The error that files say nothing of what they are: what is there, and the commands."""
     mosaics = index_files(root, RAW_SUFFIXES)
     folders = sorted(path.name for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
-    named = (
-        listed(sorted(path.name for path in {**photographs, **mosaics}.values()))
-        if photographs or mosaics
-        else ""
-    )
-    found = (
-        f"{len(photographs) + len(mosaics)} pictures without angles in their names ({named})" if named else ""
-    )
+    named = listed(sorted(path.name for path in mosaics.values()))
+    found = f"{len(mosaics)} pictures without angles in their names ({named})" if named else ""
     found = " and ".join(part for part in (found, f"folders {listed(folders)}" if folders else "") if part)
     out = f"--out {shlex.quote(root.resolve().name + '-scene')}"
     source = shlex.quote(str(root))
@@ -276,14 +277,6 @@ def _unknown_layout(root: Path) -> PolarguideError:
     if mosaics:
         command = f"polarguide prepare {source} {out} --sensor IMX250MYR"
         remedy = f"Raw mosaics: {command}, or yours of {SENSOR_NAMES}. {remedy}"
-    if photographs and not mosaics:
-        remedy += (
-            " Photographs through a filter that was turned between them: --angles unknown, or angles.csv with the "
-            f"columns file,angle. Ordinary photographs, without a filter: polarguide prepare {source} {out} --angles "
-            "none (pictures, poses and normals without measured polarization)."
-        )
-        if len(photographs) % len(ANGLES) == 0:
-            remedy += " docs/how-to/prepare.md sorts shots that are numbered in the order they were taken."
     inside = None if named else _folder_of_pictures(root)
     if inside is not None:
         remedy = f"Give the folder that the pictures are in, such as {inside}. {remedy}"

@@ -61,11 +61,6 @@ def stated_exposures(
     return {view: [math.exp(logs[path] - mean) for path in paths] for view, paths in views.items()}, ""
 
 
-def corrected_note(stated: Sequence[float]) -> str:
-    """The exposures of a single shot that its files state, for the user."""
-    return f"The files state exposures that differ by a factor of {max(stated) / min(stated):.3g}; corrected."
-
-
 def exposure_notes(stated: Mapping[str, Sequence[float]]) -> list[str]:
     """The exposures that the files state, in a sentence for the user."""
     if not stated:

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from polarguide._native import MAX_CHANNELS
 from polarguide.geometry.camera import Camera
 from polarguide.raster.cpu import finite, native_rasterizer
 from polarguide.raster.interface import Rasterize, Splats
@@ -60,30 +59,6 @@ def surface_picture(splats: Splats, camera: Camera) -> SurfacePicture:
     rasterizer.surface(*finite(*whole), WIDTH, out)
     directions, depth = out.to(splats.means.device).split((3, 1), dim=-1)
     return SurfacePicture(directions, depth[..., 0])
-
-
-@torch.no_grad()
-def surface_reference(splats: Splats, camera: Camera, rasterize: Rasterize) -> SurfacePicture:
-    """The reference implementation of ``surface_picture``: any dtype and device, a rendering for every 32 Gaussians.
-
-    Args:
-        splats, camera: as there. rasterize: tells the weights, as what is blended of a channel for each Gaussian.
-    """
-    pose = camera.pose(splats.means.dtype, splats.means.device)
-    places = (splats.means - pose.center) @ pose.rotation[2]
-    order = places.argsort(stable=True)
-    whole = Splats(*(t[order] for t in splats))
-    alone = torch.eye(len(order), dtype=places.dtype, device=places.device)
-    parts = [
-        rasterize(whole._replace(features=own), camera).features for own in alone.split(MAX_CHANNELS, dim=1)
-    ]
-    weights = torch.cat(parts, dim=-1)
-    upto, depth = weights.cumsum(dim=-1), places[order]
-    reached = (upto >= upto[..., -1:] / 2) & (weights > 0)
-    median = depth[reached.to(torch.uint8).argmax(dim=-1)]
-    near = weights * torch.exp(-0.5 * ((median[..., None] / depth - 1) / WIDTH).square())
-    near = near / near.sum(dim=-1, keepdim=True).clamp(min=torch.finfo(near.dtype).tiny)
-    return SurfacePicture(near @ whole.features, near @ depth)
 
 
 SLABS = 31

@@ -47,17 +47,6 @@ FOR_STEPS = {"adam", "frozen"}
 """Parts of the names of tensors that only further steps read."""
 
 
-class RecordedRecipe(Protocol):
-    """A recipe as far as a run's folder records it."""
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-
-    def data(self) -> dict[str, Any]:
-        """All values as plain JSON types."""
-
-
 class SavedState(Protocol):
     """The state of a training as far as a checkpoint holds it.
 
@@ -102,7 +91,8 @@ class RunConfiguration:
     def of(
         cls,
         scene: Scene,
-        recipe: RecordedRecipe,
+        recipe: str,
+        recipe_data: dict[str, Any],
         settings: ResolvedSettings,
         device: torch.device,
         painted: str | None = None,
@@ -111,8 +101,8 @@ class RunConfiguration:
         return cls(
             scene=str(scene.root if scene.root == IN_MEMORY else scene.root.resolve()),
             scene_digest=scene.digest,
-            recipe=recipe.name,
-            recipe_data=recipe.data(),
+            recipe=recipe,
+            recipe_data=recipe_data,
             settings=settings,
             downscale=scene.downscale,
             transfer="srgb" if scene.transfer == "srgb" else "linear",

@@ -113,7 +113,9 @@ def train(
         if painted is not None:
             loaded = painted.over(loaded)
         digest = None if painted is None else painted.digest
-        configuration = RunConfiguration.of(loaded, chosen, resolved, backend.device, digest)
+        configuration = RunConfiguration.of(
+            loaded, chosen.name, chosen.data(), resolved, backend.device, digest
+        )
         state = None
         if resume:
             if leads:

@@ -122,7 +122,7 @@ def train_field(
     resolved = resolve_field(settings, whole, recipe, None if earlier is None else earlier.settings)
     loaded = _trained_on(whole, resolved)
     check_trainable(loaded)
-    configuration = RunConfiguration.of(loaded, recipe, resolved, backend.device)
+    configuration = RunConfiguration.of(loaded, recipe.name, recipe.data(), resolved, backend.device)
     if not all(view.is_determined for view in loaded.train_views):
         reporter.warn(ignored_filters(recipe.name))
     return_freed_memory()  # of decoded files

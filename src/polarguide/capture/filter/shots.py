@@ -33,7 +33,6 @@ from polarguide.capture.layout import (
     index_files,
     list_files,
     require_angle_folders,
-    require_memory_of_each,
 )
 from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
@@ -193,17 +192,6 @@ def require_four_shots(root: Path, shots: dict[str, dict[int, Path]]) -> None:
                 found=f"none at {' and '.join(missing)}",
                 remedy="Add the file, or remove the other shots of the view (prepare --format singles takes any).",
             )
-
-
-def read_shots(files: dict[int, Path], *, levels: Levels | None = None) -> Shots:
-    """Read the four shots of a view, as ``read_stack`` does.
-
-    Raises:
-        PolarguideError: one cannot be read, or they differ in size, depth or orientation.
-    """
-    remedy = "Make the pictures smaller, all by the same factor."
-    require_memory_of_each(list(files.values()), _READ, "four shots", remedy=remedy)
-    return read_stack([files[angle] for angle in ANGLES], levels=levels)
 
 
 def read_stack(

@@ -62,8 +62,6 @@ from polarguide.runs.opened import OpenedRun
 from polarguide.visualization import figures
 
 PANORAMA_HEIGHT = 512
-SPLATS = ("ply", "spz", "sog", "splat-glb", "splat-usdz", "points")
-"""Formats of Gaussians."""
 
 
 def export(
