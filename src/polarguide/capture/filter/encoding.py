@@ -19,13 +19,7 @@ from PIL import Image
 
 from polarguide.capture import checks
 from polarguide.capture.exposures import Angle
-from polarguide.capture.filter.camera_files import (
-    is_camera_raw,
-    missing_tags,
-    number_of,
-    read_exposure_data,
-    tags_of,
-)
+from polarguide.capture.filter.camera_files import is_camera_raw, number_of, tags_of
 from polarguide.capture.filter.shots import Shots
 from polarguide.capture.formats.decoders import HIGH_RANGE, heif_colors, is_heif
 from polarguide.capture.formats.integrity import BIG_TIFF, PNG, TIFF, png_chunk
@@ -289,8 +283,8 @@ def given_transfer(kind: str, transfer: str) -> TransferDecision | None:
     return None if transfer == "auto" else TransferDecision(transfer, f"Transfer {transfer}, as given.")
 
 
-Slope = Callable[[str], float | None]
-"""The curvature of the response (``checks.Measures``) that a transfer leaves; None where the light does not tell."""
+Slope = Callable[[str], checks.Curvature | None]
+"""The curvature of the response that a transfer leaves; None where the light does not tell."""
 
 
 def decide_transfer(
@@ -304,8 +298,8 @@ def decide_transfer(
     """
     measured = None if slope is None else slope("linear")
     encoding = checks.encoding(measured)
-    if encoding is not None and slope is not None:
-        note = f"the curvature of the response is {measured:+.2f}; linear files have 0, sRGB about -0.6"
+    if encoding is not None and measured is not None and slope is not None:
+        note = f"the curvature of the response is {measured.value:+.2f}; linear files have 0, sRGB about -0.6"
         doubt = _doubt(slope, encoding)
         if stated is not None and stated[0] != encoding:
             doubt = (
@@ -320,7 +314,10 @@ def decide_transfer(
     if slope is not None:
         untold = ": no two pairs at right angles, or too few pixels are polarized for their sums to tell"
     if measured is not None:
-        untold = f": the curvature of the response is {measured:+.2f}, between those of linear files and sRGB"
+        untold = (
+            f": the curvature of the response is {measured.value:+.2f} +- {measured.error:.2f}; linear files have 0, "
+            "sRGB about -0.6"
+        )
     if kind == PLAIN and eight and slope is not None:
         doubt = (
             "The 8-bit files state no encoding, and their pair sums do not tell it: they are taken as linear. If they "
@@ -335,34 +332,20 @@ def decide_transfer(
     return TransferDecision(usual, note, _doubt(slope, usual))
 
 
-def exposed_alike(paths: Sequence[Path]) -> bool:
-    """True where no file states (EXIF) that the pictures of a view differ in exposure."""
-    taken = {path: read_exposure_data(path) for path in paths}
-    logs = [math.log(light) for data in taken.values() if (light := data.light) is not None]
-    return bool(missing_tags(taken)) or not logs or max(logs) - min(logs) < checks.OTHER_EXPOSURE
-
-
-def slope_of_shots(
-    shots: Sequence[Shots], angles: Sequence[Sequence[Angle]], files: Sequence[Sequence[Path]] = ()
-) -> Slope:
-    """The curvature of the response over some views.
+def slope_of_shots(shots: Sequence[Shots], angles: Sequence[Sequence[Angle]]) -> Slope:
+    """The curvature of the response over some views, whatever the exposures of their pictures.
 
     Args:
         shots: of each view, aligned well enough (as from a tripod). angles: of each view's pictures.
-        files: of each view's pictures; none of pictures in memory.
     """
-    alike = [exposed_alike(paths) for paths in files] or [True] * len(shots)
     pairs = [checks.right_pairs(mine) for mine in angles]
     samples = [checks.sampled(view.pictures) for view in shots]
     usable = [checks.sampled(~(view.clipped.any(axis=0) | view.dark)[None])[0] for view in shots]
 
-    def slope(transfer: str) -> float | None:
-        views = zip(samples, usable, pairs, alike, strict=True)
-        each = (
-            checks.pair_slopes(linear_codes(view, transfer), valid, at, alike=one)
-            for view, valid, at, one in views
-        )
-        return checks.slope(list(itertools.chain.from_iterable(each)))
+    def slope(transfer: str) -> checks.Curvature | None:
+        views = zip(samples, usable, pairs, strict=True)
+        each = (checks.pair_slopes(linear_codes(view, transfer), valid, at) for view, valid, at in views)
+        return checks.curvature_of(list(itertools.chain.from_iterable(each)))
 
     return slope
 
@@ -385,21 +368,15 @@ def transfer_of_set(
         return given
     stated = stated_video_transfer(video) if video else stated_transfer(paths) if paths else None
     eight = shots.pictures.dtype == np.uint8
-    files = [paths] if paths and video is None else []
-    return decide_transfer(kind, stated, eight=eight, slope=slope_of_shots([shots], [angles], files))
+    return decide_transfer(kind, stated, eight=eight, slope=slope_of_shots([shots], [angles]))
 
 
 def _doubt(slope: Slope | None, transfer: str) -> str:
-    """The warning where the chosen transfer leaves the response curved, as a camera's own tone curve does.
-
-    Tone curves leave a negative curvature in files that are read as linear. Light that drifts between the shots can
-    leave a positive one, which is no sign of a tone curve.
-    """
+    """The warning where the chosen transfer surely leaves the response curved, as a camera's own tone curve does."""
     left = None if slope is None else slope(transfer)
-    highest = math.inf if transfer == "linear" else checks.DECODED[0]
-    if left is None or checks.ENCODED[0] <= left <= highest:
+    if left is None or not (left.surely_below(checks.ENCODED[0]) or left.surely_above(checks.DECODED[0])):
         return ""
     return (
-        f"Read as {transfer}, the response still has a curvature of {left:+.2f} (0 if it is linear): the files have "
-        "another tone curve, and DoLP is wrong. Export 16-bit TIFF without a tone curve, or take camera raw."
+        f"Read as {transfer}, the response still has a curvature of {left.value:+.2f} (0 if it is linear): the files "
+        "have another tone curve, and DoLP is wrong. Export 16-bit TIFF without a tone curve, or take camera raw."
     )
