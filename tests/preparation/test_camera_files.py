@@ -15,6 +15,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.checks import measured_gains, pair_moments
+from polarguide.capture.filter.camera_files import exif_data
 from polarguide.capture.filter.develop import align_shots, estimate_shifts
 from polarguide.capture.filter.encoding import (
     LOSSY,
@@ -58,6 +59,25 @@ def test_pair_sums_measure_all_four_exposures():
     assert set(found.deviating(np.log(true / [1, 1, 0.8, 1]))) == {90}
     swapped = measured_gains(pair_moments(light[[0, 2, 1, 3]], np.ones(light.shape[1:], bool)))
     assert swapped.pairing == 1
+
+
+@pytest.mark.parametrize(
+    ("tags", "iso"),
+    [
+        ({34855: 400}, 400),
+        ({34855: 400, 34866: 800}, 400),
+        ({34855: 65535, 34866: 102400}, 102400),
+        ({34855: 65535, 34864: 1, 34865: 204800}, 204800),
+        ({34855: 65535}, None),
+        ({}, None),
+    ],
+)
+def test_iso_beyond_its_tag_is_read_from_another(tags, iso):
+    """65535 says that the number has more than 16 bits (EXIF 2.3)."""
+    data, exif = io.BytesIO(), Image.Exif()
+    exif.get_ifd(0x8769).update(tags)
+    Image.new("RGB", (8, 8)).save(data, "JPEG", exif=exif)
+    assert exif_data(data.getvalue()).iso == iso
 
 
 @pytest.mark.parametrize("stated", [(100, 100, 125, 100), (100, 80, 125, 90), (100, 100, 100, 100)])

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
+import logging
 import math
+import re
 import struct
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -79,6 +81,8 @@ def stated_encoding(data: bytes) -> Encoding | None:
                 profile = image.info.get("icc_profile")
                 rest = _of_png(image.info)
             stated = png_chunk(data, b"cICP") if data.startswith(PNG) else None
+            if stated and not stated[3]:
+                return Encoding(None, "its cICP chunk (values of narrow range, from 16 to 235 of 255)")
             characteristics = stated[1] if stated else None
     if characteristics is not None and characteristics != _UNSPECIFIED:
         name = HIGH_RANGE.get(characteristics, f"number {characteristics} of H.273")
@@ -221,7 +225,7 @@ def stated_transfer(paths: Sequence[Path]) -> Stated | None:
 
 
 _OF_VIDEO = {
-    "unknown": None,
+    **dict.fromkeys(("unknown", "reserved"), None),
     "linear": 1.0,
     **dict.fromkeys(
         (
@@ -241,6 +245,8 @@ _OF_VIDEO = {
 }
 """Exponents of transfers by ffmpeg's names; those of television are shown as sRGB is."""
 _HIGH_RANGE = {"smpte2084": "PQ", "arib-std-b67": "HLG"}
+_COLORS = re.compile(r"[\w-]+/[\w-]+/([\w-]+)")
+"""Matrix, primaries and transfer as ffmpeg describes them, as in yuv420p(tv, bt2020nc/bt2020/arib-std-b67)."""
 
 
 def stated_video_transfer(path: Path) -> Stated | None:
@@ -250,16 +256,21 @@ def stated_video_transfer(path: Path) -> Stated | None:
         PolarguideError: it is neither linear nor like sRGB.
     """
     decoder = optional_import("imageio_ffmpeg", str(path))
-    frames = decoder.read_frames(str(path))
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # of turned films it says that sizes differ
+    # Logarithmic films are not converted: the frames are taken for others, and the description is that of the file.
+    frames = decoder.read_frames(str(path), output_params=["-vf", "setparams=color_trc=bt709"])
     try:
         described = str(next(frames).get("pix_fmt", ""))
     except (OSError, RuntimeError, StopIteration):  # whoever reads the frames says what is wrong
         return None
     finally:
         frames.close()
-    # As in yuv420p(tv, bt2020nc/bt2020/arib-std-b67): matrix, primaries and transfer, or one name where all agree.
-    words = [word.strip().split("/")[-1] for word in described.partition("(")[2].rstrip(")").split(",")]
-    name = next((word for word in words if word in _OF_VIDEO or word in _HIGH_RANGE), "unknown")
+    colors = _COLORS.search(described)
+    # One name stands for all three where they agree, as in yuv420p(tv, bt709).
+    words = (
+        [colors[1]] if colors else [word for word in re.findall(r"[\w-]+", described) if word in _OF_VIDEO]
+    )
+    name = words[0] if words else "unknown"
     if name in _OF_VIDEO and _OF_VIDEO[name] is None:
         return None
     said = f"transfer {name}" + (f" ({_HIGH_RANGE[name]}, high dynamic range)" if name in _HIGH_RANGE else "")
