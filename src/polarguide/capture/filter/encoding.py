@@ -385,7 +385,7 @@ def transfer_of_set(
 def _doubt(slope: Slope | None, transfer: str) -> str:
     """The warning where the chosen transfer surely leaves the response curved, as a camera's own tone curve does."""
     left = None if slope is None else slope(transfer)
-    if left is None or not (left.surely_below(checks.ENCODED[0]) or left.surely_above(checks.DECODED[0])):
+    if left is None or not (left.surely_below(-checks.BENT) or left.surely_above(checks.BENT)):
         return ""
     return (
         f"Read as {transfer}, the response still has a curvature of {left.value:+.2f} (0 if it is linear): the files "
