@@ -9,6 +9,7 @@ import cv2
 import imageio_ffmpeg
 import numpy as np
 import pytest
+import tifffile
 from faults import Fault
 from PIL import Image, ImageCms
 
@@ -93,6 +94,26 @@ def test_other_encodings_of_png_are_refused(tmp_path, kind, content, found):
 def test_profiles_state_the_encoding(tmp_path, suffix):
     path = tmp_path / f"v{suffix}"
     Image.fromarray(np.full((16, 16, 3), 90, np.uint8)).save(path, icc_profile=SRGB)
+    assert stated_transfer([path]) == ("srgb", "a color profile (ICC)")
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("colors", [1, 3])
+@pytest.mark.parametrize(("exponent", "transfer"), [(1.0, "linear"), (2.2, "srgb"), (1.8, None)])
+def test_transfer_functions_of_tiff_state_the_encoding(tmp_path, bits, colors, exponent, transfer):
+    """One curve, or one for each color; and a profile beside it goes first."""
+    path = tmp_path / "v.tif"
+    curve = np.rint(65535 * np.linspace(0, 1, 1 << bits) ** exponent).astype(int)
+    tag = (301, "H", colors * len(curve), tuple(curve.tolist()) * colors, True)
+    picture = np.full((16, 16, 3), 90, f"u{bits // 8}")
+    tifffile.imwrite(path, picture, photometric="rgb", extratags=[tag], metadata=None)
+    assert stated_encoding(path.read_bytes()).exponent == pytest.approx(exponent, abs=0.02)
+    if transfer is None:
+        Fault(str(path), found="a TransferFunction, gamma 1.80").raised_by(stated_transfer, [path])
+    else:
+        assert stated_transfer([path]) == (transfer, "a TransferFunction")
+    profile = (34675, "B", len(SRGB), SRGB, True)
+    tifffile.imwrite(path, picture, photometric="rgb", extratags=[profile, tag], metadata=None)
     assert stated_transfer([path]) == ("srgb", "a color profile (ICC)")
 
 

@@ -105,10 +105,13 @@ def _of_tiff(data: bytes) -> tuple[bytes | None, Encoding | None]:
     """The ICC profile of a TIFF file, and what its transfer function says."""
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         tags = file.pages.first.tags
-        profile, function = tags.valueof(_TIFF_PROFILE), tags.valueof(_TRANSFER_FUNCTION)
+        profile = tags.valueof(_TIFF_PROFILE)
+        function = tags.valueof(_TRANSFER_FUNCTION)
         count = 1 << int(file.pages.first.bitspersample)
-    middle = function[round(_MIDDLE * (count - 1))] / 65535 if function and len(function) >= count else 0.0
-    exponent = math.log(middle) / math.log(_MIDDLE) if 0 < middle < 1 else None
+    curve = np.ravel([] if function is None else function)  # of all colors, or of one after the other
+    place = round(_MIDDLE * (count - 1))
+    middle = float(curve[place]) / 65535 if len(curve) >= count else 0.0
+    exponent = math.log(middle) / math.log(place / (count - 1)) if 0 < middle < 1 else None
     return profile, None if exponent is None else Encoding(exponent, "a TransferFunction")
 
 
