@@ -98,6 +98,9 @@ def test_a_sensor_is_named_in_any_case(settings: type[MosaicOptions]) -> None:
         ("DZK 33UX250", "IMX250MZR"),
         ("dyk_33ux250", "IMX250MYR"),
         ("GO-5100MP-USB", "IMX250MZR"),
+        ("Sony imx264mzr", "IMX264MZR"),
+        ("Lucid Phoenix PHX050S-QC", "IMX250MYR"),
+        ("The Imaging Source DZK 33UX250", "IMX250MZR"),
     ],
 )
 def test_a_camera_is_read_as_its_sensor(model: str, sensor: str) -> None:

@@ -15,9 +15,11 @@ from PIL.TiffImagePlugin import IFDRational
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.checks import measured_gains, pair_moments
+from polarguide.capture.filter.camera_files import exif_data
 from polarguide.capture.filter.develop import align_shots, estimate_shifts
 from polarguide.capture.filter.encoding import (
     LOSSY,
+    PLAIN,
     decide_transfer,
     slope_of_shots,
     stated_encoding,
@@ -57,6 +59,25 @@ def test_pair_sums_measure_all_four_exposures():
     assert set(found.deviating(np.log(true / [1, 1, 0.8, 1]))) == {90}
     swapped = measured_gains(pair_moments(light[[0, 2, 1, 3]], np.ones(light.shape[1:], bool)))
     assert swapped.pairing == 1
+
+
+@pytest.mark.parametrize(
+    ("tags", "iso"),
+    [
+        ({34855: 400}, 400),
+        ({34855: 400, 34866: 800}, 400),
+        ({34855: 65535, 34866: 102400}, 102400),
+        ({34855: 65535, 34864: 1, 34865: 204800}, 204800),
+        ({34855: 65535}, None),
+        ({}, None),
+    ],
+)
+def test_iso_beyond_its_tag_is_read_from_another(tags, iso):
+    """65535 says that the number has more than 16 bits (EXIF 2.3)."""
+    data, exif = io.BytesIO(), Image.Exif()
+    exif.get_ifd(0x8769).update(tags)
+    Image.new("RGB", (8, 8)).save(data, "JPEG", exif=exif)
+    assert exif_data(data.getvalue()).iso == iso
 
 
 @pytest.mark.parametrize("stated", [(100, 100, 125, 100), (100, 80, 125, 90), (100, 100, 100, 100)])
@@ -302,6 +323,14 @@ def test_damaged_profiles_state_nothing():
         assert found is None or found.exponent > 0
 
 
+def decided(pictures, kind=LOSSY):
+    """What is decided of four gray pictures [4, H, W] in [0, 1] that state nothing."""
+    codes = np.rint(np.clip(pictures, 0, 1) * 65535).astype(np.uint16)
+    stack, none = np.repeat(codes[..., None], 3, axis=3), np.zeros(codes.shape, bool)
+    slope = slope_of_shots([Shots(stack, 1, none, none[0])], [(0, 45, 90, 135)])
+    return decide_transfer(kind, None, eight=False, slope=slope)
+
+
 @pytest.mark.parametrize(
     ("encode", "transfer", "doubtful"),
     [
@@ -309,29 +338,59 @@ def test_damaged_profiles_state_nothing():
         (srgb_encode, "srgb", False),
         (lambda light: srgb_encode(light) ** 1.6, "srgb", True),
         (lambda light: light ** (1 / 1.5), "srgb", True),
+        (lambda light: 1.099 * (light / 3) ** 0.45 - 0.099, "srgb", True),
+        (lambda light: light**1.1, "linear", False),
+        (lambda light: light**1.5, "linear", True),
+        (lambda light: light**2.2, "linear", True),
     ],
 )
-def test_a_tone_curve_that_is_neither_is_doubted(encode, transfer, doubtful):
-    codes = np.rint(np.clip(encode(four()), 0, 1) * 65535).astype(np.uint16)
-    pictures, none = np.repeat(codes[..., None], 3, axis=3), np.zeros(codes.shape, bool)
-    slope = slope_of_shots([Shots(pictures, 1, none, none[0])], [(0, 45, 90, 135)])
-    found = decide_transfer(LOSSY, None, eight=False, slope=slope)
+@pytest.mark.parametrize("exposures", [(1, 1, 1, 1), (1, 0.8, 1, 1)])
+def test_a_tone_curve_that_is_neither_is_doubted(encode, transfer, doubtful, exposures):
+    """Also one that bends upward, as of linear light that a program took for sRGB; and the curve of BT.709 in the dark,
+    which puts DoLP off by a fifth.
+    """
+    found = decided(encode(four() * np.reshape(exposures, (4, 1, 1))))
     assert (found.transfer, bool(found.doubt)) == (transfer, doubtful)
 
 
 @pytest.mark.parametrize(("encode", "transfer"), [(lambda light: light, "linear"), (srgb_encode, "srgb")])
 @pytest.mark.parametrize("times", [(100, 100, 100, 100), (100, 50, 100, 100), (200, 100, 50, 100)])
-def test_the_encoding_is_measured_whatever_exposures_the_files_state(tmp_path, encode, transfer, times):
+@pytest.mark.parametrize("stating", [True, False])
+def test_the_encoding_is_measured_whatever_the_exposures(tmp_path, encode, transfer, times, stating):
+    """Whether files state them (EXIF) or not, as after editing."""
     paths = []
     for angle, light, time in zip((0, 45, 90, 135), four(), times, strict=True):
         image = Image.fromarray(np.rint(encode(light * 50 / time) * 255).astype(np.uint8))
         exif = image.getexif()
-        exif.get_ifd(0x8769)[0x829A] = IFDRational(1, time)
+        if stating:
+            exif.get_ifd(0x8769)[0x829A] = IFDRational(1, time)
         paths.append(tmp_path / f"v_{angle}.jpg")
         image.save(paths[-1], quality=100, exif=exif)
     found = transfer_of_set(paths, "auto", read_stack(paths), (0, 45, 90, 135))
     assert (found.transfer, found.doubt) == (transfer, "")
     assert "curvature" in found.note
+
+
+@pytest.mark.parametrize("encode", [lambda light: light, srgb_encode])
+@pytest.mark.parametrize("exposures", [(1, 1, 1, 1), (1, 0.8, 1, 1)])
+def test_one_direction_of_polarization_does_not_mislead(encode, exposures):
+    """Exposures and polarization of one direction look alike: the pictures tell the right encoding, or none."""
+    y, x = np.mgrid[:96, :128] / 40.0
+    angles = np.radians([0, 45, 90, 135])
+    degree = 0.25 + 0.2 * np.cos(y * 1.7)
+    light = np.stack([(0.6 + 0.2 * np.sin(x)) / 2 * (1 + degree * np.cos(2 * (0.3 - a))) for a in angles])
+    found = decided(encode(light * np.reshape(exposures, (4, 1, 1))))
+    told = "curvature" in found.note
+    assert found.transfer == ("linear" if told and encode is not srgb_encode else "srgb")
+    assert found.doubt == ""
+
+
+def test_light_that_drifts_from_place_to_place_is_no_tone_curve():
+    """A lamp that moved between the shots: bright and dark sums agree nowhere, and no two parts say one curvature."""
+    y, x = np.mgrid[:96, :128]
+    moved = 1 + 0.1 * np.sin(x / 9.0) * np.cos(y / 7.0)
+    found = decided(four() * np.stack([np.ones_like(moved), moved, np.ones_like(moved), moved]), PLAIN)
+    assert (found.transfer, found.doubt) == ("linear", "")
 
 
 def _stating(folder, kind, values, full):

@@ -17,7 +17,11 @@ from PIL.TiffImagePlugin import IFDRational
 
 from polarguide.capture.colmap.sfm import run_step
 from polarguide.capture.filter.camera_files import Lens, camera_groups
-from polarguide.capture.filter.consecutive import chosen_matching, shots_of_one_place
+from polarguide.capture.filter.consecutive import (
+    chosen_matching,
+    numbered_like_angles,
+    shots_of_one_place,
+)
 from polarguide.core.progress import Advance, Reporter
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
@@ -122,6 +126,21 @@ def test_pictures_without_a_sign_of_a_filter_are_photographs(
     assert (tmp_path / "out" / "polar" / "a_none.png").exists()
 
 
+@pytest.mark.parametrize("name", ["cup_P{}", "cup({})", "{}_cup", "cup_{}°", "x1_polar{:03d}_linear"])
+def test_pictures_numbered_like_angles_are_no_photographs(tmp_path: Path, name: str) -> None:
+    """Names that no rule reads, of four pictures that differ in 0, 45, 90 and 135 alone."""
+    for place, angle in enumerate((0, 45, 90, 135)):
+        write_picture(tmp_path / "in" / f"{name.format(angle)}.png", busy_light(48, 64, place)[0] / 2)
+    Fault(found="numbered like angles").raised_by(prepare_scene, tmp_path / "in", tmp_path / "out", PLAIN)
+    done = prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, angles="none"))
+    assert len(done.views) == 4
+
+
+@pytest.mark.parametrize("numbers", [range(0, 200, 45), range(45, 200, 45), range(0, 100, 45)])
+def test_numbers_that_go_on_count_pictures(numbers: range) -> None:
+    assert numbered_like_angles([Path(f"shots/frame_{number:04d}.jpg") for number in numbers]) == []
+
+
 @pytest.mark.parametrize("suffix", ["png", "tif", "bmp"])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_gray_pictures_may_be_mosaics(tmp_path: Path, suffix: str, channels: int) -> None:
@@ -208,6 +227,24 @@ def test_lenses_are_told_apart_by_their_focal_lengths(tmp_path: Path) -> None:
     assert found["a"] == found["b"] == found["d"] == Lens("Phone (lens)", 26.0)
     assert found["c"] == Lens("Phone (lens)", 41.0)
     assert camera_groups({view: paths[view] for view in "abd"}) == {}
+
+
+@pytest.mark.parametrize(("first", "second", "cameras"), [(0, 1, 0), (0, 2, 2), (1, 1.5, 2), (2, 2, 0)])
+@pytest.mark.parametrize("film", [None, 26])
+def test_digital_zoom_is_another_camera(
+    tmp_path: Path, first: float, second: float, cameras: int, film: int | None
+) -> None:
+    """Whatever the focal lengths beside it; 0 means that there was none."""
+    paths = {}
+    for view, zoom in (("a", first), ("b", second)):
+        paths[view] = tmp_path / f"{view}.jpg"
+        exif = Image.Exif()
+        tags = exif.get_ifd(0x8769)
+        tags[37386], tags[41988] = IFDRational(42, 10), IFDRational(round(10 * zoom), 10)
+        if film:
+            tags[41989] = film
+        Image.new("RGB", (8, 8)).save(paths[view], exif=exif)
+    assert len(set(camera_groups(paths).values())) == cameras
 
 
 class Impatient(Reporter):

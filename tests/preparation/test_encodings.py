@@ -9,11 +9,12 @@ import cv2
 import imageio_ffmpeg
 import numpy as np
 import pytest
+import tifffile
 from faults import Fault
 from PIL import Image, ImageCms
 
 from polarguide.capture.filter.encoding import stated_encoding, stated_transfer, stated_video_transfer
-from polarguide.core.errors import PolarguideWarning
+from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.optics.color import srgb_encode_array as srgb_encode
 from polarguide.preparation.filter_source import SinglesSource
 from polarguide.preparation.settings import PrepareSettings
@@ -79,6 +80,7 @@ def test_chunks_of_png_state_the_encoding(tmp_path, kind, content, transfer, bit
         (b"cICP", bytes([9, 16, 0, 1]), "PQ"),
         (b"cICP", bytes([9, 18, 0, 1]), "HLG"),
         (b"cICP", bytes([1, 9, 0, 1]), "number 9"),
+        (b"cICP", bytes([1, 13, 0, 0]), "narrow range"),
         (b"gAMA", struct.pack(">I", 55556), "1.80"),
     ],
 )
@@ -92,6 +94,26 @@ def test_other_encodings_of_png_are_refused(tmp_path, kind, content, found):
 def test_profiles_state_the_encoding(tmp_path, suffix):
     path = tmp_path / f"v{suffix}"
     Image.fromarray(np.full((16, 16, 3), 90, np.uint8)).save(path, icc_profile=SRGB)
+    assert stated_transfer([path]) == ("srgb", "a color profile (ICC)")
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("colors", [1, 3])
+@pytest.mark.parametrize(("exponent", "transfer"), [(1.0, "linear"), (2.2, "srgb"), (1.8, None)])
+def test_transfer_functions_of_tiff_state_the_encoding(tmp_path, bits, colors, exponent, transfer):
+    """One curve, or one for each color; and a profile beside it goes first."""
+    path = tmp_path / "v.tif"
+    curve = np.rint(65535 * np.linspace(0, 1, 1 << bits) ** exponent).astype(int)
+    tag = (301, "H", colors * len(curve), tuple(curve.tolist()) * colors, True)
+    picture = np.full((16, 16, 3), 90, f"u{bits // 8}")
+    tifffile.imwrite(path, picture, photometric="rgb", extratags=[tag], metadata=None)
+    assert stated_encoding(path.read_bytes()).exponent == pytest.approx(exponent, abs=0.02)
+    if transfer is None:
+        Fault(str(path), found="a TransferFunction, gamma 1.80").raised_by(stated_transfer, [path])
+    else:
+        assert stated_transfer([path]) == (transfer, "a TransferFunction")
+    profile = (34675, "B", len(SRGB), SRGB, True)
+    tifffile.imwrite(path, picture, photometric="rgb", extratags=[profile, tag], metadata=None)
     assert stated_transfer([path]) == ("srgb", "a color profile (ICC)")
 
 
@@ -161,19 +183,25 @@ def test_pair_sums_are_believed_against_a_statement(tmp_path):
     ("codec", "transfer", "stated"),
     [
         ("libx264", "bt709", "srgb"),
+        ("libx264", "bt2020-10", "srgb"),
         ("libx264", "linear", "linear"),
-        ("libx265", "arib-std-b67", "HLG"),
-        ("libx265", "smpte2084", "PQ"),
         ("libx264", None, None),
+        ("libx265", "arib-std-b67", PolarguideError),
+        ("libx265", "smpte2084", PolarguideError),
+        ("libx264", "bt470bg", PolarguideError),
+        ("libx264", "smpte428", PolarguideError),
+        ("libx264", "log100", PolarguideError),
+        ("libx264", "log316", PolarguideError),
     ],
 )
 def test_videos_state_their_transfer(tmp_path, codec, transfer, stated):
+    """Logarithmic ones, too, which ffmpeg does not convert, and those of cinema."""
     path = tmp_path / "turn.mp4"
     named = "" if transfer is None else f":transfer={transfer}"
     options = [f"-{codec.removeprefix('lib')}-params", f"log-level=error{named}"]
     run = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-f", "lavfi", "-i", "color=gray:s=64x48:d=0.5"]
     subprocess.run([*run, "-c:v", codec, *options, str(path)], check=True)
-    if stated in ("HLG", "PQ"):
-        Fault(str(path), found=stated).raised_by(stated_video_transfer, path)
+    if stated is PolarguideError:
+        Fault(str(path), found=f"transfer {transfer}").raised_by(stated_video_transfer, path)
     else:
         assert (stated_video_transfer(path) or (None,))[0] == stated

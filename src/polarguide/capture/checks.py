@@ -37,6 +37,8 @@ _RESIDUAL = 0.05
 # +0.3; the gain differences of real sensors leave less than 0.1.
 ENCODED, DECODED = (-0.12, -0.25), (0.1, 0.2)
 """Curvatures from which files seem encoded, or decoded twice: for a doubt, and for a judgment."""
+BENT = 0.05
+"""Curvature of a response that is not linear, if it is sure: a gamma of 0.9 has -0.056, and DoLP is off by as much."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,7 @@ def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], tr
     slope = curvature(measures)
     if swapped or slope is None:  # the slope is meaningless with wrong pairs
         return warnings
-    if transfer == "linear" and encoding(slope) == "srgb":
+    if transfer == "linear" and encoding(Curvature(slope)) == "srgb":
         warnings.append(
             f"The pictures look sRGB-encoded (curvature {slope:.2f}, linear ones have 0): "
             "if they are, read them with transfer srgb."
@@ -226,45 +228,74 @@ def right_pairs(angles: Sequence[object]) -> list[tuple[int, int]]:
     return pairs
 
 
+@dataclass(frozen=True)
+class Curvature:
+    """A slope of the regression described in ``Measures``, with its standard error (jackknife over tiles)."""
+
+    value: float
+    error: float = 0.0
+
+    def surely_below(self, limit: float) -> bool:
+        """Whether it lies below a limit by three standard errors."""
+        return self.value + _SURE * self.error < limit
+
+    def surely_above(self, limit: float) -> bool:
+        """Whether it lies above a limit by three standard errors."""
+        return self.value - _SURE * self.error > limit
+
+
 def pair_slopes(
-    codes: NDArray[np.uint16],
-    usable: NDArray[np.bool_],
-    pairs: Sequence[tuple[int, int]],
-    *,
-    alike: bool = True,
+    codes: NDArray[np.uint16], usable: NDArray[np.bool_], pairs: Sequence[tuple[int, int]]
 ) -> list[NDArray[np.float64]]:
-    """Sums of the regression described in ``Measures`` for every two of a view's pairs.
+    """Sums of the regression described in ``Measures`` over every two of a view's pairs, for each of its tiles.
+
+    Pictures of different exposures add shares of I0 - I90 and I45 - I135 to the difference of the sums (to first order,
+    and before a curve, too). A fit of both is taken off, so that nothing is assumed of the exposures.
 
     Args:
         codes: linear codes [K, H, W, C] of a sample of the view. usable: [H, W]. pairs: of ``right_pairs``.
-        alike: whether the pictures have one exposure. Others add shares of I0 - I90 and I45 - I135 to the difference
-            of the sums (to first order, and before a curve, too), so that a fit of both is taken off.
     """
     if len(pairs) < 2:
         return []
     gray = codes.mean(axis=3, dtype=np.float64)
-    gray = gray[:, usable & (gray.min(axis=0) > _LOW_CODE)]
-    first, second = (gray[[pair[side] for pair in pairs]] for side in (0, 1))
+    usable = usable & (gray.min(axis=0) > _LOW_CODE)
+    rows, columns = (np.arange(size) * _TILES // size for size in usable.shape)
+    tile = (rows[:, None] * _TILES + columns)[usable]
+    first, second = (gray[:, usable][[pair[side] for pair in pairs]] for side in (0, 1))
     s0 = (first + second).mean(axis=0)
     sums, polarized = (first + second) / s0, (first - second) / s0
-    found = []
+    tiles = np.zeros((_TILES**2, 5))
     for one, other in itertools.combinations(range(len(pairs)), 2):
-        level = np.ones_like(s0)
-        taken_off = np.stack([level] if alike else [level, polarized[one], polarized[other]], axis=1)
+        taken_off = np.stack([np.ones_like(s0), polarized[one], polarized[other]], axis=1)
         both = np.stack([polarized[one] ** 2 - polarized[other] ** 2, sums[one] - sums[other]], axis=1)
         q, r = (both - taken_off @ np.linalg.lstsq(taken_off, both, rcond=None)[0]).T
-        found.append(np.array([len(q), 0.0, 0.0, q @ q, q @ r]))
-    return found
+        for place, values in ((0, np.ones_like(q)), (3, q * q), (4, q * r)):
+            tiles[:, place] += np.bincount(tile, values, len(tiles))
+    return [tile for tile in tiles if tile[0] > 0]
 
 
-def encoding(slope: float | None) -> Literal["linear", "srgb"] | None:
+def curvature_of(tiles: Sequence[NDArray[np.float64]]) -> Curvature | None:
+    """The curvature by the tiles of all views (``pair_slopes``); None if too few pixels are polarized."""
+    value = slope(tiles)
+    if value is None or len(tiles) < 2:
+        return None
+    without = np.sum(tiles, axis=0) - np.stack(tiles)
+    slopes = without[:, 4] / without[:, 3]
+    error = math.sqrt(((slopes - value) ** 2).sum() * (len(tiles) - 1) / len(tiles))
+    return Curvature(value, error)
+
+
+def encoding(found: Curvature | None) -> Literal["linear", "srgb"] | None:
     """How files are encoded that have this curvature when they are read as linear; None where it does not tell.
 
     The one judgment of ``prepare``, ``inspect`` and the warnings of ``train``.
     """
-    if slope is None or ENCODED[1] <= slope < ENCODED[0]:
-        return None
-    return "srgb" if slope < ENCODED[1] else "linear"
+    doubtful, certain = ENCODED
+    if found is not None and found.value < certain and found.surely_below(doubtful):
+        return "srgb"
+    if found is not None and found.value >= doubtful and found.surely_above(certain):
+        return "linear"
+    return None
 
 
 def _is_off(residuals: tuple[float, float, float]) -> bool:

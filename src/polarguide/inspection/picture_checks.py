@@ -124,9 +124,9 @@ def _pairs(capture: Capture, measurements: Sequence[ViewMeasurements], pairing: 
     return Check(key, title, "ok", finding, figures=figures)
 
 
-BENT, WRONG = 0.05, 0.18
-"""Curvatures of the response: a gamma of 0.9 has -0.056, of 0.8 -0.125, of 0.73 -0.18; DoLP is then off by as much as
-the gamma. Smooth areas of a real sensor's pictures, whose response is close to linear, have -0.17."""
+WRONG = 0.18
+"""Curvature of the response, beside ``checks.BENT``: a gamma of 0.8 has -0.125, of 0.73 -0.18; DoLP is then off by as
+much as the gamma. Smooth areas of a real sensor's pictures, whose response is close to linear, have -0.17."""
 
 
 def _encoding(capture: Capture, pairing: int | None) -> Check:
@@ -141,7 +141,7 @@ def _encoding(capture: Capture, pairing: int | None) -> Check:
     sure = bend is not None and abs(slope) > _SURE_BEND * bend[1]
     finding = f"Curvature of the response {slope:+.2f}; linear files have 0, sRGB read as linear about -0.6."
     low, high = (abs(slope) > abs((checks.ENCODED if slope < 0 else checks.DECODED)[k]) for k in (0, 1))
-    low, high = low or (sure and abs(slope) > BENT), high or (sure and abs(slope) > WRONG)
+    low, high = low or (sure and abs(slope) > checks.BENT), high or (sure and abs(slope) > WRONG)
     if not low:
         return Check(key, title, "ok", finding, figures=figures)
     gamma = 1 / (1 - 2 * slope)

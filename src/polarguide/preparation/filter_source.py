@@ -147,8 +147,7 @@ class ShotsSource(Source):
         several = [view for view in self.views if len(self._of_view[view]) > 1]
         views = several[:: max(1, math.ceil(len(several) / _JUDGED_VIEWS))] or self.views[:1]
         judged = [read_stack(self._of_view[view], self._white, levels) for view in views]
-        angles, files = [self._angles(view) for view in views], [self._of_view[view] for view in views]
-        slope = slope_of_shots(judged, angles, files) if several else None
+        slope = slope_of_shots(judged, [self._angles(view) for view in views]) if several else None
         decision = decide_transfer(kind, stated, eight=judged[0].pictures.dtype == np.uint8, slope=slope)
         if decision.doubt:
             warnings.warn(decision.doubt, PolarguideWarning, stacklevel=2)

@@ -16,7 +16,12 @@ from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
 from polarguide.capture.exposures import TABLE, angles_of_names, folders_of_angles, parse_angle
 from polarguide.capture.filter.camera_files import QUARTER_TURNS, TURNS
-from polarguide.capture.filter.consecutive import extract_frames, find_videos, shots_of_one_place
+from polarguide.capture.filter.consecutive import (
+    extract_frames,
+    find_videos,
+    numbered_like_angles,
+    shots_of_one_place,
+)
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
 from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, read_picture
 from polarguide.capture.layout import angle_folders, describe_contents, index_files, list_files
@@ -175,8 +180,8 @@ def _require_photographs(root: Path) -> None:
     """Refuse pictures without angles in their names that may be something else than ordinary photographs.
 
     Raises:
-        PolarguideError: there are raw mosaics, gray pictures (which may be mosaics) or none; or pictures in a row show
-            one place, as shots through a filter do.
+        PolarguideError: there are raw mosaics, gray pictures (which may be mosaics) or none; or pictures are numbered
+            like angles, or show one place in a row, as shots through a filter do.
     """
     files = list(index_files(root, SHOT_SUFFIXES).values())
     if not files or index_files(root, tuple(set(RAW_SUFFIXES) - set(SHOT_SUFFIXES))):
@@ -189,6 +194,14 @@ def _require_photographs(root: Path) -> None:
             found=f"{gray[0]}, which is gray",
             remedy=f"Raw mosaics: --sensor, one of {SENSOR_NAMES}. Ordinary photographs: --angles none. Shots through "
             "a filter: --angles unknown, or angles in their names.",
+        )
+    numbered = numbered_like_angles(files)
+    if numbered:
+        raise PolarguideError(
+            root,
+            expected="angles as in cup_45 or in folders 0, 45, 90 and 135",
+            found=f"pictures that are numbered like angles otherwise ({listed([p.name for p in numbered])})",
+            remedy="Rename them; or ordinary photographs, without a filter: --angles none.",
         )
     each = shots_of_one_place(files)
     if each is not None:

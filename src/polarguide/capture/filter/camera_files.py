@@ -245,7 +245,11 @@ def tags_of(data: bytes) -> dict[int, Any]:
 
 _MAKER, _MODEL, _DIRECTORY = 271, 272, 34665
 _TIME, _F_NUMBER, _ISO = 33434, 33437, 34855
+_ISO_TOO_LARGE, _LARGER_ISO = 65535, (34866, 34865, 34867)
+"""What the tag ISO has where its 16 bits are too few, and those that say more: recommended exposure index, standard
+output sensitivity, ISO speed (EXIF 2.3)."""
 _FOCAL_LENGTH, _FOCAL_LENGTH_OF_FILM, _SERIAL_NUMBER, _LENS = 37386, 41989, 42033, 42036
+_DIGITAL_ZOOM = 41988
 
 
 @dataclass(frozen=True)
@@ -326,12 +330,20 @@ def exif_data(data: bytes) -> ExposureData:
     tags = tags_of(data)
     names = (str(tags.get(tag, "")).partition("\0")[0].strip() for tag in (_MAKER, _MODEL))
     camera = " ".join(filter(None, names))
-    exposure = (number_of(tags.get(tag)) for tag in (_TIME, _ISO, _F_NUMBER))
-    return _plausible(camera, _lens(camera, tags), *exposure)
+    seconds, iso, f_number = (number_of(tags.get(tag)) for tag in (_TIME, _ISO, _F_NUMBER))
+    if iso == _ISO_TOO_LARGE:
+        iso = next(filter(None, (number_of(tags.get(tag)) for tag in _LARGER_ISO)), None)
+    return _plausible(camera, _lens(camera, tags), seconds, iso, f_number)
 
 
 def _lens(camera: str, tags: dict[int, Any]) -> Lens:
-    """Bodies and lenses count as one where their focal lengths are stated: then these tell cameras apart."""
+    """Bodies and lenses count as one where their focal lengths are stated: then these tell cameras apart.
+
+    Digital zoom makes another camera: whether a stated focal length has it is each maker's choice.
+    """
+    zoom = number_of(tags.get(_DIGITAL_ZOOM))
+    if zoom is not None and zoom > 0 and zoom != 1:  # 0: none was used
+        camera = f"{camera} zoom {zoom:.3g}".lstrip()
     focal, of_film = (number_of(tags.get(tag)) for tag in (_FOCAL_LENGTH, _FOCAL_LENGTH_OF_FILM))
     stated = [(unit, value) for unit, value in (("film", of_film), ("lens", focal)) if value and value > 0]
     if stated:

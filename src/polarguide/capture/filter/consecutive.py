@@ -17,6 +17,7 @@ from polarguide.capture.write import write_png
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, write_text
 from polarguide.core.progress import Reporter
+from polarguide.geometry.polarizer import ANGLES
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 MOST_SHOTS = 12
@@ -50,6 +51,20 @@ def shots_of_one_place(paths: Sequence[Path]) -> int | None:
         if np.percentile(steps[between], 10) > _APART * np.percentile(steps[~between], 90):
             return size
     return None
+
+
+def numbered_like_angles(paths: Sequence[Path]) -> list[Path]:
+    """The first pictures that differ in one number of their names alone, which is 0, 45, 90 and 135; else none.
+
+    As cup_P45.png, cup(45).png or 45_cup.png. Numbers that count pictures go on, or begin elsewhere.
+    """
+    groups: dict[tuple[Path, str, str], dict[int, Path]] = {}
+    for path in paths:
+        for number in re.finditer(r"\d+", path.stem):
+            around = (path.parent, path.stem[: number.start()], path.stem[number.end() :])
+            groups.setdefault(around, {})[int(number[0])] = path
+    alike = (group for group in groups.values() if sorted(group) == list(ANGLES))
+    return list(next(alike, {}).values())
 
 
 def _edges(path: Path) -> NDArray[np.float32]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import io
 import itertools
+import logging
 import math
+import re
 import struct
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -19,13 +21,7 @@ from PIL import Image
 
 from polarguide.capture import checks
 from polarguide.capture.exposures import Angle
-from polarguide.capture.filter.camera_files import (
-    is_camera_raw,
-    missing_tags,
-    number_of,
-    read_exposure_data,
-    tags_of,
-)
+from polarguide.capture.filter.camera_files import is_camera_raw, number_of, tags_of
 from polarguide.capture.filter.shots import Shots
 from polarguide.capture.formats.decoders import HIGH_RANGE, heif_colors, is_heif
 from polarguide.capture.formats.integrity import BIG_TIFF, PNG, TIFF, png_chunk
@@ -85,6 +81,8 @@ def stated_encoding(data: bytes) -> Encoding | None:
                 profile = image.info.get("icc_profile")
                 rest = _of_png(image.info)
             stated = png_chunk(data, b"cICP") if data.startswith(PNG) else None
+            if stated and not stated[3]:
+                return Encoding(None, "its cICP chunk (values of narrow range, from 16 to 235 of 255)")
             characteristics = stated[1] if stated else None
     if characteristics is not None and characteristics != _UNSPECIFIED:
         name = HIGH_RANGE.get(characteristics, f"number {characteristics} of H.273")
@@ -107,10 +105,13 @@ def _of_tiff(data: bytes) -> tuple[bytes | None, Encoding | None]:
     """The ICC profile of a TIFF file, and what its transfer function says."""
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         tags = file.pages.first.tags
-        profile, function = tags.valueof(_TIFF_PROFILE), tags.valueof(_TRANSFER_FUNCTION)
+        profile = tags.valueof(_TIFF_PROFILE)
+        function = tags.valueof(_TRANSFER_FUNCTION)
         count = 1 << int(file.pages.first.bitspersample)
-    middle = function[round(_MIDDLE * (count - 1))] / 65535 if function and len(function) >= count else 0.0
-    exponent = math.log(middle) / math.log(_MIDDLE) if 0 < middle < 1 else None
+    curve = np.ravel([] if function is None else function)  # of all colors, or of one after the other
+    place = round(_MIDDLE * (count - 1))
+    middle = float(curve[place]) / 65535 if len(curve) >= count else 0.0
+    exponent = math.log(middle) / math.log(place / (count - 1)) if 0 < middle < 1 else None
     return profile, None if exponent is None else Encoding(exponent, "a TransferFunction")
 
 
@@ -227,7 +228,7 @@ def stated_transfer(paths: Sequence[Path]) -> Stated | None:
 
 
 _OF_VIDEO = {
-    "unknown": None,
+    **dict.fromkeys(("unknown", "reserved"), None),
     "linear": 1.0,
     **dict.fromkeys(
         (
@@ -247,6 +248,8 @@ _OF_VIDEO = {
 }
 """Exponents of transfers by ffmpeg's names; those of television are shown as sRGB is."""
 _HIGH_RANGE = {"smpte2084": "PQ", "arib-std-b67": "HLG"}
+_COLORS = re.compile(r"[\w-]+/[\w-]+/([\w-]+)")
+"""Matrix, primaries and transfer as ffmpeg describes them, as in yuv420p(tv, bt2020nc/bt2020/arib-std-b67)."""
 
 
 def stated_video_transfer(path: Path) -> Stated | None:
@@ -256,16 +259,21 @@ def stated_video_transfer(path: Path) -> Stated | None:
         PolarguideError: it is neither linear nor like sRGB.
     """
     decoder = optional_import("imageio_ffmpeg", str(path))
-    frames = decoder.read_frames(str(path))
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # of turned films it says that sizes differ
+    # Logarithmic films are not converted: the frames are taken for others, and the description is that of the file.
+    frames = decoder.read_frames(str(path), output_params=["-vf", "setparams=color_trc=bt709"])
     try:
         described = str(next(frames).get("pix_fmt", ""))
     except (OSError, RuntimeError, StopIteration):  # whoever reads the frames says what is wrong
         return None
     finally:
         frames.close()
-    # As in yuv420p(tv, bt2020nc/bt2020/arib-std-b67): matrix, primaries and transfer, or one name where all agree.
-    words = [word.strip().split("/")[-1] for word in described.partition("(")[2].rstrip(")").split(",")]
-    name = next((word for word in words if word in _OF_VIDEO or word in _HIGH_RANGE), "unknown")
+    colors = _COLORS.search(described)
+    # One name stands for all three where they agree, as in yuv420p(tv, bt709).
+    words = (
+        [colors[1]] if colors else [word for word in re.findall(r"[\w-]+", described) if word in _OF_VIDEO]
+    )
+    name = words[0] if words else "unknown"
     if name in _OF_VIDEO and _OF_VIDEO[name] is None:
         return None
     said = f"transfer {name}" + (f" ({_HIGH_RANGE[name]}, high dynamic range)" if name in _HIGH_RANGE else "")
@@ -289,8 +297,8 @@ def given_transfer(kind: str, transfer: str) -> TransferDecision | None:
     return None if transfer == "auto" else TransferDecision(transfer, f"Transfer {transfer}, as given.")
 
 
-Slope = Callable[[str], float | None]
-"""The curvature of the response (``checks.Measures``) that a transfer leaves; None where the light does not tell."""
+Slope = Callable[[str], checks.Curvature | None]
+"""The curvature of the response that a transfer leaves; None where the light does not tell."""
 
 
 def decide_transfer(
@@ -304,8 +312,8 @@ def decide_transfer(
     """
     measured = None if slope is None else slope("linear")
     encoding = checks.encoding(measured)
-    if encoding is not None and slope is not None:
-        note = f"the curvature of the response is {measured:+.2f}; linear files have 0, sRGB about -0.6"
+    if encoding is not None and measured is not None and slope is not None:
+        note = f"the curvature of the response is {measured.value:+.2f}; linear files have 0, sRGB about -0.6"
         doubt = _doubt(slope, encoding)
         if stated is not None and stated[0] != encoding:
             doubt = (
@@ -320,7 +328,10 @@ def decide_transfer(
     if slope is not None:
         untold = ": no two pairs at right angles, or too few pixels are polarized for their sums to tell"
     if measured is not None:
-        untold = f": the curvature of the response is {measured:+.2f}, between those of linear files and sRGB"
+        untold = (
+            f": the curvature of the response is {measured.value:+.2f} +- {measured.error:.2f}; linear files have 0, "
+            "sRGB about -0.6"
+        )
     if kind == PLAIN and eight and slope is not None:
         doubt = (
             "The 8-bit files state no encoding, and their pair sums do not tell it: they are taken as linear. If they "
@@ -335,34 +346,20 @@ def decide_transfer(
     return TransferDecision(usual, note, _doubt(slope, usual))
 
 
-def exposed_alike(paths: Sequence[Path]) -> bool:
-    """True where no file states (EXIF) that the pictures of a view differ in exposure."""
-    taken = {path: read_exposure_data(path) for path in paths}
-    logs = [math.log(light) for data in taken.values() if (light := data.light) is not None]
-    return bool(missing_tags(taken)) or not logs or max(logs) - min(logs) < checks.OTHER_EXPOSURE
-
-
-def slope_of_shots(
-    shots: Sequence[Shots], angles: Sequence[Sequence[Angle]], files: Sequence[Sequence[Path]] = ()
-) -> Slope:
-    """The curvature of the response over some views.
+def slope_of_shots(shots: Sequence[Shots], angles: Sequence[Sequence[Angle]]) -> Slope:
+    """The curvature of the response over some views, whatever the exposures of their pictures.
 
     Args:
         shots: of each view, aligned well enough (as from a tripod). angles: of each view's pictures.
-        files: of each view's pictures; none of pictures in memory.
     """
-    alike = [exposed_alike(paths) for paths in files] or [True] * len(shots)
     pairs = [checks.right_pairs(mine) for mine in angles]
     samples = [checks.sampled(view.pictures) for view in shots]
     usable = [checks.sampled(~(view.clipped.any(axis=0) | view.dark)[None])[0] for view in shots]
 
-    def slope(transfer: str) -> float | None:
-        views = zip(samples, usable, pairs, alike, strict=True)
-        each = (
-            checks.pair_slopes(linear_codes(view, transfer), valid, at, alike=one)
-            for view, valid, at, one in views
-        )
-        return checks.slope(list(itertools.chain.from_iterable(each)))
+    def slope(transfer: str) -> checks.Curvature | None:
+        views = zip(samples, usable, pairs, strict=True)
+        each = (checks.pair_slopes(linear_codes(view, transfer), valid, at) for view, valid, at in views)
+        return checks.curvature_of(list(itertools.chain.from_iterable(each)))
 
     return slope
 
@@ -385,21 +382,15 @@ def transfer_of_set(
         return given
     stated = stated_video_transfer(video) if video else stated_transfer(paths) if paths else None
     eight = shots.pictures.dtype == np.uint8
-    files = [paths] if paths and video is None else []
-    return decide_transfer(kind, stated, eight=eight, slope=slope_of_shots([shots], [angles], files))
+    return decide_transfer(kind, stated, eight=eight, slope=slope_of_shots([shots], [angles]))
 
 
 def _doubt(slope: Slope | None, transfer: str) -> str:
-    """The warning where the chosen transfer leaves the response curved, as a camera's own tone curve does.
-
-    Tone curves leave a negative curvature in files that are read as linear. Light that drifts between the shots can
-    leave a positive one, which is no sign of a tone curve.
-    """
+    """The warning where the chosen transfer surely leaves the response curved, as a camera's own tone curve does."""
     left = None if slope is None else slope(transfer)
-    highest = math.inf if transfer == "linear" else checks.DECODED[0]
-    if left is None or checks.ENCODED[0] <= left <= highest:
+    if left is None or not (left.surely_below(-checks.BENT) or left.surely_above(checks.BENT)):
         return ""
     return (
-        f"Read as {transfer}, the response still has a curvature of {left:+.2f} (0 if it is linear): the files have "
-        "another tone curve, and DoLP is wrong. Export 16-bit TIFF without a tone curve, or take camera raw."
+        f"Read as {transfer}, the response still has a curvature of {left.value:+.2f} (0 if it is linear): the files "
+        "have another tone curve, and DoLP is wrong. Export 16-bit TIFF without a tone curve, or take camera raw."
     )

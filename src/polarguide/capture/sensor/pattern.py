@@ -47,15 +47,18 @@ def _spelled(name: str) -> str:
 
 
 def sensor_named(name: str) -> str:
-    """The sensor of this name, or in the camera of this model; another word as it is."""
-    spelled = _spelled(name)
-    if spelled in SENSORS:
-        return spelled
+    """The sensor of this name, or in the camera of this model, after its maker or not; another word as it is."""
+    whole = _spelled(name)
     # The longest: BFS-U3-51S5PC is another camera than BFS-U3-51S5P with the mount C.
-    for model in sorted(_CAMERAS, key=len, reverse=True):
-        begin = _spelled(model)
-        if spelled.startswith(begin) and _MOUNT.fullmatch(spelled[len(begin) :]):
-            return _CAMERAS[model]
+    models = sorted(_CAMERAS, key=len, reverse=True)
+    for start in (0, *(found.end() for found in re.finditer("-", whole))):
+        spelled = whole[start:]
+        if spelled in SENSORS:
+            return spelled
+        for model in models:
+            begin = _spelled(model)
+            if spelled.startswith(begin) and _MOUNT.fullmatch(spelled[len(begin) :]):
+                return _CAMERAS[model]
     return name
 
 
