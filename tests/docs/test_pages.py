@@ -14,7 +14,9 @@ from polarguide_bench.recipes import ABLATIONS
 from polarguide_shots.measurement.fields import FORMAT, KEYS
 
 ROOT = Path(__file__).resolve().parents[2]
-DOCS, PACKAGE = ROOT / "docs", ROOT / "src" / "polarguide"
+DOCS = ROOT / "docs"
+SOURCES = ROOT / "src"
+PACKAGE = SOURCES / "polarguide"
 GENERATED = (DOCS / "generated", DOCS / "reference" / "api")
 PAGES = sorted(p for p in DOCS.rglob("*.md") if not any(made in p.parents for made in GENERATED))
 BESIDE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "research/trials.md")
@@ -74,7 +76,9 @@ def test_files_and_links_exist(path):
     text = text_of(path)
     missing = [name for name in NAMED_FILE.findall(text) if "<" not in name and not (ROOT / name).exists()]
     missing += [
-        name for name in MODULE_FILE.findall(text) if not any((at / name).exists() for at in (PACKAGE, ROOT))
+        name
+        for name in MODULE_FILE.findall(text)
+        if not any((at / name).exists() for at in (PACKAGE, SOURCES, ROOT))
     ]
     for target in re.findall(r"\]\(([^)\s]+)\)", FENCE.sub("", text)):
         file, _, anchor = target.partition("#")
@@ -154,7 +158,7 @@ def test_every_recipe_is_described_and_every_named_one_exists():
 
 def parameters():
     """Names of parameters and fields that an option can stand for: of verbs, and of the dataclasses that they read."""
-    for path in PACKAGE.rglob("*.py"):
+    for path in SOURCES.rglob("*.py"):
         for node in ast.walk(ast.parse(text_of(path))):
             if isinstance(node, ast.arg):
                 yield node.arg
@@ -178,7 +182,7 @@ def test_options_exist():
 def test_the_bibliography_holds_what_is_cited():
     bibliography = text_of(DOCS / "reference" / "bibliography.bib")
     authors = {name.lower() for name in re.findall(r"author = \{([^,{]+)", bibliography)}
-    folders = (PACKAGE, ROOT / "benchmarks")
+    folders = (SOURCES, ROOT / "benchmarks")
     sources = "\n".join(text_of(p) for folder in folders for p in folder.rglob("*.py"))
     name = "[A-Z][a-z]+"
     cited = set(re.findall(rf"\b({name})(?:, {name})*(?: et al\.|,? and {name})? (?:19|20)\d\d\b", sources))

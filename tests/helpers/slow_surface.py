@@ -2,8 +2,9 @@
 
 import torch
 
+from polarguide._native import MAX_CHANNELS
 from polarguide.geometry.camera import Camera
-from polarguide.raster.interface import MAX_CHANNELS, Rasterize, Splats
+from polarguide.raster.interface import Rasterize, Splats
 from polarguide.raster.surface import WIDTH, SurfacePicture
 
 

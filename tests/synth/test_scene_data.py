@@ -116,7 +116,7 @@ def test_files_that_are_no_scene(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_use_names_of_today(name: str) -> None:
-    text = (resources.files("polarguide") / "synth" / "presets" / f"{name}.json").read_text("utf-8")
+    text = (resources.files("polarguide_synth") / "presets" / f"{name}.json").read_text("utf-8")
     assert with_current_keys(json.loads(text)) == json.loads(text)
 
 
