@@ -64,10 +64,6 @@ class Region:
         """World points [..., 3] in the field's own coordinates."""
         return (points - points.new_tensor(self.center)) / self.unit
 
-    def world(self, inner: Tensor) -> Tensor:
-        """The inverse of ``inner``."""
-        return inner * self.unit + inner.new_tensor(self.center)
-
     def cube(self, inner: Tensor) -> tuple[Tensor, Tensor]:
         """Where the grids hold a place, in [-1, 1]^3, and its derivative along each axis, both [..., 3].
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -62,7 +61,6 @@ def march(
     sampling: Sampling,
     *,
     generator: torch.Generator | None = None,
-    within: Callable[[Tensor], Tensor] | None = None,
 ) -> RaySamples:
     """Look along rays.
 
@@ -71,7 +69,6 @@ def march(
         origin, direction: [N, 3] in the field's coordinates, direction of unit length.
         sampling: how many samples.
         generator: moves the samples within their strata; None: they lie in the middle.
-        within: which places [M, 3] are there, [M] bool, and nothing lies behind them; None: everything.
     """
     count, fine = len(origin), sampling.fine
     with torch.no_grad():
@@ -88,13 +85,10 @@ def march(
     distance = geometry.distance.view(count, fine)
     first, last = ((distance + falling * step) * field.sharpness for step in (before, after))
     alpha = section_opacity(first, last)
-    if within is not None:
-        alpha = alpha * within(flat).view(count, fine)
     through = torch.cumprod(1 - alpha + 1e-7, dim=1)
     weights = alpha * torch.cat((torch.ones_like(through[:, :1]), through[:, :-1]), dim=1)
     color = (weights[..., None] * colors).sum(dim=1)
-    if within is None:
-        color = color + through[:, -1:] * _behind(field, origin, direction, sampling.background, generator)
+    color = color + through[:, -1:] * _behind(field, origin, direction, sampling.background, generator)
     shape = (count, fine, 3)
     return RaySamples(color, along, weights, places, geometry.slope.view(shape), normals.view(shape))
 

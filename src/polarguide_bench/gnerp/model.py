@@ -1,17 +1,14 @@
-"""A trained field, for whoever scores or shows it: it renders layers as every model does."""
+"""A trained field: it renders the layers that scores and reports need."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from polarguide.geometry.camera import Camera
-from polarguide.geometry.vectors import unit
 from polarguide.optics.color import srgb_decode
-from polarguide.shading.model import PLAIN, ShadingModel
 from polarguide.shading.result import RenderResult
 from polarguide_bench.gnerp.field import Field
 from polarguide_bench.gnerp.march import march, trace
@@ -20,8 +17,6 @@ from polarguide_bench.gnerp.state import FieldState
 
 CHUNK = 4096
 """Rays at a time."""
-Within = Callable[[Tensor], Tensor]
-"""Which places [N, 3] of the scene are shown, [N] bool."""
 
 
 class _RayPixels(NamedTuple):
@@ -38,29 +33,12 @@ class FieldModel:
 
     Args:
         state: state of the training. recipe: the method. device: where layers are rendered.
-        trained: whether its map of distances is to be brought up to date; a training does that itself.
     """
 
-    shading: ShadingModel = PLAIN
-    """It has the layers of a scene without reflection."""
-
-    def __init__(
-        self, state: FieldState, recipe: NeuralRecipe, device: torch.device, *, trained: bool = True
-    ) -> None:
+    def __init__(self, state: FieldState, recipe: NeuralRecipe, device: torch.device) -> None:
         self.state, self.recipe, self.device = state, recipe, device
         self.field: Field = state.field
-        if trained:
-            self.field.map_distances()
-
-    @property
-    def light(self) -> dict[str, Tensor]:
-        """None is learned."""
-        return {}
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """Names of the layers that it renders, in the order of ``LAYERS``."""
-        return ("final", "base", "normal", "depth", "alpha")
+        self.field.map_distances()
 
     @property
     def steps(self) -> int:
@@ -71,11 +49,6 @@ class FieldModel:
     def gaussians(self) -> None:
         """It has none."""
 
-    @property
-    def size(self) -> str:
-        """How large it is, for people."""
-        return f"{sum(values.numel() for values in self.field.parameters()):,} numbers"
-
     @torch.no_grad()
     def render(
         self,
@@ -84,15 +57,13 @@ class FieldModel:
         normals: bool = True,
         depth: bool = False,
         surface: bool = False,
-        within: Within | None = None,
     ) -> RenderResult:
         """All layers; ``depth`` only on request.
 
         Args:
             camera: any. normals: they come with the colors. surface: its depth is that of the surface in any case.
-            within: see ``Within``; None: all, with what lies behind.
         """
-        batches = [self._ray_pixels(*rays, depth, within) for rays in self._rays(camera)]
+        batches = [self._ray_pixels(*rays, depth) for rays in self._rays(camera)]
         color, normal, opacity, distance = (torch.cat(parts) for parts in zip(*batches, strict=True))
         size = (camera.height, camera.width)
         final = srgb_decode(color).view(*size, 3)
@@ -134,32 +105,16 @@ class FieldModel:
         ]
         return (self.field.lattice(own) * region.unit).cpu()
 
-    @torch.no_grad()
-    def surface(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Normals [N, 3], and linear colors [N, 3] seen from straight above, at places [N, 3] of the surface."""
-        colors = []
-        for part in self.field.region.inner(places.to(self.device, torch.float32)).split(CHUNK):
-            geometry = self.field.geometry(part)
-            normal = unit(geometry.slope)
-            color = self.field.color(part, -normal, normal, geometry.features)
-            colors.append(torch.cat((normal, srgb_decode(color)), dim=1))
-        normal, color = torch.cat(colors).to(places).split(3, dim=1)
-        return normal, color
-
     def _rays(self, camera: Camera) -> list[tuple[Tensor, Tensor]]:
         """Origins and directions of all pixels, in parts."""
         directions = camera.world_rays(device=self.device).view(-1, 3)
         center = self.field.region.inner(camera.pose(directions.dtype, self.device).center)
         return [(center.expand(len(part), 3), part) for part in directions.split(CHUNK)]
 
-    def _ray_pixels(
-        self, origin: Tensor, direction: Tensor, depth: bool, within: Within | None
-    ) -> _RayPixels:
-        region = self.field.region
-        inside = None if within is None else lambda inner: within(region.world(inner))
-        marched = march(self.field, origin, direction, self.recipe.sampling, within=inside)
+    def _ray_pixels(self, origin: Tensor, direction: Tensor, depth: bool) -> _RayPixels:
+        marched = march(self.field, origin, direction, self.recipe.sampling)
         distance = marched.distance
         if depth:
             traced, hit = trace(self.field, origin, direction)
-            distance = torch.where(hit & (within is None), traced, distance)
+            distance = torch.where(hit, traced, distance)
         return _RayPixels(marched.color, marched.normal, marched.opacity, distance)

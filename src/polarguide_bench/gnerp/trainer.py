@@ -16,7 +16,6 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
 from polarguide.optics import aolp, dolp, lens_frame, luminance
 from polarguide.optics.color import srgb_encode
-from polarguide.shading.model import PLAIN, ShadingModel
 from polarguide.training.distributed import ALONE
 from polarguide.training.feed import Entry, Packed, ViewStore, packed, unpacked
 from polarguide.training.settings import ResolvedSettings, StepReport
@@ -170,12 +169,10 @@ class FieldTrainer:
         store: keeps what is computed of the views; None: in memory.
 
     Attributes:
-        shading: has the layers of a scene without reflection.
         whole: whether the state is one between two steps. ranks: it is alone.
     """
 
     ranks = ALONE
-    shading: ShadingModel = PLAIN
 
     def __init__(
         self,
