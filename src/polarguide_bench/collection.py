@@ -21,8 +21,16 @@ from polarguide.training.settings import TrainSettings
 
 FORMAT = 1
 RECORD = "capture.json"
-SCENE, INSPECTION, RUN, EXPORT, SHARE = "scene", "inspection", "run", "export", "share.html"
-"""In the folder of each capture."""
+SCENE = "scene"
+"""Scene folder, in the folder of each capture."""
+INSPECTION = "inspection"
+"""Folder of the inspection."""
+RUN = "run"
+"""Run folder."""
+EXPORT = "export"
+"""Folder of the exports."""
+SHARE = "share.html"
+"""File of the shared page."""
 Step = Literal["prepare", "inspect", "train", "eval", "share", "export"]
 STEPS: tuple[Step, ...] = ("prepare", "inspect", "train", "eval", "share", "export")
 _BLOCK = 1 << 20

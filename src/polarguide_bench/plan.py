@@ -98,7 +98,8 @@ class Comparison:
         """The rows of the tables, in their order."""
         rows = []
         for recipe in self.recipes:
-            steps, unpolarized = self.steps_of.get(recipe.name), f"{recipe.name}:unpolarized"
+            steps = self.steps_of.get(recipe.name)
+            unpolarized = f"{recipe.name}:unpolarized"
             if not self.options.exposures:
                 rows.append(TableRow(recipe.name, recipe, self.settings.exposures, steps))
             for word in self.options.exposures:
@@ -120,7 +121,8 @@ class Comparison:
     @property
     def command(self) -> str:
         """A command line that asks for the same."""
-        settings, options = self.settings, self.options
+        settings = self.settings
+        options = self.options
         arguments: dict[str, Sequence[object]] = {
             "--recipes": [recipe.name for recipe in self.recipes],
             "--steps": [self.steps, *(f"{name}={n}" for name, n in self.steps_of.items())],
@@ -233,7 +235,8 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
         if comparison.settings.background == "masked":
             scene = mask_background(scene)
         if scene.name in [entry.name for entry in entries]:
-            expected, remedy = "scenes with names of their own", "Rename a folder."
+            expected = "scenes with names of their own"
+            remedy = "Rename a folder."
             raise PolarguideError(path, expected=expected, found=f"{scene.name} twice", remedy=remedy)
         if not scene.test_names:
             remedy = "Name some in split.json to score on."
@@ -244,7 +247,8 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
         facts = SceneFacts.of(scene)
         for warning in facts.warnings:
             reporter.warn(f"{scene.name}: {warning}")
-        count, names = len(scene.views), scene.test_names
+        count = len(scene.views)
+        names = scene.test_names
         entries.append(
             SceneEntry(
                 path, scene.name, scene.digest, count, names, share, facts.warnings, scene.refractive_index
@@ -271,7 +275,8 @@ def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[Plan
 
 
 def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int) -> PlannedRun:
-    recipe, options = row.recipe, comparison.options
+    recipe = row.recipe
+    options = comparison.options
     steps = compared_steps(row.steps, comparison.settings.steps)
     settings = replace(
         comparison.settings,

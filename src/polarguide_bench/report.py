@@ -83,7 +83,8 @@ def panel(title: str, axis: str, series: list[Series], columns: Sequence[list[st
         columns: words at the places 0, 1, ... of the x axis; without any, it has round numbers.
     """
     points = [point for of in series for point in of.points]
-    first, last = min(x for x, _, _ in points), max(x for x, _, _ in points)
+    first = min(x for x, _, _ in points)
+    last = max(x for x, _, _ in points)
     numbers = ticks(first if first > last / 2 else 0.0, last)
     x_ticks = [(float(place), words) for place, words in enumerate(columns)] or [
         (number, [f"{number:,g}"]) for number in numbers
@@ -99,7 +100,8 @@ def ticks(low: float, high: float) -> list[float]:
     rough = max(high - low, 1e-6) / 6
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough * 0.999)
-    first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
+    first = math.floor(low / step + 1e-9)
+    last = math.ceil(high / step - 1e-9)
     return [round(index * step, 10) for index in range(first, max(last, first + 1) + 1)]
 
 

@@ -157,7 +157,8 @@ def estimate(differences: Sequence[Numbers], scatter: Sequence[float | None]) ->
     if len(means) == 1:
         units["views"] = [fmean(known(column)) for column in differences[0].T]
     over = next((name for name, values in units.items() if len(values) >= LEAST_UNITS), None)
-    mean, half = fmean(means), None if over is None else t_half_width(units[over])
+    mean = fmean(means)
+    half = None if over is None else t_half_width(units[over])
     noise = half is not None and abs(mean) <= half
     return {
         "mean": mean,

@@ -175,7 +175,8 @@ def _remark(row: Row, results: Results) -> str:
     """Its number of steps where that is not the others', and what is missing of it, else its seeds if rows differ."""
     (steps,) = (recipe.steps for recipe in results.record.recipes if recipe.name == row.recipe)
     states = [r.state for r in results.record.runs if r.recipe == row.recipe and row.scene in (None, r.scene)]
-    finished, missing = states.count("done"), ""
+    finished = states.count("done")
+    missing = ""
     if states and not finished:
         missing = "failed" if "failed" in states else "missing"
     elif finished < len(states):
@@ -187,7 +188,8 @@ def _remark(row: Row, results: Results) -> str:
 
 def notes(results: Results) -> list[str]:
     """Notes that a reader of the scores needs, a sentence each."""
-    counts, record = seed_counts(results), results.record
+    counts = seed_counts(results)
+    record = results.record
     number = f"{counts[0]} " if len(counts) == 1 else ""
     stated = {
         "↑ higher is better, ↓ lower is better.": True,
@@ -219,7 +221,8 @@ def control_section(results: Results) -> Section:
     """The gain by polarization: a block for every recipe with controls, a row for every scene and one over scenes."""
     compared = [d for d in results.compared if d["why"] == "control"]
     columns = _columns(compared)
-    blocks, stated = [], []
+    blocks = []
+    stated = []
     for recipe, controls in controlled(results.recipes).items():
         letters = dict(zip(controls, "abcdefghij", strict=False)) if len(controls) > 1 else {}
         names = ", ".join(f"{letters[c]}: {c}" if letters else c for c in controls)
@@ -289,7 +292,8 @@ def _row(
         if of is None:
             cells.append(EMPTY)
             continue
-        unit, letter = _unit(of), letters.get(of["other"], "")
+        unit = _unit(of)
+        letter = letters.get(of["other"], "")
         interval = "" if of["low"] is None else f"[{signed(of['low'], column)}, {signed(of['high'], column)}]"
         more = " ".join(filter(None, (interval, "" if unit == usual else f"({unit})", letter)))
         cells.append(_gain(of["mean"], of["noise"], column, more))

@@ -122,7 +122,8 @@ class _Work:
 
     def _inspect(self) -> dict[str, Any]:
         out = self.folder / INSPECTION
-        reading, settings = self.task.request.reading, self.task.request.settings
+        reading = self.task.request.reading
+        settings = self.task.request.settings
         inspect_settings = InspectSettings(
             refractive_index=settings.refractive_index, transfer=reading.transfer
         )
@@ -138,7 +139,8 @@ class _Work:
         return {"verdict": inspected.verdict, "findings": findings}
 
     def _train(self) -> dict[str, Any]:
-        request, run = self.task.request, self.folder / RUN
+        request = self.task.request
+        run = self.folder / RUN
         with StopSignals() as should_stop:
             train(
                 self._scene,
@@ -174,7 +176,8 @@ class _Work:
         return {}
 
     def _export(self) -> dict[str, Any]:
-        run, out = self._opened(), self.folder / EXPORT
+        run = self._opened()
+        out = self.folder / EXPORT
         files = [path for kind in self.task.request.formats for path in formats.export(run, kind, out)]
         return {"files": tuple(path.relative_to(self.folder).as_posix() for path in files)}
 

@@ -7,8 +7,10 @@ import math
 BAND = 16.0
 """Width of the paper ring in mm."""
 MARGIN = 6.0
-LABELED, SHORT = 15, 5
-"""Degrees between numbers, and between lines."""
+LABELED = 15
+"""Degrees between numbers."""
+SHORT = 5
+"""Degrees between lines."""
 RULER = 50.0
 _FOOT = 22.0
 _SLIT = 277.5

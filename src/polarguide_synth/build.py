@@ -248,7 +248,8 @@ def area_light_dict(light: dict[str, Any], channel: int | None, where: str) -> d
         PolarguideError: a field is missing or has another type; ``where`` names the scene.
     """
     try:
-        position, toward = list(light["position"]), list(light["toward"])
+        position = list(light["position"])
+        toward = list(light["toward"])
         half = [float(s) / 2 for s in light["size"]]
         radiance = [float(v) for v in light["radiance"]]
     except (KeyError, TypeError, ValueError) as error:
@@ -328,7 +329,8 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
 
 
 def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:
-    turn, position = rotation(thing.rotation), np.array(thing.position, float)
+    turn = rotation(thing.rotation)
+    position = np.array(thing.position, float)
     if thing.shape.get("type") == "ball":
         mesh = sphere(_radius(thing))
     elif thing.shape.get("type") == "mesh":

@@ -28,10 +28,12 @@ def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[
     ends = np.round(np.cumsum(shares) / shares.sum() * path.views).astype(int)
     counts = np.diff(np.concatenate([[0], ends]))
     focal = float(width / 2 / np.tan(np.radians(path.fov) / 2))
-    size, center = (width, height), (width / 2, height / 2)
+    size = (width, height)
+    center = (width / 2, height / 2)
     cameras = []
     for ring, count in zip(path.rings, counts, strict=True):
-        start, stop = float(ring.get("from", 0.0)), float(ring.get("to", 360.0))
+        start = float(ring.get("from", 0.0))
+        stop = float(ring.get("to", 360.0))
         whole = abs(stop - start) >= 360
         step = (stop - start) / max(1, count if whole else count - 1)
         if path.spacing is not None:
@@ -100,7 +102,10 @@ def sample_sparse_points(
         seed: seed of the random numbers.
     """
     random = np.random.default_rng((seed, 23))
-    origins, rays, colors, home = [], [], [], []
+    origins = []
+    rays = []
+    colors = []
+    home = []
     for number, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
         gray = picture.mean(-1)
         contrast = np.hypot(*np.gradient(gray)) + 2
@@ -111,8 +116,10 @@ def sample_sparse_points(
         origins.append(np.broadcast_to(camera.center.numpy(), (amount, 3)))
         colors.append(picture.reshape(-1, 3)[chosen])
         home.append(np.full(amount, number))
-    origin, ray = np.concatenate(origins), np.concatenate(rays)
-    color, view = np.concatenate(colors), np.concatenate(home)
+    origin = np.concatenate(origins)
+    ray = np.concatenate(rays)
+    color = np.concatenate(colors)
+    view = np.concatenate(home)
     hits = intersect(built, origin, ray)
     places = origin + hits.distance[:, None] * ray
     visible = _visible(built, cameras, places) & (random.random((len(places), len(cameras))) < MATCHED_SHARE)
@@ -169,7 +176,8 @@ def _mirrored(
     ghost = np.zeros(len(places), bool)
     if len(chosen) == 0:
         return ghost, places
-    d, n = ray[chosen], normal[chosen]
+    d = ray[chosen]
+    n = normal[chosen]
     back = d - 2 * (d * n).sum(-1, keepdims=True) * n
     hits = intersect(built, places[chosen] + 1e-4 * n, back)
     hit = hits.distance > 0

@@ -52,7 +52,8 @@ def intersect(built: BuiltScene, origins: Array, toward: Array) -> Intersections
         distance, normal, thing, uv = (
             np.array(value, float) for value in _intersect(built, origin, direction)
         )
-        normal, uv = normal.T, uv.T
+        normal = normal.T
+        uv = uv.T
     hit = thing > 0
     normal = np.where((normal * toward).sum(-1, keepdims=True) > 0, -normal, normal) * hit[:, None]
     return Intersections(distance * hit, normal, thing.astype(np.uint8), uv)
@@ -99,9 +100,11 @@ def base_colors(built: BuiltScene, hits: Intersections) -> Array:
     objects, the reflectance at normal incidence of metals; 0 without an object."""
     colors = np.zeros((len(hits.thing), 3))
     for number, (thing, texture) in enumerate(zip(built.spec.things, built.textures, strict=True), 1):
-        here, material = hits.thing == number, thing.material
+        here = hits.thing == number
+        material = thing.material
         if material.type == "metal":
-            eta, k = np.array(material.eta), np.array(material.k)
+            eta = np.array(material.eta)
+            k = np.array(material.k)
             colors[here] = ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)
         elif texture is None:
             colors[here] = material.color
@@ -113,12 +116,16 @@ def base_colors(built: BuiltScene, hits: Intersections) -> Array:
 def _texture_values(texture: Array, uv: Array) -> Array:
     """Values [N, 3] of a texture [H, W, 3], bilinear and repeated, as Mitsuba blends it; nearest in a palette."""
     height, width = texture.shape[:2]
-    column, row = uv[:, 0] * width, (1 - uv[:, 1]) * height
+    column = uv[:, 0] * width
+    row = (1 - uv[:, 1]) * height
     if height == 1:
         return texture[0, np.floor(column).astype(int) % width]
-    column, row = column - 0.5, row - 0.5
-    left, top = np.floor(column).astype(int), np.floor(row).astype(int)
-    across, down = (column - left)[:, None], (row - top)[:, None]
+    column = column - 0.5
+    row = row - 0.5
+    left = np.floor(column).astype(int)
+    top = np.floor(row).astype(int)
+    across = (column - left)[:, None]
+    down = (row - top)[:, None]
     upper, lower = (
         (1 - across) * texture[y % height, left % width] + across * texture[y % height, (left + 1) % width]
         for y in (top, top + 1)
@@ -171,7 +178,8 @@ def _layers(path: Path, camera: Camera) -> list[Picture]:
             for name in ("stokes", "specular", "diffuse", "normal", "depth")
         )
     mean = optics.luminance(stokes)
-    degree, covered = optics.dolp(mean), depth > 0
+    degree = optics.dolp(mean)
+    covered = depth > 0
     near, far = np.percentile(depth[covered].numpy(), (1, 99)) if covered.any() else (0.0, 1.0)
     return [
         figures.radiance_to_rgb(stokes[0] / 2),

@@ -72,15 +72,22 @@ def grid_faces(rows: int, columns: int, *, wrap: bool = False) -> NDArray[np.int
     """Triangles between points [rows, columns] in row order; ``wrap`` joins the last column to the first."""
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns - (not wrap)), indexing="ij")
     after = (column + 1) % columns
-    a, b = row * columns + column, row * columns + after
-    c, d = (row + 1) * columns + column, (row + 1) * columns + after
+    a = row * columns + column
+    b = row * columns + after
+    c = (row + 1) * columns + column
+    d = (row + 1) * columns + after
     return np.concatenate([np.stack((a, b, d), -1).reshape(-1, 3), np.stack((a, d, c), -1).reshape(-1, 3)])
 
 
 def rotation(degrees: tuple[float, float, float]) -> Array:
     """Rotation matrix: about x, then y, then z."""
     x, y, z = np.radians(degrees)
-    cx, sx, cy, sy, cz, sz = np.cos(x), np.sin(x), np.cos(y), np.sin(y), np.cos(z), np.sin(z)
+    cx = np.cos(x)
+    sx = np.sin(x)
+    cy = np.cos(y)
+    sy = np.sin(y)
+    cz = np.cos(z)
+    sz = np.sin(z)
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
     about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
@@ -108,14 +115,16 @@ def primitive_distance(points: Array, part: dict[str, Any]) -> Array:
     """Signed distance from points [..., 3] to one primitive (for an ellipsoid to first order), [...]."""
     kind = part["kind"]
     if "from" in part:
-        start, end = np.array(part["from"], float), np.array(part["to"], float)
+        start = np.array(part["from"], float)
+        end = np.array(part["to"], float)
         axis = end - start
         along = np.clip((points - start) @ axis / (axis @ axis), 0, 1)
         if kind == "capsule":
             radius = part["radius"] + (part.get("end", part["radius"]) - part["radius"]) * along
             return np.asarray(np.linalg.norm(points - start - along[..., None] * axis, axis=-1) - radius)
         if kind == "cylinder":
-            length, round_ = float(np.linalg.norm(axis)), part.get("round", 0.0)
+            length = float(np.linalg.norm(axis))
+            round_ = part.get("round", 0.0)
             height = (points - start) @ axis / length
             across = np.linalg.norm(points - start - (height / length)[..., None] * axis, axis=-1)
             sides = np.stack((across - part["radius"], np.abs(height - length / 2) - length / 2), -1) + round_
@@ -125,7 +134,8 @@ def primitive_distance(points: Array, part: dict[str, Any]) -> Array:
         local = local @ rotation(tuple(part["rotation"]))
     if kind == "ellipsoid":
         size = np.array(part["size"], float)
-        near, slope = np.linalg.norm(local / size, axis=-1), np.linalg.norm(local / size**2, axis=-1)
+        near = np.linalg.norm(local / size, axis=-1)
+        slope = np.linalg.norm(local / size**2, axis=-1)
         return np.asarray(near * (near - 1) / np.maximum(slope, 1e-9))
     if kind == "box":
         round_ = part.get("round", 0.0)
@@ -149,7 +159,8 @@ def surface_nets(values: Array) -> tuple[Array, np.ndarray]:
     """
     inside = values < 0
     shape = tuple(n - 1 for n in values.shape)
-    sums, counts = np.zeros((*shape, 3)), np.zeros(shape)
+    sums = np.zeros((*shape, 3))
+    counts = np.zeros(shape)
     corners = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
 
     def corner(array: np.ndarray, at: tuple[int, ...]) -> np.ndarray:
@@ -160,7 +171,8 @@ def surface_nets(values: Array) -> tuple[Array, np.ndarray]:
             if first[axis]:
                 continue
             second = tuple(1 if k == axis else first[k] for k in range(3))
-            a, b = corner(values, first), corner(values, second)
+            a = corner(values, first)
+            b = corner(values, second)
             crossed = (a < 0) != (b < 0)
             t = np.where(crossed, a / np.where(crossed, a - b, 1), 0)
             place = np.array(first) + t[..., None] * np.eye(3)[axis]
@@ -172,7 +184,8 @@ def surface_nets(values: Array) -> tuple[Array, np.ndarray]:
     points = np.argwhere(used) + sums[used] / counts[used][:, None]
     faces = []
     for axis in range(3):
-        one, two = (axis + 1) % 3, (axis + 2) % 3
+        one = (axis + 1) % 3
+        two = (axis + 2) % 3
         low = np.moveaxis(inside, (axis, one, two), (0, 1, 2))[:-1, 1:-1, 1:-1]
         high = np.moveaxis(inside, (axis, one, two), (0, 1, 2))[1:, 1:-1, 1:-1]
         cells = np.moveaxis(index, (axis, one, two), (0, 1, 2))
@@ -289,7 +302,8 @@ def _distance(points: Array, parts: list[dict[str, Any]], blend: float, block: f
 def _combined(points: Array, parts: list[dict[str, Any]], blend: float) -> Array:
     total: Array | None = None
     for part in parts:
-        value, width = primitive_distance(points, part), part.get("blend", blend)
+        value = primitive_distance(points, part)
+        width = part.get("blend", blend)
         if total is None:
             total = value
         elif part.get("cut"):

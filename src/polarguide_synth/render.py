@@ -47,7 +47,9 @@ from polarguide_synth.settings import LONG_SECONDS, Overrides, SynthSettings, ch
 from polarguide_synth.transport import PathLimits
 
 TEST_SAMPLES = 4
-METER_VIEWS, METER_SAMPLES, METER_WIDTH = 4, 16, 64
+METER_VIEWS = 4
+METER_SAMPLES = 16
+METER_WIDTH = 64
 BRIGHT = 1.5
 
 
@@ -175,7 +177,8 @@ def synthesize(
     variant = choose_variant(settings.color, threads=threads)
     if state == "new":
         folder.write_file(out / folder.REQUEST, json.dumps(plan.request, indent=1).encode())
-    names, tests = plan.names, plan.tests
+    names = plan.names
+    tests = plan.tests
     built = build_scene(spec, out, variant)
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
     exposure = spec.exposure or _metered_exposure(built, cameras, settings.seed)
@@ -212,7 +215,9 @@ def _render_all(job: Job, reporter: Reporter) -> None:
 
 def render_view(job: Job, number: int) -> None:
     """Render one view and write its files."""
-    settings, name, camera = job.settings, job.names[number], job.cameras[number]
+    settings = job.settings
+    name = job.names[number]
+    camera = job.cameras[number]
     samples = settings.samples * (TEST_SAMPLES if name in job.tests else 1)
     big = camera.scaled(2, 2 * camera.width, 2 * camera.height) if job.mosaics else camera
     if job.mosaics:
@@ -341,7 +346,8 @@ def sweep_plans(
         return [Plan(overrides.apply(spec), settings, out / "all")]
     plans = []
     for value in sweep.values:
-        one, how = overrides, settings
+        one = overrides
+        how = settings
         if sweep.parameter == "noise":
             how = replace(settings, noise=value)
         else:
@@ -367,7 +373,8 @@ def _note(scene: Path, parameter: str, value: float) -> None:
 
 def _fewer_views(plan: Plan, out: Path, sweep: Sweep, reporter: Reporter, threads: int) -> list[Path]:
     """All members of a sweep over the number of training views, from the scene with all of them."""
-    spec, settings = plan.spec, plan.settings
+    spec = plan.spec
+    settings = plan.settings
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
     by_name = dict(zip(view_names(len(cameras)), cameras, strict=True))
     tests = held_out_names(list(by_name), settings.test_every)

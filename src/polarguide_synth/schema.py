@@ -157,7 +157,8 @@ Vector = tuple[Number, Number, Number]
 Refraction = Annotated[float, Meta(gt=0, le=100)]
 Extinction = Annotated[float, Meta(ge=0, le=100)]
 Data = dict[str, Any]
-MOST_VIEWS, MOST_SURFACES = 10_000, 1000
+MOST_VIEWS = 10_000
+MOST_SURFACES = 1000
 OLD_KEYS = {"colour": "color", "colours": "colors", "towards": "toward", "truth": "ground_truth"}
 """Names that fields had in earlier scene files and requests."""
 

@@ -256,7 +256,8 @@ def _render_pass(
     """Sums over some samples of each pixel: [pixels, 7, 3 or 1]."""
     pixels = camera.width * camera.height
     first, count = part
-    lens, start = pinhole(camera), opaque_value(mi.UInt32, seed * SCATTER % 2**32)
+    lens = pinhole(camera)
+    start = opaque_value(mi.UInt32, seed * SCATTER % 2**32)
     if mi.variant().startswith("scalar"):
         sums = np.zeros((pixels, 7, 3))
         for pixel in range(pixels):
@@ -302,7 +303,8 @@ def _path(
 ) -> list[list[Any]]:
     """One sample in color: S0, S1, S2 of the specular and of the diffuse lobe, and the directly visible emission."""
     sampler = Sampler(mi.UInt32(pixel), mi.UInt32(sample), seed)
-    spread, place = sampler.next(), sampler.pair()
+    spread = sampler.next()
+    place = sampler.pair()
     if center:
         place = mi.Point2f(0.5, 0.5)
     ray, x_ref = primary_rays(lens, mi.UInt32(pixel), place)

@@ -22,8 +22,10 @@ from polarguide_synth.schema import SceneSpec, parse_scene, read_scene_file
 Color = Literal["rgb", "spectral"]
 OLDEST_LLVM = 16
 """Older ones crash on processors that are newer than they are."""
-SLOW_PATHS_PER_SECOND, FAST_PATHS_PER_SECOND = 800.0, 200_000.0
-"""Of the scalar variant, which has no threads, and of each thread of a compiled one: rough figures, of the presets."""
+SLOW_PATHS_PER_SECOND = 800.0
+"""Paths per second of the scalar variant, which has no threads: a rough figure of the presets."""
+FAST_PATHS_PER_SECOND = 200_000.0
+"""Paths per second of each thread of a compiled variant."""
 LONG_SECONDS = 3600.0
 """Longer than anybody who typed a command waits beside it: then it should be meant."""
 
@@ -97,7 +99,8 @@ def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
 def _silent_stderr() -> Iterator[None]:
     """Suppress what a library writes to the error stream past Python while it loads."""
     sys.stderr.flush()
-    stderr, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    stderr = os.dup(2)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:
         yield

@@ -27,7 +27,8 @@ from polarguide_synth.schema import make
 def fractal_noise(points: Array, seed: int, octaves: int = 4) -> Array:
     """Value noise in [0, 1] at points [..., D]: octaves of halving scale and amplitude, the first with unit cells."""
     total = np.zeros(points.shape[:-1])
-    weight, sums = 1.0, 0.0
+    weight = 1.0
+    sums = 0.0
     for octave in range(octaves):
         total += weight * _value(points * 2.0**octave + 17.3 * octave, seed * 31 + octave)
         sums += weight
@@ -141,7 +142,8 @@ def tiles(
 ) -> Array:  # fmt: skip
     """Square tiles in random colors of a palette, with joints."""
     u, v = _grid(pixels)
-    row, column = np.floor(v * cells), np.floor(u * cells)
+    row = np.floor(v * cells)
+    column = np.floor(u * cells)
     which = (_random(row * 31 + column, seed) * len(colors)).astype(int)
     edge = np.minimum.reduce(
         [u * cells - column, column + 1 - u * cells, v * cells - row, row + 1 - v * cells]
@@ -164,7 +166,8 @@ def printed(
     sky = np.array(accent) * (1 - v[..., None]) + np.array([0.1, 0.2, 0.4]) * v[..., None]
     picture[block] = (sky * (0.5 + tone))[block]
     for _ in range(9):
-        center, radius = random.uniform((0.15, 0.15), (0.85, 0.53)), random.uniform(0.03, 0.13)
+        center = random.uniform((0.15, 0.15), (0.85, 0.53))
+        radius = random.uniform(0.03, 0.13)
         disc = (np.hypot(u - center[0], v - center[1]) < radius) & block
         picture[disc] = random.uniform(0.03, 0.75, 3)
     for line in range(7):
@@ -309,7 +312,8 @@ def room(
     z = hit[..., 2] + eye
     light = 0.55 + 0.5 * fractal_noise(hit * 0.8 + 9, seed, 3)
     picture = np.where((axis == 2)[..., None], 0.0, np.array(walls)) * light[..., None]
-    top, bottom = (axis == 2) & (d[..., 2] > 0), (axis == 2) & (d[..., 2] < 0)
+    top = (axis == 2) & (d[..., 2] > 0)
+    bottom = (axis == 2) & (d[..., 2] < 0)
     picture[top] = (np.array(ceiling) * light[..., None])[top]
     boards = 0.7 + 0.6 * fractal_noise(hit * np.array([1.0, 9.0, 1.0]), seed + 1, 3)
     picture[bottom] = (np.array(floor) * boards[..., None])[bottom]
@@ -339,7 +343,8 @@ def _furniture(picture: Array, sides: dict[str, NDArray[np.bool_]], u: Array, z:
         picture[west & (np.abs(u) < 1.6) & (z > foot - 0.05) & (z < foot)] = (0.16, 0.09, 0.04)
         at = -1.6
         while at < 1.55:
-            thick, tall = random.uniform(0.03, 0.09), random.uniform(0.22, 0.34)
+            thick = random.uniform(0.03, 0.09)
+            tall = random.uniform(0.22, 0.34)
             book = west & (u > at) & (u < at + thick) & (z > foot) & (z < foot + tall)
             picture[book] = random.uniform(0.03, 0.5, 3)
             at += thick + (0.004 if random.random() < 0.9 else 0.2)
@@ -375,7 +380,8 @@ def studio(
         up = np.cross(toward, right)
         ahead = np.maximum(d @ toward, 1e-3)
         wide, tall = (np.tan(np.radians(s / 2)) for s in item["size"])
-        x, y = d @ right / ahead / wide, d @ up / ahead / tall
+        x = d @ right / ahead / wide
+        y = d @ up / ahead / tall
         shade = np.clip((1 - np.maximum(np.abs(x), np.abs(y))) * 12, 0, 1) * (d @ toward > 0)
         picture = picture * (1 - shade[..., None]) + shade[..., None] * np.array(item["radiance"], float)
     return picture

@@ -87,7 +87,9 @@ class Sampler:
     """
 
     def __init__(self, pixel: Any, sample: Any, seed: Any) -> None:
-        self._pixel, self._sample, self._seed = pixel, sample, seed
+        self._pixel = pixel
+        self._sample = sample
+        self._seed = seed
         self._used = 0
         state = mi.sample_tea_64(pixel, seed)
         self.later = mi.PCG32(1, state + mi.UInt64(sample), mi.UInt64(sample))

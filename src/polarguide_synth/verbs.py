@@ -40,7 +40,8 @@ def synth(
         yes: Start a rendering of more than an hour without a question. Without a terminal there is no question.
     """
     use_threads(compute.threads)
-    spec, reporter = find_scene(scene), ConsoleReporter()
+    spec = find_scene(scene)
+    reporter = ConsoleReporter()
     render = importlib.import_module("polarguide_synth.render")
     if sweep is not None:
         family = render.parse_sweep(sweep)

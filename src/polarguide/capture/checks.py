@@ -35,8 +35,10 @@ _SAMPLES = 20_000
 _RESIDUAL = 0.05
 # Curvature (see Measures) of encoded data taken as linear is about -0.6, of linear data decoded as sRGB about
 # +0.3; the gain differences of real sensors leave less than 0.1.
-ENCODED, DECODED = (-0.12, -0.25), (0.1, 0.2)
-"""Curvatures from which files seem encoded, or decoded twice: for a doubt, and for a judgment."""
+ENCODED = (-0.12, -0.25)
+"""Curvatures below which files seem encoded: for a doubt, and for a decision."""
+DECODED = (0.1, 0.2)
+"""Curvatures above which files seem decoded twice: for a doubt, and for a decision."""
 BENT = 0.05
 """Curvature of a response that is not linear, if it is sure: a gamma of 0.9 has -0.056, and DoLP is off by as much."""
 

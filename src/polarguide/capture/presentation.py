@@ -31,8 +31,10 @@ REMEDY = "Correct it with polarguide present, or remove the file."
 CREDITS = ("title", "author", "license", "provenance")
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
 """Meters of each unit of length that is understood."""
-LEAST_METERS, MOST_METERS = 1e-9, 1e9
-"""A nanometer, and eighty Earths: single precision of files that are exported ends beyond."""
+LEAST_METERS = 1e-9
+"""A nanometer."""
+MOST_METERS = 1e9
+"""Eighty Earths. Single precision of exported files ends beyond both limits."""
 WIDEST_CROP = 100.0
 STOPS = 8.0
 """Of exposure, to either side: as much as the steps of an 8-bit picture."""

@@ -97,7 +97,8 @@ class Rate:
     """
 
     def __init__(self, total: int | None, clock: Callable[[], float] = time.monotonic) -> None:
-        self.total, self.clock = total, clock
+        self.total = total
+        self.clock = clock
         self._first: tuple[float, int] | None = None
 
     def left(self, done: int, total: int | None = None, seconds: float | None = None) -> float | None:
@@ -148,7 +149,8 @@ class Lines:
     """Progress of one piece of work as lines, for logs: not more often than every ``LINE_SECONDS``."""
 
     def __init__(self, label: str, total: int | None, clock: Callable[[], float] = time.monotonic) -> None:
-        self._label, self.clock = label, clock
+        self._label = label
+        self.clock = clock
         self._rate = Rate(total, clock)
         self._last = clock()
         self._line = ""

@@ -67,7 +67,8 @@ def diagnosis() -> dict[str, Any]:
         if not each.extra and not (each.conditional and _version(each.name) is None)
     }
     problems = [f"{name} is not installed: {install_package(name)}" for name, v in packages.items() if not v]
-    torch, kernels = _torch(), _kernels()
+    torch = _torch()
+    kernels = _kernels()
     for name, state in (("torch", torch), ("polarguide's kernels", kernels)):
         if "error" in state:
             problems.append(f"{name} cannot be loaded: {state['error']}")
@@ -177,7 +178,9 @@ def _useless_cuda(version: str) -> str:
 
 
 def _print(report: dict[str, Any]) -> None:
-    kernels, torch, machine = report["kernels"], report["torch"], report["machine"]
+    kernels = report["kernels"]
+    torch = report["torch"]
+    machine = report["machine"]
     table = Table("", Column(overflow="fold"), box=None, show_header=False, pad_edge=False)
     table.add_row("polarguide", f"{report['polarguide']['version']}  {report['polarguide']['folder']}")
     table.add_row("Python", f"{report['python']['version']}  {report['python']['executable']}")

@@ -23,10 +23,12 @@ MEBIBYTE = 1 << 20
 LAST_WORDS_SECONDS = 5.0
 MOST_PROCESSES = 65536
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
-NEARLY, GROWTH, SETTLED = 0.9, 1.05, 3
-"""Of a limit, from which on freed memory is given back; of the most that steps then hold, until it is again; and how
-many steps tell the most, some of which take more than others.
-"""
+NEARLY = 0.9
+"""Share of a memory limit from which on freed memory is given back."""
+GROWTH = 1.05
+"""Factor on the memory of the largest step, from which on freed memory is given back again."""
+SETTLED = 3
+"""Number of steps that determine the memory of the largest step."""
 PARTLY = 0.5
 """Of a limit, from which on ``MemoryBound.clear`` gives freed memory back."""
 

@@ -31,7 +31,9 @@ class Adam:
     def __init__(
         self, rates: Mapping[str, float], *, betas: tuple[float, float] = (0.9, 0.999), epsilon: float
     ) -> None:
-        self.rates, self.betas, self._epsilon = dict(rates), betas, epsilon
+        self.rates = dict(rates)
+        self.betas = betas
+        self._epsilon = epsilon
         self.moments: dict[str, dict[str, Tensor]] = {}
 
     @torch.no_grad()

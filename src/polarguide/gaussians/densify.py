@@ -47,7 +47,8 @@ def free_space(points: Tensor, cameras: Sequence[Camera], share: float, quantile
     radii = []
     for camera in cameras:
         x, y, z = camera.to_camera(points.double() - camera.center).unbind(-1)
-        column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        column = camera.fx * x / z + camera.cx
+        row = camera.fy * y / z + camera.cy
         inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         depths = z[inside]
         radii.append(share * float(torch.quantile(depths, quantile)) if len(depths) else 0.0)
@@ -116,14 +117,16 @@ class DensityStatistics:
     """
 
     def __init__(self, count: int, slots: int = 1, device: torch.device | None = None) -> None:
-        self._slots, self._device = slots, device
+        self._slots = slots
+        self._device = device
         self.clear(count)
 
     @classmethod
     def of(cls, gradient: Tensor, counts: Tensor) -> DensityStatistics:
         """From sums as of the attributes."""
         statistics = cls(0, gradient.shape[0] if gradient.ndim == 2 else 1, gradient.device)
-        statistics.gradient, statistics.seen = gradient, counts
+        statistics.gradient = gradient
+        statistics.seen = counts
         return statistics
 
     def add(self, screen_gradient: Tensor, radii: Tensor, width: int, height: int, slot: int = 0) -> None:
@@ -184,7 +187,8 @@ def densify(
         strongest = statistics.mean().argsort(descending=True, stable=True)[:room]
         pulled = torch.zeros_like(pulled)
         pulled[strongest] = True
-    clone, split = pulled & ~wide, pulled & wide
+    clone = pulled & ~wide
+    split = pulled & wide
     children = _children(gaussians, split, generator)
     clones = {name: gaussians[name].detach()[clone] for name in gaussians.names}
     gaussians.append({name: torch.cat((clones[name], children[name])) for name in gaussians.names})

@@ -37,7 +37,8 @@ def shortest_axis_normals_reference(
     first, second, third = log_scales.detach().unbind(-1)
     is_first = (first <= second) & (first <= third)
     is_second = ~is_first & (second <= third)
-    ax, ay = is_first.to(w), is_second.to(w)
+    ax = is_first.to(w)
+    ay = is_second.to(w)
     az = 1 - ax - ay
     length = x * x + y * y + z * z
     twice = 2 / (w * w + length).clamp(min=1e-24)
@@ -122,7 +123,8 @@ def mirrored_directions(means: Tensor, center: Tensor, normals: Tensor) -> Tenso
     Returns:
         [N, 3], unit; zero for a mean at the center.
     """
-    means, normals = means.detach(), normals.detach()
+    means = means.detach()
+    normals = normals.detach()
     center = center.detach().to(means)
     if fits(means, normals):
         out = torch.empty_like(means)

@@ -50,7 +50,9 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     basis = [torch.full_like(x, SH_C0)]
     if degree > 0:
         basis += [-_C1 * y, _C1 * z, -_C1 * x]
-    xx, yy, zz = x * x, y * y, z * z
+    xx = x * x
+    yy = y * y
+    zz = z * z
     if degree > 1:
         basis += [
             _C2[0] * x * y,

@@ -36,7 +36,8 @@ LENS = (
 def can_be_lens(size: ArrayLike, focal: ArrayLike, center: ArrayLike) -> bool:
     """Whether a lens can have these numbers in pixels, also in single precision; false for NaN."""
     side = max(float(np.max(size)), 1.0)  # pictures without pixels are refused elsewhere
-    lengths, places = np.asarray(focal, np.float64), np.abs(np.asarray(center, np.float64))
+    lengths = np.asarray(focal, np.float64)
+    places = np.abs(np.asarray(center, np.float64))
     sound = (lengths <= FARTHEST).all() and (places <= min(FARTHEST, FARTHEST_CENTER * side)).all()
     alike = lengths.max() <= MOST_STRETCH * lengths.min()
     return bool(sound and alike and (lengths >= SHORTEST_FOCAL * side).all())
@@ -111,7 +112,8 @@ class Camera:
         if inner.shape != (3, 3) or outer.shape not in ((3, 4), (4, 4)):
             found = f"{list(inner.shape)} and {list(outer.shape)}"
             raise _no_matrices("intrinsics [3, 3] and world_to_camera [3, 4] or [4, 4]", found)
-        rotation, translation = outer[:3, :3], outer[:3, 3]
+        rotation = outer[:3, :3]
+        translation = outer[:3, 3]
         turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) and np.linalg.det(rotation) > 0
         if not turns or not (np.abs(translation) <= FARTHEST).all():
             found = np.array2string(outer[:3], precision=4).replace("\n", "")
@@ -152,7 +154,9 @@ class Camera:
 
     def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
         """Unit rays through the pixel centers in camera axes, [height, width, 3]; not to be written to."""
-        size, focal, center = (self.width, self.height), (self.fx, self.fy), (self.cx, self.cy)
+        size = (self.width, self.height)
+        focal = (self.fx, self.fy)
+        center = (self.cx, self.cy)
         return _pixel_rays(size, focal, center, dtype, torch.device(device))
 
     def world_rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:

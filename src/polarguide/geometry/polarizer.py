@@ -26,9 +26,11 @@ def malus(stokes: Any, angle: Any) -> Any:
     s0, s1, s2 = stokes
     twice = 2 * angle
     if isinstance(twice, (int, float, np.ndarray, np.generic)):
-        cosine, sine = np.cos(twice), np.sin(twice)
+        cosine = np.cos(twice)
+        sine = np.sin(twice)
     else:
-        cosine, sine = twice.cos(), twice.sin()
+        cosine = twice.cos()
+        sine = twice.sin()
     return (s0 + s1 * cosine + s2 * sine) / 2
 
 

@@ -15,7 +15,8 @@ from polarguide.geometry.vectors import unit
 # Optical axes that are nearly parallel do not say where they meet: the cameras' own distance from each other does then.
 _LEAST_SPREAD = 1e-4
 # The pictures' rows say what is level if they fan out by so much (variance of unit vectors) and roll by less than so.
-_LEAST_FAN, _MOST_ROLL = 0.03, 0.2
+_LEAST_FAN = 0.03
+_MOST_ROLL = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +65,8 @@ def scene_frame(cameras: Sequence[Camera]) -> SceneFrame:
     eye = torch.eye(3, dtype=torch.float64)
     across = eye - forward[:, :, None] * forward[:, None, :]
     system = across.mean(dim=0)
-    middle, ahead = centers.mean(dim=0), unit(forward.mean(dim=0), 1e-9)
+    middle = centers.mean(dim=0)
+    ahead = unit(forward.mean(dim=0), 1e-9)
     if float(torch.linalg.eigvalsh(system)[0]) > _LEAST_SPREAD:
         center = torch.linalg.solve(system, (across @ centers[:, :, None])[..., 0].mean(dim=0))
     else:

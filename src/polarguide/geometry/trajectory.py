@@ -79,7 +79,8 @@ def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
             keyframes.append(camera)
     if len(keyframes) == 1:
         return keyframes * frames
-    times, sampled = np.arange(len(keyframes)), np.linspace(0, len(keyframes) - 1, frames)
+    times = np.arange(len(keyframes))
+    sampled = np.linspace(0, len(keyframes) - 1, frames)
     centers = CubicSpline(times, torch.stack([camera.center for camera in keyframes]).numpy())(sampled)
     turns = Rotation.from_matrix(torch.stack([camera.rotation for camera in keyframes]).numpy())
     rotations = RotationSpline(times, turns)(sampled).as_matrix()
@@ -142,7 +143,8 @@ def read_path(path: Path) -> tuple[list[Camera], float]:
 
 def _camera_of(record: _CameraRecord, where: str) -> Camera:
     lens = f"fx {record.fx:g}, fy {record.fy:g}, cx {record.cx:g}, cy {record.cy:g}"
-    size, place = f"{record.width} x {record.height}", list(record.translation)
+    size = f"{record.width} x {record.height}"
+    place = list(record.translation)
     if not can_be_lens((record.width, record.height), (record.fx, record.fy), (record.cx, record.cy)):
         raise _fault(f"{where})", f"numbers up to {FARTHEST:g}, {LENS}", f"{lens} for {size} pixels")
     if not max(map(abs, place)) <= FARTHEST:

@@ -163,7 +163,8 @@ def combine(parts: list[OrderPosterior]) -> OrderPosterior:
 
 def tempered(ratios: Tensor) -> float:
     """The tempered sum of the clusters' log-likelihood ratios [C]; 0 if it is negative."""
-    total, count = float(ratios.sum()), ratios.numel()
+    total = float(ratios.sum())
+    count = ratios.numel()
     if total <= 0 or count < 2:
         return 0.0
     variance = float(ratios.var()) * count
@@ -192,7 +193,8 @@ def _offset(clusters: Tensor, zero: int) -> tuple[float, float]:
 def _refined(profile: Tensor, zero: int) -> float:
     """Position of a profile's maximum relative to ``zero``, refined by a parabola through three degrees."""
     degree, center = _peak(profile, zero)
-    before, after = float(profile[degree - 1]), float(profile[(degree + 1) % DEGREES])
+    before = float(profile[degree - 1])
+    after = float(profile[(degree + 1) % DEGREES])
     bend = before - 2 * center + after
     fraction = 0.5 * (before - after) / bend if bend < 0 else 0.0
     near = (degree - zero + DEGREES // 2) % DEGREES - DEGREES // 2
@@ -365,7 +367,8 @@ def combine_evidence(
 
 def order_check(angles: AngleFindings) -> Check:
     """Check whether the pictures are named by their true angles."""
-    key, title = "angle_order", "Order of the angles"
+    key = "angle_order"
+    title = "Order of the angles"
     if angles.posterior is None:
         return Check(
             key, title, UNVERIFIED, _no_evidence(angles), _more_evidence(angles), figures=angles.record()
@@ -393,7 +396,8 @@ def order_check(angles: AngleFindings) -> Check:
 
 def handedness_check(angles: AngleFindings) -> Check:
     """Check whether the angles increase counter-clockwise as displayed."""
-    key, title = "handedness", "Sense of the angles"
+    key = "handedness"
+    title = "Sense of the angles"
     if angles.posterior is None:
         return Check(key, title, UNVERIFIED, _no_evidence(angles), _more_evidence(angles))
     probability = angles.posterior.sense_probability
@@ -413,10 +417,12 @@ def handedness_check(angles: AngleFindings) -> Check:
 
 def zero_check(angles: AngleFindings) -> Check:
     """Check whether a polarizer angle of 0 degrees is the image's horizontal."""
-    key, title = "zero_offset", "Zero of the angles"
+    key = "zero_offset"
+    title = "Zero of the angles"
     if angles.posterior is None:
         return Check(key, title, UNVERIFIED, _no_evidence(angles), _more_evidence(angles))
-    offset, error = angles.posterior.offset, angles.posterior.offset_error
+    offset = angles.posterior.offset
+    error = angles.posterior.offset_error
     figures = {"offset_degrees": offset, "error_degrees": error}
     if not math.isfinite(error) or error > ZERO_UNSURE:
         finding = f"The standard error of the zero is {error:.1f}°: too large to decide."

@@ -262,10 +262,12 @@ def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
         return replace(nothing, exposures=", ".join(exposure.words for exposure in view.exposures))
     if share < 0.001:
         return nothing
-    stokes, noise = optics.stokes(gray), optics.intensity_noise(gray)
+    stokes = optics.stokes(gray)
+    noise = optics.intensity_noise(gray)
     i0, i45, i90, i135 = (angle[good] for angle in gray)
     s0 = stokes[0][good]
-    degree, spread = optics.dolp(stokes)[good], optics.dolp_noise(stokes, noise)[good]
+    degree = optics.dolp(stokes)[good]
+    spread = optics.dolp_noise(stokes, noise)[good]
     limit = float(optics.diffuse_dolp_limit(index))
     return replace(
         nothing,

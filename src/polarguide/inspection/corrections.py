@@ -296,7 +296,8 @@ def _require_geometry(capture: Capture, view: InspectedView, prepared: _View) ->
     if prepared.geometry.step not in STEPS:
         raise _changed(capture, view.name, f"a step of {prepared.geometry.step}")
     if prepared.warp is not None:
-        model, parameters = prepared.warp.model, prepared.warp.parameters
+        model = prepared.warp.model
+        parameters = prepared.warp.parameters
         if model not in MODELS or len(parameters) != MODELS[model][1]:
             found = f"a camera {shortened(model)} with {len(parameters)} parameters"
             raise _changed(capture, view.name, found)
@@ -304,7 +305,8 @@ def _require_geometry(capture: Capture, view: InspectedView, prepared: _View) ->
 
 def analyzer_check(capture: Capture, path: Path | None) -> Check | None:
     """The calibration of the sensor's analyzers; None where nothing was calibrated."""
-    key, title = "analyzers", "Analyzers of the sensor"
+    key = "analyzers"
+    title = "Analyzers of the sensor"
     if path is not None:
         calibration = read_analyzers(path)
         text = f"Corrected for this inspection with the calibration of {calibration.sensor}"
@@ -314,11 +316,9 @@ def analyzer_check(capture: Capture, path: Path | None) -> Check | None:
         analyzers = _about(capture).analyzers
         if analyzers is None:
             return None
-        text, remedy, record = (
-            f"Prepared with the calibration of {analyzers.sensor}",
-            "",
-            msgspec.to_builtins(analyzers),
-        )
+        text = f"Prepared with the calibration of {analyzers.sensor}"
+        remedy = ""
+        record = msgspec.to_builtins(analyzers)
     lens = f" and {record['lens']}" if record["lens"] else ""
     return Check(key, title, "ok", f"{text}{lens} ({record['sha256'][:16]}).", remedy, figures=record)
 
@@ -336,7 +336,8 @@ def _matrices(
     """Matrices [4, 4, h, w] or [4, 4, h, w, 3] at the pixels of a view's pictures."""
     if prepared is None or about.prepare is None:
         return calibration.of_pictures(size[::-1])
-    settings, geometry = about.prepare.request.settings, prepared.geometry
+    settings = about.prepare.request.settings
+    geometry = prepared.geometry
     matrices = calibration.of_pictures(
         geometry.size[::-1], offset=(settings.offset_x, settings.offset_y), scale=geometry.step
     )
@@ -366,7 +367,8 @@ def _averaged(matrices: NDArray[np.float32], factor: int) -> NDArray[np.float32]
     """Means over boxes of ``factor`` x ``factor`` pixels."""
     if factor == 1:
         return matrices
-    height, width = matrices.shape[2] // factor, matrices.shape[3] // factor
+    height = matrices.shape[2] // factor
+    width = matrices.shape[3] // factor
     cut = matrices[:, :, : height * factor, : width * factor]
     boxes = cut.reshape(4, 4, height, factor, width, factor, *matrices.shape[4:])
     return np.asarray(boxes.mean(axis=(3, 5), dtype=np.float32))

@@ -54,9 +54,12 @@ ZENITH_MARGIN = math.radians(15.0)
 LEAST_ZENITH = math.radians(15.0)
 LEAST_DOLP = 0.03
 FEWEST = 500
-LEAST_INLIERS, LARGEST_ERROR, LEAST_CONCENTRATION = 0.5, math.radians(10.0), 0.25
-"""Limits for usable normals: share of pixels that agree, error of the normals there, and length of the mean of
-``exp(4 i (AoLP - azimuth))``, which is 1 for perfect agreement modulo 90 degrees and 0 for none."""
+LEAST_INLIERS = 0.5
+"""Least share of pixels whose normals agree."""
+LARGEST_ERROR = math.radians(10.0)
+"""Largest error of these normals."""
+LEAST_CONCENTRATION = 0.25
+"""Least length of the mean of ``exp(4 i (AoLP - azimuth))``: 1 for agreement modulo 90 degrees, 0 for none."""
 _SPECULAR = 0.95
 _NORMAL_ERRORS = tuple(math.radians(angle) for angle in (3.0, 6.0, 10.0, 16.0))
 _INLIERS = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97)
@@ -116,7 +119,8 @@ def sample_surfaces(pairs: Iterable[tuple[InspectedView, Surface]], pairing: int
         noise = optics.intensity_noise(gray)
         planes = torch.cat((optics.stokes(gray), noise[None], (~view.usable).float()[None]))
         planes = interpolate(planes[None], size=size, mode="area")[0]
-        stokes, degree = planes[:3], optics.dolp(planes[:3])
+        stokes = planes[:3]
+        degree = optics.dolp(planes[:3])
         spread = optics.dolp_noise(stokes, planes[3])
         rays = surface.camera.rays()
         zenith = optics.zenith(surface.normal, rays)
@@ -226,7 +230,8 @@ def point_evidence(
             f"limit {float(optics.diffuse_dolp_limit(index)):.2f}; {FEWEST_POINTS} are needed."
         )
         return Evidence(POINTS, torch.zeros(1, 2, DEGREES), count, False, note), None
-    weights, points = weights[keep].double(), model.points[keep]
+    weights = weights[keep].double()
+    points = model.points[keep]
     spreads = torch.stack([_spread(fields[sense][keep].double(), weights) for sense in range(len(SENSES))])
     observed = (weights > 0).sum(dim=1)
     certainty = (weights.sum(dim=1) / observed)[None, :, None]
@@ -292,7 +297,8 @@ def _observed_fields(
         planes = torch.cat((optics.stokes(gray), noise[None], (~view.usable).float()[None]))
         grid = torch.stack((2 * u - 1, 2 * v - 1), dim=-1).float()[None, None]
         sampled = grid_sample(planes[None], grid, align_corners=False)[0, :, 0]
-        stokes, degree = sampled[:3], optics.dolp(sampled[:3])
+        stokes = sampled[:3]
+        degree = optics.dolp(sampled[:3])
         spread = optics.dolp_noise(stokes, sampled[3])
         degrees[:, column] = torch.stack((degree, spread), dim=-1)
         certain = degree > limit + 3 * spread
@@ -304,7 +310,8 @@ def _observed_fields(
         turn = camera.rotation.float()
         angle = optics.aolp(stokes)
         for k, sense in enumerate(SENSES):
-            cosine, sine = torch.cos(angle)[:, None], sense * torch.sin(angle)[:, None]
+            cosine = torch.cos(angle)[:, None]
+            sine = sense * torch.sin(angle)[:, None]
             fields[k, :, column, 0] = (cosine * x_ref + sine * up_ref) @ turn
             fields[k, :, column, 1] = (cosine * up_ref - sine * x_ref) @ turn
     return fields, weights, degrees
@@ -321,7 +328,8 @@ def _spread(fields: Tensor, weights: Tensor) -> Tensor:
     mixed = moments[2] + moments[2].mT
     spreads = []
     for zero in range(DEGREES):
-        c, s = math.cos(math.radians(zero)), math.sin(math.radians(zero))
+        c = math.cos(math.radians(zero))
+        s = math.sin(math.radians(zero))
         moment = c * c * moments[0] + s * s * moments[1] + s * c * mixed
         spreads.append(torch.linalg.eigvalsh(moment)[:, 0].clamp(min=0))
     return torch.stack(spreads, dim=1)

@@ -135,7 +135,8 @@ def _pair_error(
     features2: tuple[NDArray[np.float64], NDArray[np.float32] | None],
     factor: int,
 ) -> PairError | None:
-    (x1, d1), (x2, d2) = features1, features2
+    x1, d1 = features1
+    x2, d2 = features2
     assert first.camera is not None
     assert second.camera is not None
     if d1 is None or d2 is None or min(len(d1), len(d2)) < 2:
@@ -148,7 +149,8 @@ def _pair_error(
     p1 = np.concatenate([x1[[m.queryIdx for m in matches]], np.ones((len(matches), 1))], axis=1)
     p2 = np.concatenate([x2[[m.trainIdx for m in matches]], np.ones((len(matches), 1))], axis=1)
     matrix = _fundamental(first.camera, second.camera)
-    along2, along1 = p1 @ matrix.T, p2 @ matrix
+    along2 = p1 @ matrix.T
+    along1 = p2 @ matrix
     value = np.abs((p2 * along2).sum(axis=1))
     length = np.sqrt((along1[:, :2] ** 2).sum(1) + (along2[:, :2] ** 2).sum(1))
     nowhere = np.full_like(value, np.inf)  # cameras in one place have no epipolar lines
@@ -168,8 +170,10 @@ def _fundamental(first: Camera, second: Camera) -> NDArray[np.float64]:
     return np.asarray(inner2.T @ cross @ rotation @ inner1)
 
 
-TYPICAL_PX, VIEW_PX = 2.0, 2.0
-"""Median epipolar errors in stored pixels above which a capture, or one view of it, gets a warning."""
+TYPICAL_PX = 2.0
+"""Median epipolar error in stored pixels above which a capture gets a warning."""
+VIEW_PX = 2.0
+"""The same of one view."""
 STANDS_OUT = 2.5
 """A view also has to be this many times worse than the median view."""
 GAP_DEG = 25.0
@@ -178,7 +182,8 @@ FEW_VIEWS = 20
 
 def pose_check(capture: Capture) -> Check:
     """Check whether feature matches agree with the poses."""
-    key, title = "poses", "Pose quality"
+    key = "poses"
+    title = "Pose quality"
     if capture.model is None:
         remedy = "Run polarguide prepare with --poses sfm or --poses PATH."
         return Check(key, title, "n/a", "There are no poses.", remedy)
@@ -213,7 +218,8 @@ def pose_check(capture: Capture) -> Check:
 
 def coverage_check(capture: Capture) -> Check:
     """Check whether neighboring views are close enough to each other."""
-    key, title = "coverage", "Coverage"
+    key = "coverage"
+    title = "Coverage"
     cameras = [view.camera for view in capture.posed if view.camera is not None]
     if len(cameras) < 2:
         return Check(key, title, "n/a", "Fewer than two views have a pose.")

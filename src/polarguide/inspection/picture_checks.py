@@ -22,22 +22,32 @@ from polarguide.inspection.settings import Check, Verdict
 
 PAIR_ERROR = 0.05
 """Median |I0 + I90 - I45 - I135| / S0 of a view above which its four pictures are inconsistent."""
-UNEQUAL, VERY_UNEQUAL = 0.01, 0.04
-"""Deviations of the pair ratio from 1. A picture exposed 5 % longer gives 0.025; real sensors have about 0.02."""
-OTHERWISE, VERY_OTHERWISE = 0.08, 0.17
-"""Largest difference of the logarithms of the gains of two angles. Angles that are marked to two degrees leave 0.07,
-real sensors 0.04; a picture that was exposed by a third of a stop otherwise gives 0.23."""
+UNEQUAL = 0.01
+"""Deviation of the pair ratio from 1 for a warning; real sensors have about 0.02."""
+VERY_UNEQUAL = 0.04
+"""The same for the verdict "wrong"; a picture that is exposed 5 % longer gives 0.025."""
+OTHERWISE = 0.08
+"""Largest difference of the logarithms of the gains of two angles for a warning; angles marked to two degrees leave
+0.07."""
+VERY_OTHERWISE = 0.17
+"""The same for the verdict "wrong". An exposure that differs by a third of a stop gives 0.23."""
 UNSTEADY = 0.01
 """Deviation of a view's pair ratio from the capture's."""
-SATURATED, BLOWN = 0.05, 0.3
-"""Shares of saturated pixels: of one view that gets a warning; of a capture that is wrong."""
-LITTLE, ALMOST_NONE = 0.05, 0.005
-"""Shares of polarized pixels."""
+SATURATED = 0.05
+"""Share of saturated pixels from which on a view gets a warning."""
+BLOWN = 0.3
+"""Share of saturated pixels from which on a capture is wrong."""
+LITTLE = 0.05
+"""Share of polarized pixels below which a capture gets a warning."""
+ALMOST_NONE = 0.005
+"""Share of polarized pixels below which polarization tells nothing."""
 NOISY = 0.03
 """Noise of one intensity as a share of S0 / 2: three times its DoLP noise is then 0.13."""
 
-PAIRS_TITLE, ENCODING_TITLE = "Consistency of the four angles", "Linear encoding"
-EXPOSURE_TITLE, NOISE_TITLE = "Equal exposure of the angles", "Noise"
+PAIRS_TITLE = "Consistency of the four angles"
+ENCODING_TITLE = "Linear encoding"
+EXPOSURE_TITLE = "Equal exposure of the angles"
+NOISE_TITLE = "Noise"
 UNDEREXPOSED = 0.01
 """99th percentile of the values below which the exposure of a view was too short."""
 
@@ -101,7 +111,8 @@ def light_checks(capture: Capture, measurements: Sequence[ViewMeasurements]) -> 
 
 
 def _pairs(capture: Capture, measurements: Sequence[ViewMeasurements], pairing: int | None) -> Check:
-    key, title = "pair_sums", PAIRS_TITLE
+    key = "pair_sums"
+    title = PAIRS_TITLE
     error = float(np.median([r.sum_error for r in measurements]))
     figures = {"median_error": error, "pairing": None if pairing is None else list(PAIRINGS[pairing])}
     if pairing is not None and pairing > 0:
@@ -130,7 +141,8 @@ much as the gamma. Smooth areas of a real sensor's pictures, whose response is c
 
 
 def _encoding(capture: Capture, pairing: int | None) -> Check:
-    key, title = "encoding", ENCODING_TITLE
+    key = "encoding"
+    title = ENCODING_TITLE
     slope = checks.curvature([view.measures for view in capture.views])
     if slope is None or pairing not in (None, 0):
         why = "too few pixels are polarized" if slope is None else "the pictures are paired wrongly"
@@ -141,7 +153,8 @@ def _encoding(capture: Capture, pairing: int | None) -> Check:
     sure = bend is not None and abs(slope) > _SURE_BEND * bend[1]
     finding = f"Curvature of the response {slope:+.2f}; linear files have 0, sRGB read as linear about -0.6."
     low, high = (abs(slope) > abs((checks.ENCODED if slope < 0 else checks.DECODED)[k]) for k in (0, 1))
-    low, high = low or (sure and abs(slope) > checks.BENT), high or (sure and abs(slope) > WRONG)
+    low = low or (sure and abs(slope) > checks.BENT)
+    high = high or (sure and abs(slope) > WRONG)
     if not low:
         return Check(key, title, "ok", finding, figures=figures)
     gamma = 1 / (1 - 2 * slope)
@@ -170,7 +183,8 @@ def response_curvature(capture: Capture) -> tuple[float, float] | None:
         good = view.usable.numpy() & (gray.min(axis=0) > 1 / 256)
         i0, i45, i90, i135 = gray[:, good]
         s0 = (i0 + i45 + i90 + i135) / 2
-        x, y = (i0 - i90) / s0, (i45 - i135) / s0
+        x = (i0 - i90) / s0
+        y = (i45 - i135) / s0
         rows = np.stack([np.ones_like(x), x, y, x * x - y * y, (i0 + i90 - i45 - i135) / s0])
         groups += [
             part @ part.T for part in np.array_split(rows, max(2, _GROUPS // len(capture.views)), axis=1)
@@ -192,7 +206,8 @@ def response_curvature(capture: Capture) -> tuple[float, float] | None:
 def _exposure(
     measurements: Sequence[ViewMeasurements], pairing: int | None, exposed: MeasuredGains | None
 ) -> Check:
-    key, title = "exposure", EXPOSURE_TITLE
+    key = "exposure"
+    title = EXPOSURE_TITLE
     known = [r for r in measurements if r.pair_ratio is not None]
     if not known or pairing not in (None, 0):
         return Check(key, title, "n/a", "The pair sums cannot be compared.")
@@ -230,7 +245,8 @@ def _exposure(
 
 
 def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> Check:
-    key, title = "saturation", "Saturation"
+    key = "saturation"
+    title = "Saturation"
     shares = [r.saturated for r in measurements]
     lost = [r.saturated + r.invalid for r in measurements]
     figures = {
@@ -261,7 +277,8 @@ def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> C
 
 
 def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
-    key, title = "noise", NOISE_TITLE
+    key = "noise"
+    title = NOISE_TITLE
     share, bright = (
         float(np.median([getattr(r, k) for r in measurements])) for k in ("noise_share", "bright")
     )
@@ -297,7 +314,8 @@ def with_noise(angles: AngleFindings, measurements: Sequence[ViewMeasurements]) 
 
 
 def _brightness(measurements: Sequence[ViewMeasurements]) -> Check:
-    key, title = "brightness", "Brightness"
+    key = "brightness"
+    title = "Brightness"
     bright = float(np.median([r.bright for r in measurements]))
     finding = f"The 99th percentile of the values is {bright:.0%} of full scale (median view)."
     off = tuple(r.view for r in measurements if r.bright < UNDEREXPOSED)
@@ -310,7 +328,8 @@ def _brightness(measurements: Sequence[ViewMeasurements]) -> Check:
 
 
 def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
-    key, title = "low_dolp", "Strength of polarization"
+    key = "low_dolp"
+    title = "Strength of polarization"
     share = float(np.median([r.polarized for r in measurements]))
     median = float(np.median([r.dolp[0] for r in measurements]))
     finding = f"{share:.0%} of the pixels have a DoLP above {POLARIZED:g} and above three times its noise; "
@@ -346,7 +365,8 @@ def dielectric_check(
     measurements: Sequence[ViewMeasurements], pixels: SurfaceSamples | None, index: float
 ) -> Check:
     """Check whether large areas are polarized more strongly than a dielectric under unpolarized light can be."""
-    key, title = "dielectric", "Polarization that a dielectric can have"
+    key = "dielectric"
+    title = "Polarization that a dielectric can have"
     above = float(torch.tensor([r.above_limit for r in measurements]).median())
     limit = float(optics.diffuse_dolp_limit(index))
     finding = f"{above:.0%} of the pixels (median view) have a DoLP above the diffuse limit ({limit:.2f})."

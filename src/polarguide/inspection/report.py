@@ -26,8 +26,10 @@ from polarguide.visualization.pages import data_uri, page
 
 SIDE = 240
 """Longest side of the pictures in pixels."""
-NOISE_HIGH, EXCESS_HIGH = 0.05, 0.1
-SATURATED_COLOR, INVALID_COLOR = (255, 40, 40), (60, 120, 255)
+NOISE_HIGH = 0.05
+EXCESS_HIGH = 0.1
+SATURATED_COLOR = (255, 40, 40)
+INVALID_COLOR = (60, 120, 255)
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,8 @@ def _of_four(view: InspectedView) -> dict[str, Picture]:
     """Charts that need pictures at four angles."""
     gray = view.intensities().mean(dim=-1)
     stokes = optics.stokes(gray)
-    s0, degree = stokes[0].clamp(min=1e-6), optics.dolp(stokes)
+    s0 = stokes[0].clamp(min=1e-6)
+    degree = optics.dolp(stokes)
     excess = (gray[0] + gray[2] - gray[1] - gray[3]).abs() / s0
     return {
         "dolp": figures.dolp_to_rgb(degree, DOLP_HIGH),
@@ -116,7 +119,9 @@ def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
         inspection: the findings.
         reporter: receives the progress.
     """
-    capture, settings, angles = inspection.capture, inspection.settings, inspection.angles
+    capture = inspection.capture
+    settings = inspection.settings
+    angles = inspection.angles
     layers = LAYERS if capture.four else SHOT_LAYERS
     marked = {name for check in inspection.checks for name in check.views}
     tiles = []
@@ -263,7 +268,8 @@ def write_inspection(inspection: Inspection, out: Path, reporter: Reporter = SIL
         PolarguideError: a file cannot be written.
     """
     make_folder(out)
-    page, record = out / FILE, out / RECORD
+    page = out / FILE
+    record = out / RECORD
     write_whole(record, to_json(inspection_record(inspection)))
     write_text(page, inspection_html(inspection, reporter))
     return page, record

@@ -43,8 +43,10 @@ FEWEST = 4
 """Number of pictures that determine their angle from which on all are judged."""
 SENSE_NEEDS = 0.95
 """Said angles whose doubled directions have a mean longer than this are too much alike to tell a sense."""
-ZERO_OFF, ZERO_WRONG = 4.0, 8.0
-"""Degrees of a common offset, beyond four standard errors: for a warning, and for the verdict "wrong"."""
+ZERO_OFF = 4.0
+"""Degrees of a common offset for a warning, if it is also beyond four standard errors."""
+ZERO_WRONG = 8.0
+"""Degrees of a common offset for the verdict "wrong"."""
 REDUNDANT = 4
 """Known angles of one view from which on they can contradict one another."""
 FEW_ANGLES = 3
@@ -124,7 +126,8 @@ def find_shots(
         return ShotFindings(why="No picture was taken through a filter.", unfiltered=True)
     recipe = recipe_named(RECIPE)
     assert isinstance(recipe, Recipe)
-    blind, total = untold(scene), math.ceil(steps / recipe.angle_rules.last)
+    blind = untold(scene)
+    total = math.ceil(steps / recipe.angle_rules.last)
     until = Polarizers(blind, recipe, total).search + 1  # angles are fitted when a step begins
     state = short_run(
         blind,
@@ -143,7 +146,8 @@ def find_shots(
 
 def pictures_check(capture: Capture) -> Check:
     """Check of the number of pictures, and of the differences of their angles."""
-    key, title = "pictures", "Pictures"
+    key = "pictures"
+    title = "Pictures"
     exposures = [exposure for view in capture.views for exposure in view.exposures]
     angles = sorted({exposure.angle for exposure in exposures if exposure.angle is not None})
     unknown = sum(not exposure.known for exposure in exposures)
@@ -178,7 +182,10 @@ def pictures_check(capture: Capture) -> Check:
 
 def agreement_checks(capture: Capture) -> list[Check]:
     """Whether the pictures of a view agree with one another; nothing where no view has more than three known angles."""
-    key, title, compared, notes = "agreement", "Agreement of the angles", 0, []
+    key = "agreement"
+    title = "Agreement of the angles"
+    compared = 0
+    notes = []
     wrong: list[str] = []
     for view in capture.views:
         places = [k for k, exposure in enumerate(view.exposures) if exposure.angle is not None]
@@ -251,7 +258,8 @@ def _common(telling: Sequence[tuple[Judgment, float]]) -> tuple[int | None, floa
 
 
 def _modulation(findings: ShotFindings) -> Check:
-    key, title = "modulation", "Filter"
+    key = "modulation"
+    title = "Filter"
     count = len(findings.judgments)
     plain = tuple(dict.fromkeys(j.view for j in findings.judgments if j.unfiltered))
     vague = sum(j.vague for j in findings.judgments)
@@ -282,7 +290,8 @@ def _modulation(findings: ShotFindings) -> Check:
 
 
 def _sense(findings: ShotFindings, sense: int | None) -> Check:
-    key, title = "handedness", "Sense of the angles"
+    key = "handedness"
+    title = "Sense of the angles"
     telling = findings.telling
     if len(telling) < FEWEST:
         return Check(key, title, "n/a" if _all_unknown(findings) else "not verified", _too_few(findings))
@@ -305,7 +314,8 @@ def _sense(findings: ShotFindings, sense: int | None) -> Check:
 
 
 def _zero(findings: ShotFindings, sense: int | None, offset: float, error: float) -> Check:
-    key, title = "zero_offset", "Zero of the angles"
+    key = "zero_offset"
+    title = "Zero of the angles"
     if sense is None:
         return Check(key, title, "n/a" if _all_unknown(findings) else "not verified", _too_few(findings))
     figures = {"offset_degrees": offset, "error_degrees": error}
@@ -321,7 +331,8 @@ def _zero(findings: ShotFindings, sense: int | None, offset: float, error: float
 
 
 def _each(findings: ShotFindings, sense: int | None, offset: float) -> Check:
-    key, title = "angles", "Angles of the pictures"
+    key = "angles"
+    title = "Angles of the pictures"
     unknown = sum(not exposure.known for exposure in findings.stated)
     if sense is None:
         chaos = len(findings.telling) >= FEWEST

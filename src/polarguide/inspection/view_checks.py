@@ -18,8 +18,10 @@ from polarguide.inspection.settings import Check, Verdict
 
 FEWEST = 50
 """Points from which on a focal length is estimated."""
-FOCAL_DIFFERS, FOCAL_WRONG = 0.01, 0.05
-"""Differences of the logarithm of a focal length; 1 % turns a ray at 30 degrees by 0.25 degrees."""
+FOCAL_DIFFERS = 0.01
+"""Difference of the logarithm of a focal length for a warning; 1 % turns a ray at 30 degrees by 0.25 degrees."""
+FOCAL_WRONG = 0.05
+"""The same for the verdict "wrong"."""
 TO_DEVIATION = 1.4826
 STEP = 1 / 3
 """Stops by which cameras set exposures; with a larger error, equal exposures are not confirmed."""
@@ -118,8 +120,10 @@ def _focal_length_alone(model: ColmapModel, view: str) -> tuple[float, float] | 
     local = places @ camera.rotation.numpy().T + camera.translation.numpy()
     if not (local[:, 2] > 0).all():
         return None
-    middle, depth = local.mean(axis=0), float(np.median(local[:, 2]))
-    focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    middle = local.mean(axis=0)
+    depth = float(np.median(local[:, 2]))
+    focal = np.array([camera.fx, camera.fy])
+    center = np.array([camera.cx, camera.cy])
 
     def distances(change: NDArray[np.float64]) -> NDArray[Any]:
         turned = (local - middle) @ Rotation.from_rotvec(change[:3]).as_matrix().T

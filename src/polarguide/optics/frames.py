@@ -84,7 +84,9 @@ def normal_from_angles(zenith: Tensor, azimuth: Tensor, rays: Tensor) -> Tensor:
         [..., 3] unit.
     """
     sine = torch.sin(zenith)
-    right, up, back = sine * torch.cos(azimuth), sine * torch.sin(azimuth), torch.cos(zenith)
+    right = sine * torch.cos(azimuth)
+    up = sine * torch.sin(azimuth)
+    back = torch.cos(zenith)
     # Component by component: torch is slow where the last axis of three broadcasts.
     axes = zip(*(vectors.unbind(-1) for vectors in (*lens_frame(rays), rays)), strict=True)
     return torch.stack([right * x + up * y - back * ray for x, y, ray in axes], dim=-1)

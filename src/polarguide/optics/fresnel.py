@@ -256,7 +256,8 @@ def specular_zeniths(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> tu
 
 
 # Reflectances at normal incidence for which ``conductor_index`` gives a conductor.
-LEAST_REFLECTANCE, LARGEST_REFLECTANCE = 0.1, 0.985
+LEAST_REFLECTANCE = 0.1
+LARGEST_REFLECTANCE = 0.985
 
 
 def _terms(cosine: Tensor, n: Tensor, k: Tensor) -> tuple[Tensor, ...]:

@@ -102,7 +102,8 @@ def paper_candidates(stokes: Tensor, rays: Tensor, refractive_index: float | Ten
     Raises:
         ValueError: the first axis of ``stokes`` is not 3, or ``refractive_index`` is a number not above 1.
     """
-    polar, turn = diffuse_zenith(dolp(stokes), refractive_index), aolp(stokes)
+    polar = diffuse_zenith(dolp(stokes), refractive_index)
+    turn = aolp(stokes)
     normal = normal_from_angles(polar, turn, rays)
     rotated = normal_from_angles(polar, turn + math.pi / 2, rays)
     return Candidates(torch.stack((normal, -normal, rotated, -rotated), dim=-2), polar, turn)
@@ -127,7 +128,8 @@ def physical_candidates(
     Raises:
         ValueError: the first axis of ``stokes`` is not 3, or ``refractive_index`` is a number not above 1.
     """
-    degree, angle = dolp(stokes), aolp(stokes)
+    degree = dolp(stokes)
+    angle = aolp(stokes)
     below, above = specular_zeniths(degree, refractive_index)
     polar = torch.stack((diffuse_zenith(degree, refractive_index), below, above), dim=-1)
     polar = polar.repeat_interleave(2, dim=-1)
@@ -336,7 +338,8 @@ def chromatic_normals(
     moments = window_mean(torch.cat((moments, spread[None], mean)), window)
     variance, slope1, slope2, spread, s0, s1, s2 = moments.unbind(0)
     least = torch.finfo(variance.dtype).tiny
-    slope1, slope2 = slope1 / variance.clamp(min=least), slope2 / variance.clamp(min=least)
+    slope1 = slope1 / variance.clamp(min=least)
+    slope2 = slope2 / variance.clamp(min=least)
     degree = torch.hypot(slope1, slope2)
     explained = degree * variance.sqrt()
     unexplained = (spread - explained**2).clamp(min=0).sqrt()

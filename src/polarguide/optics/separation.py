@@ -78,7 +78,8 @@ def exact_separation(
     s0 = s0.clamp(min=0)
     # Cosine and sine of twice the azimuth. Without an azimuth they are 0, and so is the contrast.
     across = (x * x + y * y).clamp(min=torch.finfo(x.dtype).eps)
-    double_cos, double_sin = (x * x - y * y) / across, 2 * x * y / across
+    double_cos = (x * x - y * y) / across
+    double_sin = 2 * x * y / across
     perpendicular = -(s1 * double_cos[..., None] + s2 * double_sin[..., None])
     specular = perpendicular + (diffuse_slope * sine2)[..., None] * s0
     specular = specular / contrast.clamp(min=minimum_contrast / 10)[..., None]
@@ -107,7 +108,8 @@ def paper_separation(stokes: Tensor, zenith: Tensor, refractive_index: float | T
         ValueError: the first axis of ``stokes`` is not 3, or ``refractive_index`` is a number not above 1.
     """
     check_leading(stokes, 3, "stokes")
-    (rs, rp), (ts, tp) = reflectances(zenith, refractive_index), transmittances(zenith, refractive_index)
+    rs, rp = reflectances(zenith, refractive_index)
+    ts, tp = transmittances(zenith, refractive_index)
     s0 = stokes[0].clamp(min=0)
     reflected = ((rs + rp) / 2)[..., None]
     specular = s0 * reflected
@@ -145,7 +147,8 @@ def paper_intensities(
         ValueError: the first axis of ``stokes`` is not 3, or ``refractive_index`` is a number not above 1.
     """
     check_leading(stokes, 3, "stokes")
-    (rs, rp), (ts, tp) = reflectances(zenith, refractive_index), transmittances(zenith, refractive_index)
+    rs, rp = reflectances(zenith, refractive_index)
+    ts, tp = transmittances(zenith, refractive_index)
     wave = torch.cos(2 * (polarizer - s_direction))
     s0 = stokes[0].clamp(min=0)
     left = s0 * (1 - (rs + rp) / 2)[..., None]
@@ -182,7 +185,9 @@ def predicted_stokes(
     cosine, x, y = _components(normals, rays)
     specular_slope, diffuse_slope = dolp_slopes(cosine, refractive_index)
     # sin^2 times the cosine and sine of twice the azimuth; the slopes lack just that factor.
-    double_cos, double_sin = x * x - y * y, 2 * x * y
+    double_cos = x * x - y * y
+    double_sin = 2 * x * y
     polarized = diffuse_slope[..., None] * diffuse - specular_slope[..., None] * specular
-    s1, s2 = polarized * double_cos[..., None], polarized * double_sin[..., None]
+    s1 = polarized * double_cos[..., None]
+    s2 = polarized * double_sin[..., None]
     return torch.stack(torch.broadcast_tensors(specular + diffuse, s1, s2))

@@ -173,13 +173,15 @@ def filter_analyzer(angle: float | Tensor, rays: Tensor) -> Tensor:
         [2, ...]: cosine and sine of twice the angle of the field that it passes, in the lens frame.
     """
     theta = torch.as_tensor(angle, dtype=rays.dtype, device=rays.device)
-    sine, cosine = torch.sin(theta), torch.cos(theta)
+    sine = torch.sin(theta)
+    cosine = torch.cos(theta)
     x, y, z = rays.unbind(-1)
     # d x a with a = (-sin, -cos, 0): up in the picture is -y of the camera.
     passed = z * cosine, -z * sine, y * sine - x * cosine
     right, up = lens_frame(rays)
     field = torch.stack(passed, dim=-1)
-    along, across = dot(field, right), dot(field, up)
+    along = dot(field, right)
+    across = dot(field, up)
     squared = (along * along + across * across).clamp(min=torch.finfo(rays.dtype).tiny)
     return torch.stack(((along * along - across * across) / squared, 2 * along * across / squared))
 

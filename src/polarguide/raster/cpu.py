@@ -54,7 +54,8 @@ def finite(*splats: Tensor) -> list[Tensor]:
 
 def _chosen(picture: Tensor, channels: tuple[int, ...]) -> Tensor:
     """Some channels of a picture, as a tensor of their own."""
-    first, last = channels[0], channels[-1]
+    first = channels[0]
+    last = channels[-1]
     if channels == tuple(range(first, last + 1)):  # several times as fast as any others
         return picture[..., first : last + 1].contiguous()
     return picture[..., list(channels)]
@@ -79,7 +80,8 @@ class _Rasterize(torch.autograd.Function):
         ctx.mark_non_differentiable(radii)
         ctx.save_for_backward(*inputs, out)
         ctx.rasterizer = rasterizer
-        ctx.statistic, ctx.still = statistic, still
+        ctx.statistic = statistic
+        ctx.still = still
         return out, alpha, radii, _chosen(out, still) if still else None
 
     @staticmethod
@@ -109,6 +111,7 @@ def rasterize_cpu(
     check_shapes(splats, statistic, still)
     for name, tensor in splats._asdict().items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            found, remedy = f"{tensor.dtype} on {tensor.device}", "Convert it, or use rasterize_reference."
+            found = f"{tensor.dtype} on {tensor.device}"
+            remedy = "Convert it, or use rasterize_reference."
             raise refusal(name, "float32 on the CPU", found, remedy)
     return Rasterized(*applied(_Rasterize, camera, statistic, still, *splats))

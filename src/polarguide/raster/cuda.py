@@ -138,7 +138,9 @@ def _gsplat() -> Any:
 
 
 def _project(splats: Splats, camera: Camera) -> _Projected:
-    gsplat, size, view = _gsplat(), (camera.width, camera.height), _view(camera, splats.means.device)
+    gsplat = _gsplat()
+    size = (camera.width, camera.height)
+    view = _view(camera, splats.means.device)
     radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
         splats.means,
         None,
@@ -196,7 +198,8 @@ class _AlphaAlone(torch.autograd.Function):
         camera: Camera,
     ) -> Tensor:
         ctx.save_for_backward(means2d, conics, opacities)
-        ctx.projected, ctx.camera = _Projected(*(t.detach() for t in projected)), camera
+        ctx.projected = _Projected(*(t.detach() for t in projected))
+        ctx.camera = camera
         return alpha.detach().clone()
 
     @staticmethod
@@ -244,7 +247,8 @@ def _blend_with_statistic(
 
 def _channels(features: Tensor, chosen: list[int]) -> Tensor:
     """Some channels of [N, D], without an index that would be copied to the device."""
-    first, last = chosen[0], chosen[-1] + 1
+    first = chosen[0]
+    last = chosen[-1] + 1
     if chosen == list(range(first, last)):
         return features[:, first:last]
     return torch.stack([features[:, channel] for channel in chosen], dim=1)

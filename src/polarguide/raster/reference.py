@@ -32,7 +32,8 @@ def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
     local = means @ rotation.T + camera.translation.to(means)
     depth = local[:, 2]
     safe = torch.where(depth > NEAR_PLANE, depth, torch.ones_like(depth))
-    x, y = local[:, 0] / safe, local[:, 1] / safe
+    x = local[:, 0] / safe
+    y = local[:, 1] / safe
     means2d = torch.stack((camera.fx * x + camera.cx, camera.fy * y + camera.cy), dim=-1)
     margin_x = JACOBIAN_MARGIN * camera.width / camera.fx
     margin_y = JACOBIAN_MARGIN * camera.height / camera.fy
@@ -63,7 +64,9 @@ def rasterize_reference(
         bad = (~torch.isfinite(tensor)).nonzero()
         if len(bad):
             raise not_finite(name, int(bad[0, 0]))
-    means, opacities, features = splats.means, splats.opacities, splats.features
+    means = splats.means
+    opacities = splats.opacities
+    features = splats.features
     means2d, covariances, depth = _project(splats, camera)
     determinant = torch.linalg.det(covariances)
     visible = (depth > NEAR_PLANE) & (opacities >= MINIMUM_ALPHA) & (determinant > 0)

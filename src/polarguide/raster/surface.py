@@ -89,7 +89,8 @@ def alpha_in_front(splats: Splats, camera: Camera, depth: Tensor, rasterize: Ras
     covered = (depth > 0).cpu()
     limit = depth.to(splats.means.device, splats.means.dtype)
     low, high, total = (torch.zeros_like(limit) for _ in range(3))
-    start, end = torch.zeros_like(limit), torch.full_like(limit, torch.inf)
+    start = torch.zeros_like(limit)
+    end = torch.full_like(limit, torch.inf)
     open_pixels = covered
     for _ in range(PASSES):
         if not bool(open_pixels.any()):

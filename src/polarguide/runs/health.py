@@ -88,7 +88,8 @@ class Polarization:
         doubts = f" ({self.doubtful} of {self.pictures} pictures doubtful)" if self.pictures else ""
         counts = {"measured": self.measured, "fitted": self.fitted, "none": self.none}
         more = {"measured": "", "fitted": doubts, "none": ""}
-        total, others = sum(counts.values()), [w for w in counts if counts[w] and w != self.word]
+        total = sum(counts.values())
+        others = [w for w in counts if counts[w] and w != self.word]
         if not others:
             guess = " (layers and normals are a guess of the model)" if self.word == "none" else ""
             return f"{self.word}{more[self.word]}{guess}"
@@ -245,7 +246,8 @@ def examine(
     cameras = [view.camera for view in views]
     free = free_space(points, cameras, Densification.free_share, Densification.free_quantile)
     nearest = free.radii.tolist()
-    by_view, visible = {}, None
+    by_view = {}
+    visible = None
     with reporter.track("checking the result", len(views)) as advance:
         for view, near in zip(views, nearest, strict=True):
             facts, radii = _look(model, view, LIMITS.brighter * brightest, near, evidence.filters)
@@ -280,7 +282,8 @@ def _look(
         limit: intensity above which a pixel is burned. near: depth up to which there can be no surface; 0: unknown.
         filters: whether the model predicts what is behind them.
     """
-    local, camera = view.to(model.device), view.camera
+    local = view.to(model.device)
+    camera = view.camera
     result = model.render(camera)
     counted = _counted(local)
     stokes = model.stokes(result, camera) if filters else None
@@ -289,7 +292,8 @@ def _look(
     error = errors[:, counted].square().mean().double()
     psnr = None if bool(error.isnan()) else min(float(-10 * torch.log10(error)), HIGHEST_PSNR)
     burned = ~(result.final <= limit).all(dim=-1) & counted
-    photograph, light = local.photograph().mean(dim=-1), result.final.mean(dim=-1)
+    photograph = local.photograph().mean(dim=-1)
+    light = result.final.mean(dim=-1)
     unlit = black_pixels(view).to(model.device) | ~counted
     inner = max_pool2d(unlit.float()[None], 3, stride=1, padding=1)[0] == 0  # edges are blended
     bare = inner & (result.alpha < 0.5) & (light < photograph / 2)

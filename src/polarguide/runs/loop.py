@@ -90,8 +90,13 @@ class TrainingLoop:
         look: Look | None,
         memory: MemoryBound,
     ) -> None:
-        self._trainer, self._out, self._session, self._memory = trainer, out, session, memory
-        self._reporter, self._should_stop, self._look = reporter, should_stop, look
+        self._trainer = trainer
+        self._out = out
+        self._session = session
+        self._memory = memory
+        self._reporter = reporter
+        self._should_stop = should_stop
+        self._look = look
         self._log = RunLog(out) if trainer.ranks.rank == 0 else None
         if self._log is not None:
             self._log.cut(trainer.state.step)
@@ -118,7 +123,8 @@ class TrainingLoop:
 
     def _steps(self, meter: _Meter) -> bool:
         """Steps up to the last one; True where training is to stop before."""
-        trainer, ranks = self._trainer, self._trainer.ranks
+        trainer = self._trainer
+        ranks = self._trainer.ranks
         while trainer.state.step < trainer.settings.steps:
             # Several ranks stop after the same step, so they have to ask each other, which takes time.
             if (ranks.world == 1 or trainer.state.step % LOG_EVERY == 0) and ranks.any(self._should_stop()):
@@ -150,9 +156,12 @@ class _Meter:
     """
 
     def __init__(self, advance: Advance, log: RunLog | None, stopwatch: Stopwatch) -> None:
-        self._advance, self._log, self._stopwatch = advance, log, stopwatch
+        self._advance = advance
+        self._log = log
+        self._stopwatch = stopwatch
         self._loss = self._psnr = math.nan
-        self._began, self._first = stopwatch.read()[0], -1
+        self._began = stopwatch.read()[0]
+        self._first = -1
         self._waiting: list[StepReport] = []
 
     def take(self, report: StepReport) -> None:

@@ -30,10 +30,16 @@ STEP = 780
 """Bytes a pixel of a step: targets, G-buffer, layers, terms, and their gradients."""
 PRIORS = 900
 """Bytes a pixel while the priors of a view are computed."""
-PRIORS_KEPT, SHOWN_KEPT, UNGUIDED_KEPT = 44, 8, 13
-"""Bytes a pixel of what is kept of a view: targets, photograph with masks, and what of the targets needs no guide."""
-COPIES, WRITTEN = 5, 4
-"""Copies of the parameters of a Gaussian in memory and in the written file; values, gradients, moments, frozen."""
+PRIORS_KEPT = 44
+"""Bytes that are kept of a pixel for targets from priors."""
+SHOWN_KEPT = 8
+"""Bytes that are kept of a pixel for the photograph and its masks."""
+UNGUIDED_KEPT = 13
+"""Bytes that are kept of a pixel for targets that need no guide."""
+COPIES = 5
+"""Copies of a Gaussian's parameters in memory: values, gradients, two moments, frozen values."""
+WRITTEN = 4
+"""Copies of a Gaussian's parameters in the written file."""
 SPLAT = 600
 """Bytes a Gaussian of what a rasterizer makes of it."""
 FILLED = 0.88
@@ -92,7 +98,8 @@ def share_memory(
     Raises:
         PolarguideError: a limit that was given is too small.
     """
-    largest, total = max(pixels, default=0), sum(pixels)
+    largest = max(pixels, default=0)
+    total = sum(pixels)
     now = resident_memory() or 0
     work = now + own
     pictures = 0 if in_memory else (KEPT - MASKS) * total

@@ -129,7 +129,8 @@ class GaussianModel:
     @torch.no_grad()
     def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
         """Share of each pixel's alpha that lies nearer than a depth [H, W], see ``raster.surface``."""
-        drawn, footprints = splats(self.state.gaussians), self.state.footprints
+        drawn = splats(self.state.gaussians)
+        footprints = self.state.footprints
         if footprints is not None:
             drawn = as_trained(drawn, camera, footprints)
         return alpha_in_front(drawn, camera, depth, self.backend.rasterize)

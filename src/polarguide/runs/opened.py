@@ -54,8 +54,12 @@ class OpenedRun:
         scene: Scene | PathLike | None = None,
         reporter: Reporter = SILENT,
     ) -> None:
-        self.folder, self.configuration, self.recipe, self.model = folder, configuration, recipe, model
-        self._scene_source, self._reporter = scene, reporter
+        self.folder = folder
+        self.configuration = configuration
+        self.recipe = recipe
+        self.model = model
+        self._scene_source = scene
+        self._reporter = reporter
 
     def __repr__(self) -> str:
         of = f"{self.recipe.name}, {self.steps} steps, {self.model.size}"
@@ -94,7 +98,8 @@ class OpenedRun:
         configuration = RunConfiguration.load(folder)
         method = recipe if isinstance(recipe, Recipe) else recipe_named(recipe or configuration.recipe)
         if method.name != configuration.recipe:
-            expected, remedy = f"{configuration.recipe}, which {folder} was trained with", "Give that recipe."
+            expected = f"{configuration.recipe}, which {folder} was trained with"
+            remedy = "Give that recipe."
             raise PolarguideError("recipe", expected=expected, found=method.name, remedy=remedy)
         backend = choose_backend(device, say=reporter.say)
         state = load_checkpoint(folder, method, backend.device)
@@ -109,7 +114,8 @@ class OpenedRun:
     @classmethod
     def of(cls: type[Opened], run: OpenedRun) -> Opened:
         """An opened run as an instance of this class, which shares its scene and its model."""
-        scene, reporter = run._scene_source, run._reporter
+        scene = run._scene_source
+        reporter = run._reporter
         return cls(run.folder, run.configuration, run.recipe, run.model, scene=scene, reporter=reporter)
 
     @property
@@ -152,7 +158,8 @@ class OpenedRun:
         Raises:
             PolarguideError: the scene was moved or deleted, cannot be read, or was read otherwise for training.
         """
-        configuration, scene = self.configuration, self._scene_source
+        configuration = self.configuration
+        scene = self._scene_source
         options = SceneOptions(configuration.downscale, configuration.transfer, split="every-8th")
         recorded = configuration.test_views
         if not isinstance(scene, Scene):

@@ -42,7 +42,8 @@ class PaintedMaterials:
         """A scene whose views have these materials where they say anything."""
         views = []
         for view in scene.views:
-            own, painted = view.materials, self.numbers.get(view.name)
+            own = view.materials
+            painted = self.numbers.get(view.name)
             if painted is not None:
                 own = painted if own is None else torch.where(painted > 0, painted, own)
             views.append(replace(view, materials=own))
@@ -58,13 +59,15 @@ def read_painted(run: Path, scene: Scene) -> PaintedMaterials | None:
     """
     if not os.path.lexists(run / FOLDER):  # a link to nowhere is no absence
         return None
-    digest, numbers = hashlib.sha256(), dict[str, Tensor]()
+    digest = hashlib.sha256()
+    numbers = dict[str, Tensor]()
     known = {0, 1, 2, *scene.indices}
     for name, path in sorted(index_files(run / FOLDER, SUFFIXES).items()):
         camera = scene.view(name).camera
         data = read_file(path, largest=LARGEST, remedy=REMEDY)
         picture = torch.from_numpy(decode_materials(path, data))
-        size, found = (camera.height, camera.width), tuple(picture.shape)
+        size = (camera.height, camera.width)
+        found = tuple(picture.shape)
         if found != size:
             raise PolarguideError(
                 path,

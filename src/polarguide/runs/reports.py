@@ -21,8 +21,10 @@ from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.metals.observations import blended, evenly
 from polarguide.visualization.figures import contact_sheet, radiance_to_rgb, scalar_to_rgb, write_png
 
-METALS_PICTURE, METAL_VIEWS = "metals.png", 6
-"""The picture of a run that shows what is metal, and how many training views it has at most."""
+METALS_PICTURE = "metals.png"
+"""File with the picture of metals in a run folder."""
+METAL_VIEWS = 6
+"""Most training views in that picture."""
 ANY = 90.0
 """Degrees: as far as two angles can be apart."""
 
@@ -42,7 +44,8 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
     lines: list[tuple[str, str, Exposure, float | None, str]] = []
     for view in scene.views:
         for number, exposure in enumerate(view.exposures):
-            file, judged = names[view.name][number], of.get((view.name, number))
+            file = names[view.name][number]
+            judged = of.get((view.name, number))
             if judged is None:
                 lines.append((file, view.name, exposure, None, ""))
                 continue
@@ -102,7 +105,8 @@ def report_metals(out: Path, trainer: AngleTrainer, model: GaussianModel, report
     undecided = trainer.undecided()
     if undecided is None:
         return
-    gaussians, rasterize = model.state.gaussians, model.backend.rasterize
+    gaussians = model.state.gaussians
+    rasterize = model.backend.rasterize
     views = evenly(trainer.scene.train_views, METAL_VIEWS)
     kinds = [
         [blended(gaussians, values, view.camera, rasterize).cpu() for view in views]

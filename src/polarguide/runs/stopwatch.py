@@ -20,10 +20,12 @@ class Stopwatch:
     """
 
     def __init__(self, seconds: float = 0.0, alone: bool = True) -> None:
-        self._before, self._alone = seconds, alone
+        self._before = seconds
+        self._alone = alone
         self._pause = 0.0
         self._start = time.perf_counter()
-        self._own, self._machine = time.process_time(), machine_busy_seconds()
+        self._own = time.process_time()
+        self._machine = machine_busy_seconds()
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:

@@ -175,8 +175,10 @@ class _Warned(Reporter):
     """Hands messages on to another reporter, and keeps the warnings."""
 
     def __init__(self, to: Reporter) -> None:
-        self.say, self.track = to.say, to.track  # type: ignore[method-assign]
-        self._to, self.warnings = to, list[str]()
+        self.say = to.say  # type: ignore[method-assign]
+        self.track = to.track  # type: ignore[method-assign]
+        self._to = to
+        self.warnings = list[str]()
 
     def warn(self, text: str) -> None:
         """See ``Reporter``."""
@@ -259,7 +261,8 @@ def check_same_run(old: RunConfiguration, new: RunConfiguration, out: Path) -> N
         )
     # All but where the scene lies and the device decide the result; what is painted may change.
     for field in sorted(old.__annotations__.keys() - {"scene", "device", "painted"}):
-        a, b = getattr(old, field), getattr(new, field)
+        a = getattr(old, field)
+        b = getattr(new, field)
         if a != b and a is not None:
             name, a, b = first_difference(field, a, b)
             raise PolarguideError(

@@ -75,7 +75,8 @@ def _texel_index(face: Tensor, points: Tensor, resolution: int) -> Tensor:
     table = torch.tensor(_FACES)[face]
     s = table[..., 3] * points.gather(-1, table[..., 2:3])[..., 0]
     t = table[..., 5] * points.gather(-1, table[..., 4:5])[..., 0]
-    column, row = (s + resolution - 1) // 2, (t + resolution - 1) // 2
+    column = (s + resolution - 1) // 2
+    row = (t + resolution - 1) // 2
     return (face * resolution + row) * resolution + column
 
 
@@ -88,7 +89,8 @@ def _ring(resolution: int, device: torch.device) -> _Ring:
     face = torch.arange(6)[:, None, None].expand(6, resolution + 2, resolution + 2)
     own = _texel_index(face, _face_points(inner, resolution), resolution)
 
-    points, outer = _face_points(inner, last), _face_points(place, last)
+    points = _face_points(inner, last)
+    outer = _face_points(place, last)
 
     def across(axis_column: int) -> Tensor:
         """The texel over the edge in s (column 2 of the table) or t (column 4)."""
@@ -146,13 +148,17 @@ def bilinear(
     channels = ringed.shape[-1]
     face, s, t = place
     # Texel centers are at half-integers; one is added for the ring. A NaN reads cell 0 and stays in the fraction.
-    u, v = (s + 1) * (resolution / 2) + 0.5, (t + 1) * (resolution / 2) + 0.5
+    u = (s + 1) * (resolution / 2) + 0.5
+    v = (t + 1) * (resolution / 2) + 0.5
     column, row = (x.detach().nan_to_num(0).clamp(min=0).floor().long() for x in (u, v))
     if isinstance(resolution, Tensor):
-        column, row = column.minimum(resolution), row.minimum(resolution)
+        column = column.minimum(resolution)
+        row = row.minimum(resolution)
     else:
-        column, row = column.clamp(max=resolution), row.clamp(max=resolution)
-    fu, fv = (u - column)[:, None], (v - row)[:, None]
+        column = column.clamp(max=resolution)
+        row = row.clamp(max=resolution)
+    fu = (u - column)[:, None]
+    fv = (v - row)[:, None]
     first = (face * (resolution + 2) + row) * (resolution + 2) + column + begin
     second = first + resolution + 2
     # index_select, not an index: its gradient adds atomically on a GPU, where that of an index sorts first.
@@ -169,7 +175,8 @@ def cubemap_lookup_reference(texture: Tensor, directions: Tensor) -> Tensor:
 class _Lookup(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, texture: Tensor, directions: Tensor) -> Tensor:
-        texture, directions = texture.detach().contiguous(), directions.detach().contiguous()
+        texture = texture.detach().contiguous()
+        directions = directions.detach().contiguous()
         out = texture.new_empty(directions.shape[0], texture.shape[-1])
         _native.cubemap_forward(texture, directions, out)
         ctx.save_for_backward(texture, directions)
@@ -218,7 +225,8 @@ def cubemap_lookup(texture: Tensor, directions: Tensor) -> Tensor:
 
 
 # Of the native look-up.
-MOST_LEVELS, MOST_CHANNELS = 16, 64
+MOST_LEVELS = 16
+MOST_CHANNELS = 64
 
 
 def box_mips(texture: Tensor) -> list[Tensor]:
@@ -254,7 +262,8 @@ def box_mips(texture: Tensor) -> list[Tensor]:
 class _Between(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, directions: Tensor, level: Tensor, *levels: Tensor) -> Tensor:
-        directions, level = directions.detach().contiguous(), level.detach().contiguous()
+        directions = directions.detach().contiguous()
+        level = level.detach().contiguous()
         contiguous = [t.detach().contiguous() for t in levels]
         out = directions.new_empty(len(directions), contiguous[0].shape[-1])
         _native.mips_forward(contiguous, directions, level, out)

@@ -305,7 +305,8 @@ class DeferredShading(ShadingModel):
             return self._shade_native(splatted, texels, camera, detached=False)
         strength = splatted["strength"][..., 0]
         local = splatted["local"] if self.local else None
-        index, rough = self._index_picture(splatted), blended_roughness(splatted)
+        index = self._index_picture(splatted)
+        rough = blended_roughness(splatted)
         level = None if rough is None else LEVELS * rough
         layers: dict[str, Any] = reflect_reference(
             splatted["color"], splatted["normal"], strength, texels, camera, self, local, index, level
@@ -328,7 +329,8 @@ class DeferredShading(ShadingModel):
         """The layers of dielectrics with what metals add to them; as they are where the model knows no metals."""
         if not self.metal:
             return layers
-        features, metal = splatted.features, splatted.metal
+        features = splatted.features
+        metal = splatted.metal
         if metal is None and "metal" in splatted.layout:
             rays = camera.world_rays(dtype=features.dtype, device=features.device)
             metal = metal_pixels(
@@ -372,12 +374,14 @@ class DeferredShading(ShadingModel):
 
     def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
         """Colors [N, 3] of Gaussians by themselves; see ``ShadingModel``."""
-        directions, rough = mirrored(rays, normals).contiguous(), self._roughness(gaussians)
+        directions = mirrored(rays, normals).contiguous()
+        rough = self._roughness(gaussians)
         reflected = self.far_light(light["texels"], directions, None if rough is None else LEVELS * rough)
         if self.local:
             reflected = (reflected + local_light(gaussians, directions, 3)).clamp(min=0)
         cosine = -(rays * normals).sum(dim=-1, keepdim=True).clamp(-1, 0)
-        base, strength = harmonic_colors(gaussians, rays), self.strength(gaussians)[:, None]
+        base = harmonic_colors(gaussians, rays)
+        strength = self.strength(gaussians)[:, None]
         several = self._has_indices(gaussians)
         index = self.refractive_index + gaussians["index_offset"][:, None] if several else None
         specular, diffuse = self.contributions(base, strength, reflected, cosine, index)

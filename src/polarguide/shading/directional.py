@@ -44,7 +44,8 @@ from polarguide.shading.model import (
     mirrored,
 )
 
-CHANNELS, FEATURES = 16, 4
+CHANNELS = 16
+FEATURES = 4
 INPUTS = CHANNELS * (1 + FEATURES)
 # Brightest albedo is e^5 / 5, about 30 times display white (the release's scale).
 ALBEDO_SCALE = 0.2
@@ -178,7 +179,9 @@ class DirectionalShading(ShadingModel):
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         """``final``, ``specular`` and ``diffuse`` [H, W, 3]; the color that was splatted is the diffuse one."""
-        albedo, normal, alpha = splatted["color"], splatted["normal"], splatted.alpha
+        albedo = splatted["color"]
+        normal = splatted["normal"]
+        alpha = splatted.alpha
         rays = camera.world_rays(dtype=albedo.dtype, device=albedo.device)
         directions = mirrored(rays, unit(normal, 1e-3))
         radiance = self.radiance(
@@ -197,7 +200,8 @@ class DirectionalShading(ShadingModel):
         Args:
             rays: [N, 3] unit. normals: [N, 3] unit, facing them.
         """
-        roughness, features = torch.sigmoid(gaussians["roughness_logits"]), torch.tanh(gaussians["features"])
+        roughness = torch.sigmoid(gaussians["roughness_logits"])
+        features = torch.tanh(gaussians["features"])
         specular = self.radiance(light, mirrored(rays, normals), roughness, features)
         return self.diffuse_colors(gaussians, rays) + gaussians["surface"][:, None] * specular
 
@@ -222,7 +226,8 @@ class DirectionalShading(ShadingModel):
         A record has no room for features and harmonics: the surroundings have their mean color and no features, by
         which the page knows them.
         """
-        fields, surface = self.fields(gaussians), gaussians["surface"]
+        fields = self.fields(gaussians)
+        surface = gaussians["surface"]
         mean_color = (gaussians["sh_dc"] * SH_C0 + 0.5).clamp(min=0)
         layers = range(3)
         return PageShading(

@@ -102,7 +102,8 @@ def splatting_reference(
 
 def _widths(own: Mapping[str, int], *, normals: bool, depth: bool) -> dict[str, int]:
     """Numbers of all channels, given those of the shading model, which begin with the color."""
-    first, last = {"color": 3, **({"normal": 3} if normals else {})}, {"depth": 1} if depth else {}
+    first = {"color": 3, **({"normal": 3} if normals else {})}
+    last = {"depth": 1} if depth else {}
     return {**first, **{name: width for name, width in own.items() if name != "color"}, **last}
 
 
@@ -135,8 +136,10 @@ class _Splatting(torch.autograd.Function):
         contiguous = [None if t is None else t.detach().contiguous() for t in given]
         core = [t for t in contiguous[: len(_CORE)] if t is not None]
         outputs = _native_splatting(settings, core, contiguous[len(_CORE) :])
-        count, light = len(means), given[len(_CORE) + 2]
-        scales, opacities = means.new_empty(count, 3), means.new_empty(count)
+        count = len(means)
+        light = given[len(_CORE) + 2]
+        scales = means.new_empty(count, 3)
+        opacities = means.new_empty(count)
         features = means.new_empty(count, outputs.channels)
         learns = any(ctx.needs_input_grad)
         mirrored = means.new_empty(count, 3) if learns and light is not None else None
@@ -150,7 +153,8 @@ class _Splatting(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         *inputs, scales, opacities, features, mirrored = ctx.saved_tensors
-        core, (outward, strength, dc, rest, metalness, further) = inputs[: len(_CORE)], inputs[len(_CORE) :]
+        core = inputs[: len(_CORE)]
+        outward, strength, dc, rest, metalness, further = inputs[len(_CORE) :]
         others = [outward, strength, dc, rest, metalness, further]
         to_core = [torch.empty_like(t) for t in core]
         to_learned = [None if t is None else torch.empty_like(t) for t in (strength, dc, rest, further)]
@@ -209,7 +213,8 @@ def render(
         footprints: [N] of the training, with which larger pictures are as smooth as it was, see
             ``raster.magnification``; None: drawn as they are, which is how training draws.
     """
-    normals, depth = request.normals or shading.needs_normals, request.depth
+    normals = request.normals or shading.needs_normals
+    depth = request.depth
     gaussian_splats, layout = splatting(
         gaussians, camera, shading, sh_degree=request.sh_degree, normals=normals, depth=depth
     )
@@ -222,7 +227,8 @@ def render(
     if request.layers_detached and normals:
         layers, detached = shading.shade_detached(splatted, light, camera)
     else:
-        layers, detached = shading.shade(splatted, light, camera), None
+        layers = shading.shade(splatted, light, camera)
+        detached = None
     blended = None
     if request.at_median_depth and (normals or depth):
         directions = (
@@ -260,7 +266,8 @@ def split(features: Tensor, alpha: Tensor, layout: Layout) -> Split:
 
     Without a gradient and a depth there is nothing to do natively: the normal is a part of the features.
     """
-    depth, further = "depth" in layout, features.shape[-1] > 6
+    depth = "depth" in layout
+    further = features.shape[-1] > 6
     if "normal" in layout and further and fits(features) and (depth or features.requires_grad):
         return split_native(features, alpha, depth=depth)
     return split_reference(features, alpha, layout)

@@ -91,7 +91,9 @@ def metal_pixels(
     """
     pixels = where_metal(features, layout.first("metal"))
     # All channels at once: each part taken by itself would send back a picture of all of them.
-    metal, rays, facing = features[pixels], rays[pixels], unit(normal[pixels], 1e-3)
+    metal = features[pixels]
+    rays = rays[pixels]
+    facing = unit(normal[pixels], 1e-3)
     metal = metal[:, layout.channels("metal")]
     share = metal[:, 3]
     inverse = 1 / share.clamp(min=MINIMUM_SHARE)
@@ -136,10 +138,12 @@ def metal_stokes(
     at = metal.pixels
     rays = camera.rays(device=normal.device).flatten(0, 1)[at]
     facing = unit(camera.to_camera(normal).flatten(0, 1)[at])
-    over, under = specular.flatten(0, 1)[at], diffuse.flatten(0, 1)[at]
+    over = specular.flatten(0, 1)[at]
+    under = diffuse.flatten(0, 1)[at]
     stokes = optics.predicted_stokes(2 * (over - metal.specular), 2 * under, facing, rays, refractive_index)
     x_ref, up_ref = optics.lens_frame(rays)
-    x, y = dot(facing, x_ref)[:, None], dot(facing, up_ref)[:, None]
+    x = dot(facing, x_ref)[:, None]
+    y = dot(facing, up_ref)[:, None]
     polarized = 2 * metal.slope * metal.specular
     added = torch.stack((2 * metal.specular, -polarized * (x * x - y * y), -polarized * (2 * x * y)))
     return stokes + added
@@ -147,7 +151,8 @@ def metal_stokes(
 
 MOST_STRENGTH = 0.98
 # Directions in which functions are compared, and Gaussians at a time.
-DIRECTIONS, CHUNK = 128, 4096
+DIRECTIONS = 128
+CHUNK = 4096
 
 
 @torch.no_grad()

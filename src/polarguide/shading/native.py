@@ -98,7 +98,9 @@ class _Reflect(torch.autograd.Function):
         layers = [torch.empty_like(rays) for _ in range(4)]
         inputs: list[Any] = [features, rays, levels, *given.model, *given.levels]
         _native.reflect_forward(*inputs, *(looked_up or (None, None, None)), *layers)
-        metal, outputs, light = given.metal, [], []
+        metal = given.metal
+        outputs = []
+        light = []
         if metal is not None:
             pixels = len(metal.pixels)
             outputs = [rays.new_empty(pixels), rays.new_empty(pixels, 3), rays.new_empty(pixels, 3)]
@@ -116,16 +118,20 @@ class _Reflect(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         features, rays, directions, level, looked_up, *saved = ctx.saved_tensors
-        given, contiguous = ctx.given, [None if g is None else g.contiguous() for g in grads]
+        given = ctx.given
+        contiguous = [None if g is None else g.contiguous() for g in grads]
         metal = given.metal
         to_layers = contiguous if metal is None else contiguous[:-3]
         to_layers += [None] * (6 - len(to_layers))
-        to_features, to_seen = torch.empty_like(features), torch.empty_like(looked_up)
+        to_features = torch.empty_like(features)
+        to_seen = torch.empty_like(looked_up)
         if metal is not None:
             light, *saved = saved
-            by_layers, by_metal = [*to_layers[:2], to_layers[4]], contiguous[-2:]
+            by_layers = [*to_layers[:2], to_layers[4]]
+            by_metal = contiguous[-2:]
             to_light = torch.zeros_like(rays) if to_layers[3] is None else to_layers[3].clone()
-            to_normal, to_metal = rays.new_empty(len(metal.pixels), 3), rays.new_empty(len(metal.pixels), 4)
+            to_normal = rays.new_empty(len(metal.pixels), 3)
+            to_metal = rays.new_empty(len(metal.pixels), 4)
             inputs: list[Any] = [features, rays, *metal, light, *by_layers, *by_metal]
             inputs += [to_light, to_normal, to_metal]
             _native.metal_backward(*inputs)
@@ -181,7 +187,9 @@ def reflect_arguments(
     splatted: GBuffer, fresnel: bool, local: bool, refractive_index: float, detached: bool
 ) -> ReflectArguments:
     """Arguments of ``reflect_native`` for a G-buffer, by the channels that it has."""
-    layout, rough, metal = splatted.layout, None, None
+    layout = splatted.layout
+    rough = None
+    metal = None
     if "roughness" in layout:
         rough = RoughnessArguments(layout.first("roughness"), LEVELS, splatted.alpha.detach().flatten())
     if "metal" in layout:
@@ -213,7 +221,8 @@ class _Split(torch.autograd.Function):
     def forward(
         ctx: Any, features: Tensor, alpha: Tensor, deep: bool
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        values, covered = features.detach().contiguous(), alpha.detach().contiguous()
+        values = features.detach().contiguous()
+        covered = alpha.detach().contiguous()
         normal = values.new_empty(*covered.shape, 3)
         depth = torch.empty_like(covered) if deep else None
         flat_depth = None if depth is None else depth.view(-1)

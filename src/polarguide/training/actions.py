@@ -159,13 +159,18 @@ class DensityControl:
         *,
         black: bool,
     ) -> None:
-        self._settings, self._backend, self._ranks, self._memory = settings, backend, ranks, memory
-        self._densification, self._black = recipe.densification, black
+        self._settings = settings
+        self._backend = backend
+        self._ranks = ranks
+        self._memory = memory
+        self._densification = recipe.densification
+        self._black = black
         self._views: Sequence[View] = scene.train_views
         centers = torch.stack([view.camera.center for view in self._views])
         self.extent = scene_extent(centers)
         self._middle = centers.mean(dim=0).float().to(backend.device)
-        cameras, density = [view.camera for view in self._views], self._densification
+        cameras = [view.camera for view in self._views]
+        density = self._densification
         empty = free_space(scene.points, cameras, density.free_share, density.free_quantile)
         self._empty = empty.to(backend.device)
 
@@ -180,7 +185,8 @@ class DensityControl:
         Args:
             last: whether the next step has no density control; Gaussians that show too little are then removed.
         """
-        settings, densification = self._settings, self._densification
+        settings = self._settings
+        densification = self._densification
         if state.step % densification.every == 0:
             self.exchange_statistics(state)
             densify(

@@ -97,7 +97,8 @@ class SeveralRanks(Ranks):
     """The ranks of the default process group, which has a backend for CPU tensors (and one for the device's)."""
 
     def __init__(self) -> None:
-        self.rank, self.world = dist.get_rank(), dist.get_world_size()
+        self.rank = dist.get_rank()
+        self.world = dist.get_world_size()
 
     def all_reduce(self, tensors: Sequence[Tensor]) -> None:
         """Each rank gets one part of everything from all, adds it up in the order of ranks, and gives it to all."""
@@ -204,7 +205,8 @@ class _Monitor:
     """
 
     def __init__(self, ranks: SeveralRanks, out: Path) -> None:
-        self._ranks, self._out = ranks, out
+        self._ranks = ranks
+        self._out = out
         everyone: list[tuple[str, int]] = [("", 0)] * ranks.world
         here = socket.gethostname()
         dist.all_gather_object(everyone, (here, os.getpid()))

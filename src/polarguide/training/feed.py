@@ -148,11 +148,14 @@ class ViewStore:
         folder: Path | None = None,
         warn: Callable[[str], None] = lambda _: None,
     ) -> None:
-        self._limit, self._folder, self._warn = limit, folder, warn
+        self._limit = limit
+        self._folder = folder
+        self._warn = warn
         self._entries: dict[tuple[str, str], Entry] = {}
         self._places: dict[tuple[str, str], _Place] = {}
         self._file: IO[bytes] | None = None
-        self.in_memory, self.in_file = 0, 0
+        self.in_memory = 0
+        self.in_file = 0
 
     def get(self, kind: str, view: str, make: Callable[[], Entry], *, disposable: bool = False) -> Entry:
         """An entry; it is made where it is not kept.
@@ -274,8 +277,13 @@ class Feed:
         black: bool,
         memory: MemoryBound = UNBOUNDED,
     ) -> None:
-        self._backend, self._settings, self._index, self._black = backend, recipe.priors, index, black
-        self._store, self._memory, self._until = store, memory, coarse_steps(recipe, views, steps)
+        self._backend = backend
+        self._settings = recipe.priors
+        self._index = index
+        self._black = black
+        self._store = store
+        self._memory = memory
+        self._until = coarse_steps(recipe, views, steps)
         small = SmallerViews(views, recipe.coarse.factor) if self._until else views
         self._views = {"small ": small, "": views}
         self._flat: dict[str, dict[str, Flat]] = {}  # by the size of the pictures, as far as needed
@@ -310,7 +318,8 @@ class Feed:
             weights: weights of the stage, which say what its terms read.
             guide: Gaussians whose normals resolve what polarization leaves open; needed where a term reads priors.
         """
-        size, priors = self._size(step), None
+        size = self._size(step)
+        priors = None
         if step == self._until:  # what was kept of smaller pictures goes
             self._partial = {key: entry for key, entry in self._partial.items() if key[0] == size}
             for kind in KINDS:

@@ -46,7 +46,8 @@ def flat_surface(view: View, refractive_index: float, rules: FlatRules) -> Flat 
 
     Random pairs of pixels propose normals, the one that most pixels agree with is refined on them by least squares.
     """
-    luminance, rays = optics.luminance(view.stokes()), view.camera.rays()
+    luminance = optics.luminance(view.stokes())
+    rays = view.camera.rays()
     degree = optics.dolp(luminance)
     good = (degree > rules.faint) & ~view.invalid & ~view.saturated
     x_ref, up_ref = optics.lens_frame(rays)
@@ -57,7 +58,9 @@ def flat_surface(view: View, refractive_index: float, rules: FlatRules) -> Flat 
     step = max(1, round((pixels / rules.samples) ** 0.5))
     some = torch.zeros_like(good)
     some[::step, ::step] = good[::step, ::step]
-    e, d, dolp = across[some], rays[some], degree[some]
+    e = across[some]
+    d = rays[some]
+    dolp = degree[some]
     least = rules.least * pixels / step**2
     if len(e) < max(2.0, least):
         return None
@@ -69,7 +72,8 @@ def flat_surface(view: View, refractive_index: float, rules: FlatRules) -> Flat 
     proposed = torch.cat((proposed, -proposed))
     fits = _agrees(proposed @ e.T, -(proposed @ d.T), dolp, refractive_index, rules)
     best = fits.sum(dim=1).argmax()
-    normal, inside = proposed[best], fits[best]
+    normal = proposed[best]
+    inside = fits[best]
     for _ in range(3):
         _, vectors = torch.linalg.eigh(e[inside].T @ e[inside])
         normal = vectors[:, 0] * torch.sign(vectors[:, 0] @ normal)
@@ -95,7 +99,8 @@ def flat_surfaces(views: Iterable[View], refractive_index: float, rules: FlatRul
 
     Views that do not determine the Stokes vector are left out.
     """
-    surfaces, determined = dict[str, Flat](), 0
+    surfaces = dict[str, Flat]()
+    determined = 0
     for view in views:  # one by one, as they come
         if view.is_determined:
             determined += 1
@@ -106,7 +111,8 @@ def flat_surfaces(views: Iterable[View], refractive_index: float, rules: FlatRul
     normals = torch.stack([flat.normal for flat in surfaces.values()])
     sizes = torch.stack([flat.where.sum() for flat in surfaces.values()]).to(normals)
     alike = normals @ normals.T > torch.cos(torch.deg2rad(normals.new_tensor(rules.alike)))
-    enough, agreed = max(rules.fewest, rules.share * determined), {}
+    enough = max(rules.fewest, rules.share * determined)
+    agreed = {}
     for (name, flat), others in zip(surfaces.items(), alike, strict=True):
         if int(others.sum()) >= enough:
             agreed[name] = replace(flat, normal=unit((normals * (others * sizes)[:, None]).sum(dim=0)))

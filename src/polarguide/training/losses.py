@@ -295,10 +295,12 @@ def refuse_diverged(total: Tensor) -> None:
 
 def layer_terms(step: Step, weights: Weights) -> Tensor | None:
     """The weighted sum of the terms that compare layers with the separated pictures."""
-    result, priors = step.result, step.targets.priors
+    result = step.result
+    priors = step.targets.priors
     if priors is None or not (weights.specular or weights.diffuse or weights.reflection or weights.base):
         return None
-    total, separated_share = result.final.new_zeros(()), priors.separated.mean()
+    total = result.final.new_zeros(())
+    separated_share = priors.separated.mean()
     for weight, layer, target in (
         (weights.specular, result.specular, priors.specular),
         (weights.diffuse, result.diffuse, priors.diffuse),
@@ -336,10 +338,15 @@ def normal_terms(step: Step, weights: Weights) -> Tensor:
     own. ``normal_terms_reference`` is the reference implementation. A view without priors has the
     consistency term alone.
     """
-    result, priors, shading = step.result, step.targets.priors, step.shading
+    result = step.result
+    priors = step.targets.priors
+    shading = step.shading
     if not _native_fits(result, priors):
         return normal_terms_reference(step, weights)
-    stokes, directions, consistency, beside = None, [], None, result.alpha.new_zeros(())
+    stokes = None
+    directions = []
+    consistency = None
+    beside = result.alpha.new_zeros(())
     if priors is not None:
         assert result.normal is not None
         directions = [
@@ -360,7 +367,8 @@ def normal_terms(step: Step, weights: Weights) -> Tensor:
         if weights.stokes and shading.reflects and not shading.smooth_dielectric:
             beside = weights.stokes * stokes_loss(result, priors, shading)
         elif weights.stokes and shading.reflects:
-            measured, index = priors.stokes[1:], shading.refractive_index
+            measured = priors.stokes[1:]
+            index = shading.refractive_index
             factor = weights.stokes / measured.numel()
             stokes = Polarization(measured, S1_AND_S2, priors.stokes_weight, factor, index, result.index)
     if weights.consistency:
@@ -379,7 +387,9 @@ def _native_fits(result: RenderResult, priors: ViewPriors | None) -> bool:
 
 def normal_terms_reference(step: Step, weights: Weights) -> Tensor:
     """The reference implementation of ``normal_terms``: plain torch, any dtype and device."""
-    result, priors, shading = step.result, step.targets.priors, step.shading
+    result = step.result
+    priors = step.targets.priors
+    shading = step.shading
     total = result.final.new_zeros(())
     if priors is not None:
         for weight, loss in (
@@ -413,7 +423,8 @@ def step_loss(step: Step, weights: Weights) -> StepLoss:
     Raises:
         PolarguideError: the loss is not finite (on the CPU; see ``refuse_diverged``).
     """
-    result, targets = step.result, step.targets
+    result = step.result
+    targets = step.targets
     if result.detached_layers is not None:
         specular, diffuse, metal = result.detached_layers
         step = replace(step, result=replace(result, specular=specular, diffuse=diffuse, metal=metal))

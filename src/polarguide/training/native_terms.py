@@ -98,7 +98,8 @@ class _PixelTerms(torch.autograd.Function):
             assert diffuse is not None
             assert to_specular is not None
             assert to_diffuse is not None
-            measured, weight = p.measured.flatten(1, 2), p.weight.reshape(-1)
+            measured = p.measured.flatten(1, 2)
+            weight = p.weight.reshape(-1)
             total += _native.polarization(
                 normal,
                 *frame,
@@ -117,7 +118,8 @@ class _PixelTerms(torch.autograd.Function):
                 to_metal,
             )
         for d in terms.directions:
-            directions, weight = d.directions.reshape(-1, 3), d.weight.reshape(-1)
+            directions = d.directions.reshape(-1, 3)
+            weight = d.weight.reshape(-1)
             total += _native.direction(normal, directions, weight, d.factor, d.plane, to_normal)
         if (c := terms.consistency) is not None:
             assert depth is not None
@@ -151,7 +153,8 @@ def pixel_terms(result: RenderResult, camera: Camera, terms: Terms) -> Tensor:
     Raises:
         ValueError: if a shape does not fit, or a picture with a consistency term is smaller than 3 x 3.
     """
-    polarized, deep = terms.polarization is not None, terms.consistency is not None
+    polarized = terms.polarization is not None
+    deep = terms.consistency is not None
     total: Tensor = _PixelTerms.apply(
         camera,
         terms,

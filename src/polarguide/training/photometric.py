@@ -26,7 +26,8 @@ from polarguide.training.targets import Step
 
 SSIM_WINDOW = 11
 _SIGMA = 1.5
-_C1, _C2 = 0.01**2, 0.03**2
+_C1 = 0.01**2
+_C2 = 0.03**2
 
 
 class Photometric(NamedTuple):
@@ -87,7 +88,8 @@ def photometric_terms_reference(
     """The reference implementation of ``photometric_terms``: plain torch, any dtype and device."""
     encoded = srgb_encode(_Clip.apply(prediction))
     weight = (torch.ones_like(prediction[..., 0]) if weight is None else weight)[..., None]
-    x, y = encoded.permute(2, 0, 1), target.permute(2, 0, 1)
+    x = encoded.permute(2, 0, 1)
+    y = target.permute(2, 0, 1)
     means = _blur(torch.cat((x, y, x * x, y * y, x * y))).split(3)
     ssim = structural_similarity(*means).permute(1, 2, 0)
     per_value = (1 - ssim_weight) * (encoded - target).abs() + ssim_weight * (1 - ssim)
@@ -109,7 +111,8 @@ class _Photometric(torch.autograd.Function):
     def forward(
         ctx: Any, prediction: Tensor, target: Tensor, weight: Tensor | None, ssim_weight: float
     ) -> tuple[Tensor, Tensor]:
-        prediction, target = prediction.detach().contiguous(), target.detach().contiguous()
+        prediction = prediction.detach().contiguous()
+        target = target.detach().contiguous()
         weight = None if weight is None else weight.detach().contiguous()
         total = prediction.shape[0] * prediction.shape[1] if weight is None else float(weight.sum())
         gradient = torch.empty_like(prediction) if ctx.needs_input_grad[0] else None
@@ -137,15 +140,18 @@ class _Explicit(_Photometric):
         ctx: Any, prediction: Tensor, target: Tensor, weight: Tensor | None, ssim_weight: float
     ) -> tuple[Tensor, Tensor]:
         clipped = prediction.detach().clamp(0, 1)
-        x, y = srgb_encode(clipped).permute(2, 0, 1), target.permute(2, 0, 1)
+        x = srgb_encode(clipped).permute(2, 0, 1)
+        y = target.permute(2, 0, 1)
         count = x.new_full((), x[0].numel()) if weight is None else weight.sum()
         share = 1 / (3 * torch.where(count > 0, count, torch.ones_like(count)))
         share = share if weight is None else share * weight
         mx, xx, xy = _blur(torch.cat((x, x * x, x * y))).split(3)
         my, yy = _blur(torch.cat((y, y * y))).split(3)
         # SSIM is a1 a2 / (b1 b2).
-        a1, a2 = 2 * mx * my + _C1, 2 * (xy - mx * my) + _C2
-        b1, b2 = mx * mx + my * my + _C1, (xx - mx * mx) + (yy - my * my) + _C2
+        a1 = 2 * mx * my + _C1
+        a2 = 2 * (xy - mx * my) + _C2
+        b1 = mx * mx + my * my + _C1
+        b2 = (xx - mx * mx) + (yy - my * my) + _C2
         inverse = 1 / (b1 * b2)
         ssim = a1 * a2 * inverse
         difference = x - y
@@ -255,7 +261,9 @@ def partial_terms(step: Step, photometric: float, polarization: float) -> tuple[
     Args:
         step: what the terms read. photometric, polarization: weights of the stage.
     """
-    result, shading, view = step.result, step.shading, step.targets.partial
+    result = step.result
+    shading = step.shading
+    view = step.targets.partial
     assert view is not None
 
     def compared(rendered: Tensor) -> Photometric:

@@ -49,7 +49,8 @@ def unguided(view: View, settings: Priors, refractive_index: float) -> Unguided:
         view: the capture; its device does the work. settings: of the priors. refractive_index: of all surfaces.
     """
     stokes = view.stokes()
-    luminance, noise = optics.luminance(stokes), _noise(view) if settings.snr else 0.0
+    luminance = optics.luminance(stokes)
+    noise = _noise(view) if settings.snr else 0.0
     usable = optics.polarization_mask(
         luminance,
         threshold=settings.threshold,
@@ -119,7 +120,8 @@ def view_priors(
     stokes = view.stokes()
     luminance = optics.luminance(stokes)
     guide = _guide(view, normal, flat, rays, settings)
-    nearest_to, by_color = guide.normal, _by_color(precomputed, guide, settings, rays)
+    nearest_to = guide.normal
+    by_color = _by_color(precomputed, guide, settings, rays)
     if by_color is not None:
         nearest_to = torch.where(by_color[1][..., None] > 0, by_color[0], guide.normal)
     candidates = _candidates(settings.candidates, luminance, rays, refractive_index)
@@ -133,8 +135,10 @@ def view_priors(
     reliable = (~(view.invalid | view.saturated)).float()
     if metal is not None:
         body, predicted = _without_metal(metal, luminance, guide.normal, rays, settings.metal_share)
-        conditioned, chromatic_weight = conditioned * body, chromatic_weight * body
-        weight, reliable = weight * predicted, reliable * predicted
+        conditioned = conditioned * body
+        chromatic_weight = chromatic_weight * body
+        weight = weight * predicted
+        reliable = reliable * predicted
     return ViewPriors(
         specular=srgb_encode((layers.specular / 2).clamp(0, 1)),
         diffuse=srgb_encode((layers.diffuse / 2).clamp(0, 1)),
@@ -207,7 +211,8 @@ def _by_color(
     _, _, zenith, azimuth, certainty, colorful = precomputed
     if zenith is None or azimuth is None or certainty is None or colorful is None:
         return None
-    chromatic, weight = facing(zenith, azimuth, guide.normal, rays), certainty * guide.shown
+    chromatic = facing(zenith, azimuth, guide.normal, rays)
+    weight = certainty * guide.shown
     if settings.chromatic_within is not None:
         near = _within(chromatic, guide.normal, *settings.chromatic_within)
         weight = weight * torch.maximum(near, colorful)
@@ -233,7 +238,8 @@ def _across(luminance: Tensor, normal: Tensor, rays: Tensor) -> Tensor:
         luminance: [3, H, W]. normal, rays: [H, W, 3] camera axes.
     """
     x_ref, up_ref = optics.lens_frame(rays)
-    x, y = dot(normal, x_ref), dot(normal, up_ref)
+    x = dot(normal, x_ref)
+    y = dot(normal, up_ref)
     return -(luminance[1] * (x * x - y * y) + luminance[2] * (2 * x * y))
 
 

@@ -331,7 +331,8 @@ def _check_values(part: Any, where: str, path: str) -> None:
     """Check the fields of a dataclass and of those in it against their types; a shading model checks its own."""
     kinds = get_type_hints(type(part))
     for item in fields(part):
-        value, place = getattr(part, item.name), f"{path}{item.name}"
+        value = getattr(part, item.name)
+        place = f"{path}{item.name}"
         if isinstance(value, ShadingModel):
             continue
         inner = value if isinstance(value, tuple) else (value,)
@@ -388,7 +389,8 @@ class Schedule:
     def at(self, step: int) -> Position:
         """The stage of a step (0-based) and the actions due before it."""
         index = max(i for i, start in enumerate(self._starts) if start <= step)
-        stage, since = self.recipe.stages[index], step - self._starts[index]
+        stage = self.recipe.stages[index]
+        since = step - self._starts[index]
         if since == 0:
             begun = zip(self.recipe.stages, self._starts, strict=True)
             entered = (action for each, start in begun if start == step for action in each.on_enter)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import EXPOSURES, Exposures, check_choice, check_count
 
-MOST_VIEWS, MOST_SEEDS = 4096, 2**63 - 1
+MOST_VIEWS = 4096
+MOST_SEEDS = 2**63 - 1
 STEPS = 5000
 """Steps of a training of Gaussians, at least, and of every run of a comparison."""
 Background = Literal["auto", "scene", "black", "masked"]

@@ -116,7 +116,8 @@ class PartialView:
     def of(cls, view: View, device: torch.device) -> PartialView:
         """Measurements of a view, on a device."""
         view = view.to(device)
-        values, exposures = view.intensities(), view.exposures
+        values = view.intensities()
+        exposures = view.exposures
         rays = view.camera.rays(device=device)
         polarized = [k for k, e in enumerate(exposures) if e.angle is not None]
         behind = analyzers([exposures[k] for k in polarized], rays, view.mount) if polarized else None

@@ -67,11 +67,19 @@ class Trainer:
         warn: Callable[[str], None] = lambda _: None,
         memory: MemoryBound = UNBOUNDED,
     ) -> None:
-        self.scene, self.recipe, self.settings, self.backend = scene, recipe, settings, backend
-        self.ranks, self._memory, self._views = ranks, memory, scene.train_views
-        self.whole, self.black = True, settings.background != "scene"
-        self.shading, index = recipe.shading.bind(settings.refractive_index), settings.refractive_index
-        self.schedule, self._exposures = Schedule(recipe, settings.steps), dict[str, tuple[Exposure, ...]]()
+        self.scene = scene
+        self.recipe = recipe
+        self.settings = settings
+        self.backend = backend
+        self.ranks = ranks
+        self._memory = memory
+        self._views = scene.train_views
+        self.whole = True
+        self.black = settings.background != "scene"
+        self.shading = recipe.shading.bind(settings.refractive_index)
+        index = settings.refractive_index
+        self.schedule = Schedule(recipe, settings.steps)
+        self._exposures = dict[str, tuple[Exposure, ...]]()
         self.state = state or first_state(
             scene, recipe, settings, backend.device, surroundings=not self.black
         )
@@ -108,9 +116,11 @@ class Trainer:
 
     def step(self) -> StepReport:
         """One optimizer step."""
-        state, views = self.state, self.settings.views_per_step
+        state = self.state
+        views = self.settings.views_per_step
         position = self.schedule.at(state.step)
-        stage, self.whole = position.stage, not position.actions
+        stage = position.stage
+        self.whole = not position.actions
         if "refresh_priors" in position.actions:
             self._feed.refresh_priors()  # first: they leave room for looks at all views
         for action in position.actions:
@@ -142,17 +152,20 @@ class Trainer:
 
     def _backpropagate(self, slot: int, stage: Stage, counts: bool) -> Tensor:
         """Render the view of a slot and add its gradients; [3] as of ``StepReport.measured``."""
-        state, shading = self.state, self.shading if stage.reflection else PLAIN
+        state = self.state
+        shading = self.shading if stage.reflection else PLAIN
         targets = self._targets(slot, stage)  # before there is a picture, which takes memory, too
         camera = targets.camera
         statistic = ScreenStatistic(COLOR_CHANNELS) if stage.densify else None
         request = requested(stage, self.schedule.sh_degree(state.step), statistic)
-        rasterize, light = self.backend.rasterize, state.light
+        rasterize = self.backend.rasterize
+        light = state.light
         result = render(state.gaussians, camera, rasterize, request, shading=shading, light=light)
         if request.normal_rotation_only:
             assert stage.behind is not None
             result = turned_behind(result, *(share * self._reach for share in stage.behind))
-        scales, extent = state.gaussians["log_scales"], self._density.extent
+        scales = state.gaussians["log_scales"]
+        extent = self._density.extent
         step = Step(result, targets, shading, scales, extent, self.recipe.ssim_weight)
         loss = step_loss(step, stage.weights)
         loss.total.backward()
@@ -221,7 +234,8 @@ class Trainer:
             state.environment.step()
 
     def _act(self, action: Action) -> None:
-        state, steps = self.state, self.settings.steps
+        state = self.state
+        steps = self.settings.steps
         if action == "reset_opacity":
             reset_opacity(state, self.shading, self.recipe.densification.reset_opacity)
         elif action == "propagate_normals":
@@ -243,7 +257,8 @@ class Trainer:
         indices = self.scene.indices
         if not indices or not self.shading.knows_indices:
             return
-        gaussians, rasterize = self.state.gaussians, self.backend.rasterize
+        gaussians = self.state.gaussians
+        rasterize = self.backend.rasterize
         index = self.settings.refractive_index
         offsets = index_offsets(gaussians, self._views, indices, index, rasterize, self._memory)
         self.ranks.broadcast(offsets)

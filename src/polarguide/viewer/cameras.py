@@ -80,13 +80,15 @@ def drawn_camera(camera: Camera, view: View | None) -> Camera:
 
 def window_fov(photograph: Camera, aspect: float) -> float:
     """Vertical field of view in radians with which a window of ``aspect`` (width / height) contains a photograph."""
-    high, wide = 0.5 * photograph.height / photograph.fy, 0.5 * photograph.width / photograph.fx
+    high = 0.5 * photograph.height / photograph.fy
+    wide = 0.5 * photograph.width / photograph.fx
     return 2 * math.atan(max(high, wide / aspect))
 
 
 ARRIVAL = 5.0  # seconds within which a browser has to report a pose
 # Tolerances of rounding: 1 - |cos| of half the angle, and a share of the cameras' distance.
-TURNED, MOVED = 1e-6, 1e-4
+TURNED = 1e-6
+MOVED = 1e-4
 
 
 @dataclass(eq=False)
@@ -122,7 +124,9 @@ class ViewPose:
 
 def move_to_view(client: Any, view: View, scene_frame: SceneFrame, now: float) -> ViewPose:
     """Move a browser's camera to the pose of a view, with a field of view that contains the photograph."""
-    camera, target, center = client.camera, view.camera, view.camera.center
+    camera = client.camera
+    target = view.camera
+    center = view.camera.center
     # The orbit center lies on the optical axis, at the distance of the scene's center.
     ahead = target.rotation[2]
     distance = max(float((scene_frame.center - center) @ ahead), 0.1 * scene_frame.distance)
@@ -176,8 +180,11 @@ class Keyframes:
 
 THUMBNAIL = 96  # pixels of the longer side
 # Shares of the cameras' distance: size of a frustum, and distance within which it is hidden.
-SIZE, NEAR = 0.05, 0.4
-COLOR, HELD_OUT_COLOR, BOX_COLOR = (60, 90, 160), (200, 120, 30), (240, 200, 40)
+SIZE = 0.05
+NEAR = 0.4
+COLOR = (60, 90, 160)
+HELD_OUT_COLOR = (200, 120, 30)
+BOX_COLOR = (240, 200, 40)
 # The twelve edges of a box whose eight corners are ordered with the last axis fastest.
 EDGES = [(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit]
 
@@ -219,13 +226,16 @@ class Frusta:
         scene_frame: SceneFrame,
         go: Callable[[str], None],
     ) -> None:
-        self._scene, self._scene_frame = scene, scene_frame
-        self._visible, self._far = True, np.ones(len(photographs), dtype=bool)
+        self._scene = scene
+        self._scene_frame = scene_frame
+        self._visible = True
+        self._far = np.ones(len(photographs), dtype=bool)
         self._centers = np.array([p.view.camera.center.numpy() for p in photographs]).reshape(-1, 3)
         self._reach = NEAR * scene_frame.distance
         self._handles: list[Any] = []
         for number, photograph in enumerate(photographs):
-            camera, name = photograph.view.camera, photograph.view.name
+            camera = photograph.view.camera
+            name = photograph.view.name
             handle = scene.add_camera_frustum(
                 f"/cameras/{number}",
                 fov=2 * math.atan(0.5 * camera.height / camera.fy),

@@ -50,7 +50,8 @@ class Gate:
         A name that is neither an address nor known here may be a stranger's that points to this machine (DNS
         rebinding); the origin is the page that asks, which other programs than browsers do not send.
         """
-        named, asking = headers.get_all("Host"), headers.get_all("Origin")
+        named = headers.get_all("Host")
+        asking = headers.get_all("Origin")
         if len(named) != 1 or len(asking) > 1:
             return "One Host and at most one Origin are expected."
         host = host_of(f"//{named[0]}")
@@ -70,7 +71,8 @@ def host_of(url: str, schemes: tuple[str, ...] = ("",)) -> str | None:
     """The host of SCHEME://HOST[:PORT] in lower case; None where it is something else, or has more to it."""
     try:
         parts = urlsplit(url)
-        host, _ = parts.hostname, parts.port
+        host = parts.hostname
+        _ = parts.port
     except ValueError:
         return None
     if _PLACE.fullmatch(parts.netloc) is None:  # urlsplit passes over what follows the bracket of an address
@@ -131,7 +133,8 @@ def guarded(gate: Gate, check: Check) -> Iterator[None]:
         PolarguideError: viser did not listen through the gate; the caller has to end viser.
     """
     sockets = optional_import("websockets.asyncio.server", "the viewer")
-    listen, opened = sockets.serve, []
+    listen = sockets.serve
+    opened = []
 
     def serve(handler: Any, *arguments: Any, **options: Any) -> Any:
         if not str(getattr(handler, "__module__", "")).startswith("viser."):  # somebody else's, meanwhile
@@ -199,8 +202,10 @@ class _Connection:
     """A browser's connection: gives checked messages only, not too many at a time, and does not wait forever."""
 
     def __init__(self, connection: Any, check: Check) -> None:
-        self._connection, self._check = connection, check
-        self._left, self._since = BURST, time.monotonic()
+        self._connection = connection
+        self._check = check
+        self._left = BURST
+        self._since = time.monotonic()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._connection, name)

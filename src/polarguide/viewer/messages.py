@@ -136,7 +136,8 @@ def _camera(camera: _Camera, reach: float) -> dict[str, Any]:
     def pixels(value: float) -> int:
         return int(min(max(_finite(value), 1), LARGEST_WINDOW))
 
-    position, look_at = placed(camera.position), placed(camera.look_at)
+    position = placed(camera.position)
+    look_at = placed(camera.look_at)
     if position == look_at:  # viser would ask for the direction
         raise Refused("a camera that looks at itself")
     return {

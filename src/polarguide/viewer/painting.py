@@ -29,23 +29,28 @@ from polarguide.visualization.figures import Picture
 
 OFF, SURFACE, BRUSH = TOOLS = ("off", "surface", "brush")
 NOTHING, DIELECTRIC, METAL = KINDS = ("not painted", "dielectric", "metal")
-SIZE, REACH = (0.5, 20.0), (0.5, 30.0)
+SIZE = (0.5, 20.0)
+REACH = (0.5, 30.0)
 ASK = "Click on a surface"
 TINTS = np.array([(0, 0, 0), (40, 120, 255), (255, 190, 0), (0, 200, 120)], np.float32)
 """Colors of nothing, dielectrics, metals, and dielectrics with an index of their own."""
 TINTED = 0.5
 LOOKED_AT = 360
 """Rows of the pictures in which is looked up what a click hits."""
-SMALLEST, SHARE = 0.01, 0.25
-"""Pixels of such a picture that a Gaussian fills at least: what is hidden fills none. Surfaces grow from Gaussians that
-fill at least this share of what the largest fills of a disc.
-"""
-NEIGHBORS, LINKS = 16, 8
-"""Gaussians over which normals and colors are averaged, and those to which a path leads on."""
+SMALLEST = 0.01
+"""Least number of pixels that a visible Gaussian fills in such a picture."""
+SHARE = 0.25
+"""Surfaces grow from Gaussians that fill at least this share of the largest one in a disc."""
+NEIGHBORS = 16
+"""Number of Gaussians over which normals and colors are averaged."""
+LINKS = 8
+"""Number of neighbors to which a path leads on."""
 CHUNK = 1 << 16  # Gaussians at a time
-TURN, COLOR = 0.25, 0.3
-"""How far neighbors are apart: standard deviations of their normals' angle, in radians, and of the logarithm of their
-color. The reach of a click is in these units, squared, halved and summed along the surface.
+TURN = 0.25
+"""Standard deviation of the angle between neighboring normals, in radians."""
+COLOR = 0.3
+"""Standard deviation of the logarithm of neighboring colors. The reach of a click is in these units, squared,
+halved and summed along the surface.
 """
 DARK = 0.02  # radiance that is added before logarithms
 MOST_UNDONE = 50
@@ -126,8 +131,10 @@ class Materials:
         small = camera.scaled(
             scale, max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
         )
-        x, y = place[0] * small.width, place[1] * small.height
-        columns, rows = torch.arange(small.width) + 0.5, torch.arange(small.height) + 0.5
+        x = place[0] * small.width
+        y = place[1] * small.height
+        columns = torch.arange(small.width) + 0.5
+        rows = torch.arange(small.height) + 0.5
         radius = max(0.75, 0.01 * size * small.height)
         disc = (columns[None] - x) ** 2 + (rows[:, None] - y) ** 2 <= radius**2
         target = torch.stack((disc, torch.ones_like(disc)), dim=-1).float()
@@ -256,8 +263,11 @@ class Painting:
         caught: Callable[[Callable[[], None]], Callable[[Any], None]],
         busy: Callable[[], bool],
     ) -> None:
-        self._controls, self._paintable = controls, paintable
-        self._changed, self._noted, self._busy = changed, noted, busy
+        self._controls = controls
+        self._paintable = paintable
+        self._changed = changed
+        self._noted = noted
+        self._busy = busy
         self._materials: Materials | None = None
         self._clicks = Clicks(client, caught, self._click)
         self._todo: list[Callable[[Materials, Camera], str]] = []
@@ -276,7 +286,8 @@ class Painting:
         Args:
             camera: camera of the picture that was clicked into.
         """
-        todo, self._todo = self._todo, []
+        todo = self._todo
+        self._todo = []
         for each in todo:
             if self._materials is None:
                 self._materials = self._paintable.materials()
@@ -306,11 +317,14 @@ class Painting:
         self._noted(ASK if paints else "")
 
     def _click(self, place: Sequence[float]) -> None:
-        tool, kind = self._controls.tool.value, self._controls.kind.value
+        tool = self._controls.tool.value
+        kind = self._controls.kind.value
         if tool == OFF or self._busy():
             return
-        size, reach = float(self._controls.size.value), float(self._controls.reach.value)
-        number, at = self._paintable.kinds[kind], (float(place[0]), float(place[1]))
+        size = float(self._controls.size.value)
+        reach = float(self._controls.reach.value)
+        number = self._paintable.kinds[kind]
+        at = (float(place[0]), float(place[1]))
 
         def paint(materials: Materials, camera: Camera) -> str:
             if tool == BRUSH:

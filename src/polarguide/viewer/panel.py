@@ -18,7 +18,11 @@ STEPS = ("previous", "next")
 NOTHING = Presentation()
 # Ranges of the controls.
 SIDES = ("Left, right", "Down, up", "Front, back")
-EXPOSURE, STRENGTH, TURN, SECONDS, CROP = (-STOPS, STOPS), (0.0, 2.0), (-180, 180), (0.5, 10.0), (-150, 150)
+EXPOSURE = (-STOPS, STOPS)
+STRENGTH = (0.0, 2.0)
+TURN = (-180, 180)
+SECONDS = (0.5, 10.0)
+CROP = (-150, 150)
 WIPE = 0, 100
 
 
@@ -66,7 +70,9 @@ class Panel:
         # The box as it was saved, until a slider is moved; its sides are more exact than the sliders' steps.
         self._saved_crop = options.presentation.crop
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        self._status, self._lines, self._note = gui.add_markdown(""), tuple[str, ...](), ""
+        self._status = gui.add_markdown("")
+        self._lines = tuple[str, ...]()
+        self._note = ""
         with gui.add_folder("Controls", expand_by_default=False) if folded else nullcontext():
             self._add_controls(gui, options)
         self.accepts = self._accepted([*options.layers, *MEASURED], options.views)

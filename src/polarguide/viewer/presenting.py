@@ -43,7 +43,8 @@ class Clicks:
         caught: Callable[[Callable[[], None]], Callable[[Any], None]],
         clicked: Callable[[Sequence[float]], None],
     ) -> None:
-        self._client, self._wanted = client, False
+        self._client = client
+        self._wanted = False
 
         def heard(event: Any) -> None:
             caught(lambda: clicked(event.screen_pos))(None)
@@ -138,10 +139,16 @@ class Presenting:
         noted: Callable[[], None],
         caught: Callable[[Callable[[], None]], Callable[[Any], None]],
     ) -> None:
-        self._client, self._controls, self._gray_world = client, controls, gray_world
-        self._changed, self._distance = changed, distance
-        self.chosen, self.note, self._noted = presentation, "", noted
-        self._picked_white, self._chart = presentation.white_balance, presentation.chart
+        self._client = client
+        self._controls = controls
+        self._gray_world = gray_world
+        self._changed = changed
+        self._distance = distance
+        self.chosen = presentation
+        self.note = ""
+        self._noted = noted
+        self._picked_white = presentation.white_balance
+        self._chart = presentation.chart
         self._picking = ""
         self._clicks = Clicks(client, caught, self._click)
         self._clicked: tuple[str, float, float] | None = None
@@ -171,7 +178,8 @@ class Presenting:
         """The surface at the clicked pixel."""
         if self._clicked is None:
             return
-        what, self._clicked = self._clicked[0], None
+        what = self._clicked[0]
+        self._clicked = None
         if place is None:
             self._say("Nothing is there. " + ASKS[what])
         elif what == "white":

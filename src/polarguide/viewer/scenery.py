@@ -179,7 +179,8 @@ class Painter:
     """
 
     def __init__(self, around: SceneFrame, beside: Scenery | None = None) -> None:
-        self.around, self._beside = around, beside
+        self.around = around
+        self._beside = beside
         self._depths: tuple[float, float] | None = None
 
     def paint(
@@ -271,7 +272,8 @@ class Painter:
         return surface_at(result, camera, place[0] * camera.width, place[1] * camera.height)
 
     def _result(self, scenery: Scenery, camera: Camera, appearance: Appearance) -> RenderResult:
-        crop, turn = appearance.crop, None
+        crop = appearance.crop
+        turn = None
         strength = 1.0 if appearance.layer in POLARIZED else appearance.strength
         within = None if crop is None else lambda means: crop.inside(means, self.around)
         if appearance.turn % 360:
@@ -312,5 +314,7 @@ class Painter:
 
 def _exposed(radiance: Tensor, appearance: Appearance) -> Tensor:
     """Radiance [H, W, 3] as bright and in the color that is wanted, linear."""
-    white, chart, exposure = appearance.white_balance, appearance.chart, appearance.exposure
+    white = appearance.white_balance
+    chart = appearance.chart
+    exposure = appearance.exposure
     return colored(radiance, Presentation(white_balance=white, chart=chart, exposure=exposure).color)

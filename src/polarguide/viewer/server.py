@@ -104,7 +104,9 @@ class Viewer:
         viser = optional_import("viser", "the viewer")
         # viser warns of pictures for a browser that has just disconnected.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        self._current, self._photographs, self._beside = current, photographs, beside
+        self._current = current
+        self._photographs = photographs
+        self._beside = beside
         self._scene_frame = scene_frame([photograph.view.camera for photograph in photographs.values()])
         turns = shading.radiance_cubemap is not None
         others = visitors.allow_host or visitors.allow_origin
@@ -121,7 +123,8 @@ class Viewer:
         self._wake = threading.Event()
         self._refreshed = time.monotonic()
         self._cost = 0.0
-        self._warn, self._warned = warn, set[str]()
+        self._warn = warn
+        self._warned = set[str]()
         around = self._scene_frame
         reach = float(around.center.abs().max()) + REACH * around.distance
         gate = Gate(host, visitors.allow_host, visitors.allow_origin)
@@ -340,8 +343,10 @@ def paintable_run(run: OpenedRun) -> Paintable | None:
     """What can be painted over a run; None where its recipe tells no metals."""
     if not run.model.shading.knows_metals:
         return None
-    model, scene = run.model, run.scene
-    gaussians, rasterize = model.state.gaussians, model.backend.rasterize
+    model = run.model
+    scene = run.scene
+    gaussians = model.state.gaussians
+    rasterize = model.backend.rasterize
     kinds = {name: number for number, name in enumerate(KINDS)}
     kinds |= {f"dielectric of index {index:g}": number for number, index in sorted(scene.indices.items())}
 
@@ -365,10 +370,13 @@ def save_to_run(run: OpenedRun, chosen: Presentation) -> str:
 
     What its scene says just so is left to the scene. The run's own credit stays.
     """
-    own, above = read_presentation(run.folder), read_presentation(run.scene_folder)
-    fields, unchanged = {}, []
+    own = read_presentation(run.folder)
+    above = read_presentation(run.scene_folder)
+    fields = {}
+    unchanged = []
     for name in ("white_balance", "chart", "exposure", "up_axis", "meters_per_unit", "crop"):
-        value, inherited = getattr(chosen, name), getattr(above, name)
+        value = getattr(chosen, name)
+        inherited = getattr(above, name)
         fields[name] = None if value == inherited else value
         if value is None and inherited is not None:
             unchanged.append(name)

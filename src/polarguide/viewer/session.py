@@ -80,7 +80,8 @@ class FramePacing:
 
     def end_frame(self, version: int, kind: str, seconds: float, now: float) -> None:
         """Record that a picture was rendered in so many seconds."""
-        self._drawn, self.last_frame = version, now
+        self._drawn = version
+        self.last_frame = now
         if kind == "sharp":
             self._sharp = version
             return
@@ -90,7 +91,8 @@ class FramePacing:
         self._height = min(float(GREATEST_HEIGHT), max(float(LEAST_HEIGHT), self._height))
 
 
-PATH_FILE, PICTURE_FILE = "camera_path.json", "polarguide.png"
+PATH_FILE = "camera_path.json"
+PICTURE_FILE = "polarguide.png"
 JPEG_QUALITY = 75
 BETWEEN_FILES = 0.5  # least seconds between two files of a kind, or two paths that are played
 NO_LAYER = "This layer is not available here: go to a photograph, or choose another layer"
@@ -127,14 +129,18 @@ class Session:
         drop: Callable[[Exception], None] = _raise,
         beside: Scenery | None = None,
     ) -> None:
-        self._client, self._photographs, self._drop = client, photographs, drop
-        self._scene_frame, self._wake = scene_frame, wake
+        self._client = client
+        self._photographs = photographs
+        self._drop = drop
+        self._scene_frame = scene_frame
+        self._wake = wake
         self._lock = threading.Lock()
         self._painter = Painter(scene_frame, beside)
         self.pacing = FramePacing()
         self._view_pose: ViewPose | None = None
         self._last_pose: ViewPose | None = None  # of the view that was asked for last, left or not
-        self._screenshot, self._written_at = False, dict[str, float]()
+        self._screenshot = False
+        self._written_at = dict[str, float]()
         self._playing: tuple[float, list[Camera]] | None = None
         first = next(iter(photographs.values())).view.camera
         self._size = first.width, first.height
@@ -324,7 +330,8 @@ class Session:
         if frame >= len(path):
             self._playing = None
             return
-        camera, target = self._client.camera, path[frame]
+        camera = self._client.camera
+        target = path[frame]
         ahead = float(np.linalg.norm(camera.look_at - camera.position)) or self._scene_frame.distance
         with self._client.atomic():
             camera.position = target.center.numpy()
@@ -343,8 +350,10 @@ class Session:
         """Render a picture and send it to the browser."""
         began = time.monotonic()
         with self._lock:
-            version, view_pose = self.pacing.version, self._view_pose
-            screenshot, self._screenshot = self._screenshot, False
+            version = self.pacing.version
+            view_pose = self._view_pose
+            screenshot = self._screenshot
+            self._screenshot = False
             camera = self._client.camera
             frame_size = self.pacing.frame_size((camera.image_width, camera.image_height), kind)
             viewpoint = self._camera(frame_size)

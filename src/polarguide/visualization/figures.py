@@ -129,10 +129,12 @@ def _tile_size(pictures: Sequence[Picture], minimum: int, maximum: int) -> tuple
 def _place(tile: Picture, picture: Picture) -> None:
     """Fit a picture into a tile, centered."""
     scale = min(tile.shape[1] / picture.shape[1], tile.shape[0] / picture.shape[0])
-    width, height = max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale))
+    width = max(1, round(picture.shape[1] * scale))
+    height = max(1, round(picture.shape[0] * scale))
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST
     fitted = cv2.resize(picture, (width, height), interpolation=how)
-    y, x = (tile.shape[0] - height) // 2, (tile.shape[1] - width) // 2
+    y = (tile.shape[0] - height) // 2
+    x = (tile.shape[1] - width) // 2
     tile[y : y + height, x : x + width] = fitted
 
 
@@ -277,19 +279,24 @@ def angle_wheel(scale: float = 1.0) -> Picture:
     Args:
         scale: factor on the size.
     """
-    high, wide, radius = round(110 * scale), round(256 * scale), 74 * scale
+    high = round(110 * scale)
+    wide = round(256 * scale)
+    radius = 74 * scale
     size = max(0.45 * scale, SMALLEST_FONT_SCALE)
     drawn: Picture = np.full((high, wide, 3), BACKGROUND, np.uint8)
-    center_x, center_y = round(128 * scale), round(100 * scale)
+    center_x = round(128 * scale)
+    center_y = round(100 * scale)
     y, x = np.mgrid[0:high, 0:wide]
-    angle, distance = np.arctan2(center_y - y, x - center_x), np.hypot(center_y - y, x - center_x)
+    angle = np.arctan2(center_y - y, x - center_x)
+    distance = np.hypot(center_y - y, x - center_x)
     inside = (distance <= radius) & (y <= center_y)
     colors = aolp_to_rgb(torch.from_numpy(angle), torch.from_numpy(distance / radius))
     drawn[inside] = colors[inside]
     for degrees in (0, 45, 90, 135, 180):
         text = f"{degrees}" if degrees or scale < 1 else "0 deg"
         (width, height), _ = cv2.getTextSize(text, FONT, size, 1)
-        cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        cosine = math.cos(math.radians(degrees))
+        sine = math.sin(math.radians(degrees))
         left = center_x + (radius + 6 * scale) * cosine - width * (1 - cosine) / 2
         low = center_y - (radius + 6 * scale) * sine + (0 if sine > 0.5 else height / 2)
         cv2.putText(drawn, text, (round(left), round(low)), FONT, size, INK, 1, cv2.LINE_AA)
@@ -301,7 +308,8 @@ def normal_ball(high: int = 64, width: int = 256) -> Picture:
     drawn: Picture = np.full((high, width, 3), BACKGROUND, np.uint8)
     y, x = np.mgrid[0:high, 0:width]
     radius = high * 30 / 64
-    right, down = (x - width / 2) / radius, (y - high / 2) / radius
+    right = (x - width / 2) / radius
+    down = (y - high / 2) / radius
     squared = right**2 + down**2
     normals = np.stack((right, -down, np.sqrt(np.maximum(1 - squared, 0))), axis=-1)
     inside = squared <= 1

@@ -122,7 +122,8 @@ def depth_range(depth: Tensor, mask: Tensor) -> Depths:
     if values.numel() == 0:
         return 1.0, 2.0
     values = values[:: max(1, values.numel() // _SAMPLES)]
-    near, far = max(float(values.quantile(0.02)), 1e-6), float(values.quantile(0.98))
+    near = max(float(values.quantile(0.02)), 1e-6)
+    far = float(values.quantile(0.98))
     return near, max(far, 1.001 * near)
 
 

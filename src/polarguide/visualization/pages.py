@@ -97,9 +97,11 @@ def data_uri(picture: Picture, layer: str, side: int) -> str:
         size = (max(1, round(picture.shape[1] * factor)), max(1, round(picture.shape[0] * factor)))
         resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(picture.dtype)
     if layer in LOSSLESS:
-        kind, options = "png", [cv2.IMWRITE_PNG_COMPRESSION, 9]
+        kind = "png"
+        options = [cv2.IMWRITE_PNG_COMPRESSION, 9]
     else:
-        kind, options = "jpeg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        kind = "jpeg"
+        options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
     encoded, data = cv2.imencode(f".{kind}", resized[..., ::-1], options)
     if not encoded:
         raise ValueError(f"{layer}: the picture could not be encoded")

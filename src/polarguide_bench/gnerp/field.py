@@ -262,7 +262,9 @@ def direction_width() -> int:
     return 3 * (1 + 2 * FREQUENCIES)
 
 
-DEPTH, WIDTH, SKIP = 8, 256, 4
+DEPTH = 8
+WIDTH = 256
+SKIP = 4
 PLACE_FREQUENCIES = 8
 SOFTNESS = 100.0
 CHUNK = 1 << 16

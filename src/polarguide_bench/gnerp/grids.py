@@ -93,8 +93,11 @@ def spline_weights(places: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
     nodes = _nodes(cell, resolution + 2, 3)
     weight = _quadratic(t)
     slope = torch.stack((t - 1, 1 - 2 * t, t), dim=-1) * (0.5 * resolution)
-    (wx, wy, wz), (sx, sy, sz) = weight.unbind(1), slope.unbind(1)
-    across, along_y, along_z = _outer(wy, wz), _outer(sy, wz), _outer(wy, sz)
+    wx, wy, wz = weight.unbind(1)
+    sx, sy, sz = slope.unbind(1)
+    across = _outer(wy, wz)
+    along_y = _outer(sy, wz)
+    along_z = _outer(wy, sz)
     rows = (_outer(wx, across), _outer(sx, across), _outer(wx, along_y), _outer(wx, along_z))
     return nodes, torch.stack(rows, dim=1)
 

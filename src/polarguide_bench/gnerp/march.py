@@ -13,10 +13,16 @@ from polarguide_bench.gnerp.recipe import Sampling
 
 DIFFUSE_SHARE = 0.1
 """Of the probability with which samples are drawn, what is spread evenly over a ray."""
-FIRST_SHARPNESS, SECOND_SHARPNESS = 16.0, 64.0
-"""At most so sharp is the surface for the samples that look for it, so that some lie before and behind it."""
-TRACED, STRIDE, HIT = 64, 0.9, 0.01
-"""Steps of sphere tracing, their share of the distance, which is not exact, and how near is there (in the unit)."""
+FIRST_SHARPNESS = 16.0
+"""Largest sharpness for the first search, so that samples lie before and behind the surface."""
+SECOND_SHARPNESS = 64.0
+"""Largest sharpness for the second search."""
+TRACED = 64
+"""Steps of sphere tracing."""
+STRIDE = 0.9
+"""Share of the distance that a step goes, since the distance is not exact."""
+HIT = 0.01
+"""Distance that counts as a hit, in the unit of the region."""
 BEHIND_SCALE = 8.0
 """Length of the background's way to infinity, in the unit that its density counts in."""
 
@@ -70,13 +76,15 @@ def march(
         sampling: how many samples.
         generator: moves the samples within their strata; None: they lie in the middle.
     """
-    count, fine = len(origin), sampling.fine
+    count = len(origin)
+    fine = sampling.fine
     with torch.no_grad():
         begin, end = field.region.span(origin, direction)
         along = _samples(field, origin, direction, begin, end, sampling, generator)
         before, after = _sections(along, begin, end, (end - begin) / sampling.coarse)
     places = origin[:, None] + along[..., None] * direction[:, None]
-    flat, rays = places.view(-1, 3), direction[:, None].expand(-1, fine, -1).reshape(-1, 3)
+    flat = places.view(-1, 3)
+    rays = direction[:, None].expand(-1, fine, -1).reshape(-1, 3)
     geometry: Geometry = field.geometry(flat)
     normals = unit(geometry.slope)
     # The color does not bend normals: grids would paint with bumps.
@@ -111,7 +119,8 @@ def trace(field: Field, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tens
 
 def section_opacity(first: Tensor, last: Tensor) -> Tensor:
     """Opacity of sections of a ray with the scaled distances ``s f`` at their ends (NeuS, Eq. 13)."""
-    entering, leaving = torch.sigmoid(first), torch.sigmoid(last)
+    entering = torch.sigmoid(first)
+    leaving = torch.sigmoid(last)
     return ((entering - leaving) / (entering + 1e-5)).clamp(0, 1)
 
 
@@ -167,8 +176,10 @@ def _inverse(edges: Tensor, weight: Tensor, share: Tensor) -> Tensor:
     total = torch.cumsum(weight, dim=1)
     total = torch.cat((torch.zeros_like(total[:, :1]), total), dim=1) / total[:, -1:]
     place = torch.searchsorted(total, share.contiguous(), right=True).clamp(1, weight.shape[1])
-    low, high = total.gather(1, place - 1), total.gather(1, place)
-    first, last = edges.gather(1, place - 1), edges.gather(1, place)
+    low = total.gather(1, place - 1)
+    high = total.gather(1, place)
+    first = edges.gather(1, place - 1)
+    last = edges.gather(1, place)
     return first + (last - first) * ((share - low) / (high - low).clamp(min=1e-9)).clamp(0, 1)
 
 

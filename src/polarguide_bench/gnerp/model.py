@@ -36,7 +36,9 @@ class FieldModel:
     """
 
     def __init__(self, state: FieldState, recipe: NeuralRecipe, device: torch.device) -> None:
-        self.state, self.recipe, self.device = state, recipe, device
+        self.state = state
+        self.recipe = recipe
+        self.device = device
         self.field: Field = state.field
         self.field.map_distances()
 

@@ -17,7 +17,8 @@ from polarguide_bench.gnerp.recipe import NeuralRecipe
 KINDS: dict[str, type[Field]] = {"grids": GridField, "networks": NetworkField}
 # Of Adam. Nodes that few rays see move as far as others, and are not thrown by the one ray that finds them after a
 # thousand steps, as a longer memory of the squares would have it.
-BETAS, EPSILON = (0.9, 0.99), 1e-15
+BETAS = (0.9, 0.99)
+EPSILON = 1e-15
 
 
 @dataclass
@@ -68,7 +69,8 @@ class FieldState:
         Raises:
             ValueError: something is missing, not known, or has another shape, type or range; the message names it.
         """
-        step, region = _step(_tensor_of(tensors, "scalars")), _region(_tensor_of(tensors, "region"))
+        step = _step(_tensor_of(tensors, "scalars"))
+        region = _region(_tensor_of(tensors, "region"))
         state = cls.around(step, recipe, region, 0, device)
         own = {f"field.{name}": values for name, values in state.field.state_dict().items()}
         loaded = {name: _like(values, _tensor_of(tensors, name), name) for name, values in own.items()}

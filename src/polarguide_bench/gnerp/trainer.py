@@ -46,7 +46,8 @@ def aolp_loss(normal: Tensor, rays: Tensor, aolp: Tensor, dolp: Tensor, *, circu
     if circular:
         # cos and sin of twice the azimuth without the azimuth; 90 degrees more turn the sign.
         square = (right * right + up * up).clamp(min=1e-12)
-        cosine, sine = (up * up - right * right) / square, -2 * right * up / square
+        cosine = (up * up - right * right) / square
+        sine = -2 * right * up / square
         difference = 0.5 * (1 - cosine * torch.cos(2 * aolp) - sine * torch.sin(2 * aolp))
     else:
         flat = (right * right + up * up) < 1e-12
@@ -79,9 +80,11 @@ def guidance_loss(
     own = torch.stack(_across(normals, rays[:, None]), dim=-1)
     others = torch.stack(_across(around, rays[:, None, None]), dim=-1)
     length = (weights[..., None] * own).sum(dim=1).square().sum(dim=-1)
-    field, weight = _vectors(aolp, circular), weights[..., None, None]
+    field = _vectors(aolp, circular)
+    weight = weights[..., None, None]
     if circular:
-        own, others = _doubled(own), _doubled(others)
+        own = _doubled(own)
+        others = _doubled(others)
     predicted = (weight * _covariance(own, others)).sum(dim=1)
     measured = length[:, None, None] * _covariance(field, _vectors(neighbors, circular))
     return (dolp[:, None, None] * (predicted - measured).abs()).mean()
@@ -183,7 +186,10 @@ class FieldTrainer:
         state: FieldState | None = None,
         store: ViewStore | None = None,
     ) -> None:
-        self.scene, self.recipe, self.settings, self._device = scene, recipe, settings, device
+        self.scene = scene
+        self.recipe = recipe
+        self.settings = settings
+        self._device = device
         cameras = [view.camera for view in scene.train_views]
         self.state = state or FieldState.first(recipe, cameras, settings.seed, device)
         self._store = store or ViewStore()
@@ -204,7 +210,9 @@ class FieldTrainer:
 
     def step(self) -> StepReport:
         """One optimizer step."""
-        state, settings, field = self.state, self.settings, self.state.field
+        state = self.state
+        settings = self.settings
+        field = self.state.field
         share = state.step / settings.steps
         generator = seeded(settings.seed, 9, state.step)
         view = self._view_of(state.step)
@@ -254,7 +262,8 @@ class FieldTrainer:
         share: float,
     ) -> Tensor:
         weights = self.recipe.weights
-        dolp, aolp = target.dolp[pixels], target.aolp[pixels]
+        dolp = target.dolp[pixels]
+        aolp = target.aolp[pixels]
         loss = weights.color * color + weights.eikonal * eikonal_loss(marched.slopes)
         if weights.aolp:
             normal = camera.to_camera(marched.normal)
@@ -272,7 +281,8 @@ class FieldTrainer:
         index = heaviest[..., None].expand(-1, -1, 3)
         around = self._neighbors(marched, camera, rays, heaviest)
         normals = unit(self.state.field.geometry(around.view(-1, 3)).slope).view(around.shape)
-        row, column = pixels // camera.width, pixels % camera.width
+        row = pixels // camera.width
+        column = pixels % camera.width
         beside = [
             (row + dy).clamp(0, camera.height - 1) * camera.width + (column + dx).clamp(0, camera.width - 1)
             for dy, dx in DIAGONAL
@@ -293,14 +303,16 @@ class FieldTrainer:
         places = marched.places.gather(1, chosen[..., None].expand(-1, -1, 3))
         width = (marched.along.gather(1, chosen) / camera.fx)[..., None]
         pose = camera.pose(places.dtype, places.device)
-        right, down = pose.rotation[0] * width, pose.rotation[1] * width
+        right = pose.rotation[0] * width
+        down = pose.rotation[1] * width
         ahead = camera.to_world(rays)[:, None] * width
         steps = [dy * down + dx * right for dy, dx in DIAGONAL]
         return torch.stack([places + step for step in (*steps, ahead, -ahead)], dim=2)
 
     def _rays(self, camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Origin [N, 3] in the field's coordinates, and directions in camera axes."""
-        region, device = self.state.field.region, self._device
+        region = self.state.field.region
+        device = self._device
         rays = camera.rays(device=device).view(-1, 3)[pixels]
         center = region.inner(camera.pose(rays.dtype, device).center)
         return center.expand(len(rays), 3), rays
@@ -314,7 +326,8 @@ class FieldTrainer:
 
     def _set_rates(self, share: float) -> None:
         """Rates of this step: linear warm-up, then a cosine."""
-        rates, shape = self.recipe.rates, self.recipe.shape
+        rates = self.recipe.rates
+        shape = self.recipe.shape
         late = max(0.0, (share - rates.warmup) / (1 - rates.warmup))
         falling = rates.last + (1 - rates.last) * 0.5 * (1 + math.cos(math.pi * late))
         rising = min(1.0, (share * self.settings.steps + 1) / (rates.warmup * self.settings.steps + 1))

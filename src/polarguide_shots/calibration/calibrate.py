@@ -33,8 +33,12 @@ BLOCK = 32
 """Side of a block in pixels, where it is not given."""
 NEIGHBORHOOD = 31
 """Cells of one color, each way, whose mean brightness is that of a uniform light at the middle one."""
-LEAST_THROUGHPUT, MOST_THROUGHPUT, MOST_DIATTENUATION = 0.5, 1.5, 1.3
-"""What deviates more than these, or than ``FARTHEST_ANGLE``, is a defect of the sensor, not a polarizer."""
+LEAST_THROUGHPUT = 0.5
+"""A polarizer with less throughput is a defect of the sensor."""
+MOST_THROUGHPUT = 1.5
+"""A polarizer with more throughput is a defect of the sensor."""
+MOST_DIATTENUATION = 1.3
+"""A polarizer with more diattenuation is a defect of the sensor."""
 
 Array = NDArray[np.float32]
 

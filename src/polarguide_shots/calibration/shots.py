@@ -34,8 +34,10 @@ SATURATED = 0.001
 """Share of saturated samples above which a shot is refused; a few defects of the sensor stay below it."""
 TOO_DARK = 0.02
 """Mean of a shot, as a share of full scale, below which it is refused."""
-UNEVEN, TEXTURED = 0.2, 0.05
-"""Of light that is not uniform: its dimmest part against its brightest; deviations within 32 pixels."""
+UNEVEN = 0.2
+"""Largest share by which the dimmest part of uniform light is below its brightest part."""
+TEXTURED = 0.05
+"""Largest deviation of uniform light within 32 pixels."""
 _CELLS = 16
 _SMALLEST = 64
 

@@ -193,8 +193,10 @@ def unread_entry(shot: ExposureSet, files: tuple[FileStamp, ...], error: BaseExc
     return Entry(FORMAT, shot.name, files, "unread", str(fault_of(shot, error)), (), ())
 
 
-BEYOND, DIFFERENCES = "beyond", "differences"
-"""Folders of pictures beside the table."""
+BEYOND = "beyond"
+"""Folder of pictures of shots beyond their limits."""
+DIFFERENCES = "differences"
+"""Folder of pictures of differences."""
 Heard = Callable[[Entry], None]
 
 

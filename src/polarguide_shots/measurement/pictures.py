@@ -24,8 +24,12 @@ from polarguide_shots.maps import Map, Reason, ShotMaps
 from polarguide_shots.measurement.fields import NO_LIMITS, Bound, Limits
 from polarguide_shots.measurement.regions import Differences, Region
 
-S0_RANGE, DOLP_RANGE, AOLP_RANGE = 0.2, 0.1, 20.0
-"""Differences with the full color: full scales of S0, DoLP, degrees of AoLP."""
+S0_RANGE = 0.2
+"""Difference of S0 with the full color, in full scales."""
+DOLP_RANGE = 0.1
+"""Difference of DoLP with the full color."""
+AOLP_RANGE = 20.0
+"""Difference of AoLP with the full color, degrees."""
 _WIDEST, _NARROWEST = 1600, 640
 _WITHIN, _BEYOND, _DEFECT = (64, 200, 64), (255, 32, 32), (255, 224, 0)
 _NOT_COMPARED = 110

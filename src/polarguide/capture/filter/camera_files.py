@@ -245,9 +245,10 @@ def tags_of(data: bytes) -> dict[int, Any]:
 
 _MAKER, _MODEL, _DIRECTORY = 271, 272, 34665
 _TIME, _F_NUMBER, _ISO = 33434, 33437, 34855
-_ISO_TOO_LARGE, _LARGER_ISO = 65535, (34866, 34865, 34867)
-"""What the tag ISO has where its 16 bits are too few, and those that say more: recommended exposure index, standard
-output sensitivity, ISO speed (EXIF 2.3)."""
+_ISO_TOO_LARGE = 65535
+"""Value of the tag ISO where its 16 bits are too few."""
+_LARGER_ISO = (34866, 34865, 34867)
+"""Tags with the ISO then: recommended exposure index, standard output sensitivity, ISO speed (EXIF 2.3)."""
 _FOCAL_LENGTH, _FOCAL_LENGTH_OF_FILM, _SERIAL_NUMBER, _LENS = 37386, 41989, 42033, 42036
 _DIGITAL_ZOOM = 41988
 

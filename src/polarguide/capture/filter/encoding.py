@@ -162,8 +162,10 @@ def _decoded_middle(profile: bytes) -> float | None:
 
 
 LOSSY, PLAIN, CAMERA_RAW = "JPEG, WebP or HEIC", "PNG, TIFF or BMP", "camera raw"
-VIDEO, ARRAY = "video", "array"
-"""Kinds of pictures by their usual encoding."""
+VIDEO = "video"
+"""Frames of a video: sRGB unless the file states another encoding."""
+ARRAY = "array"
+"""Arrays: linear."""
 
 
 def kind_of_file(path: Path) -> str:

@@ -311,8 +311,10 @@ _WHITE_IS_ZERO = 0
 _SAMPLES = {_GRAY: 1, _RGB: 3, _PALETTE: 1, _YCBCR: 3}
 JPEG_IN_TIFF = (6, 7)
 """Compressions that decode to RGB what is stored as luminance and color differences."""
-_NO_PICTURE, _OLD_REDUCED = 1 | 4, 2
-"""Of NewSubfileType: a smaller copy, or a mask of transparency; of the older tag: a smaller copy."""
+_NO_PICTURE = 1 | 4
+"""Bits of NewSubfileType for a smaller copy and for a mask of transparency."""
+_OLD_REDUCED = 2
+"""Value of the older tag SubfileType for a smaller copy."""
 _MOST_PICTURES = 1000
 
 

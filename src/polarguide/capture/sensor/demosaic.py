@@ -295,9 +295,10 @@ _BEYOND_NOISE = 6.0
 _OF_LIGHT = 0.5
 """Light that raises one analyzer raises the two at 45 degrees to it by as much together; a defect does not."""
 _BINS = 16
-_AGREE, _SAME_SIGN = 0.5, 0.75
-"""Shares of the views in which a sample has to stand out, and to lie on one side (views above less views below): light
-moves from view to view, defects stay."""
+_AGREE = 0.5
+"""Share of the views in which a sample has to stand out. Light moves from view to view; defects stay."""
+_SAME_SIGN = 0.75
+"""Share of these views in which it has to lie on one side: views above less views below."""
 
 
 def outliers(values: NDArray[Any], period: int) -> tuple[NDArray[np.bool_], NDArray[np.int8]]:

@@ -386,10 +386,16 @@ Kind = Literal["color", "monochrome"]
 SIDE = 8
 """Pixels along a block that is looked at: 4 x 4 cells of polarizers."""
 _FEWEST = 100
-_DIFFERENT, _EQUAL = 0.02, 0.006
-"""Median second differences of cells as a share of their mean: filters make them, chance does not."""
-_STRONGER, _ALIKE, _SMALL = 1.5, 1.35, 0.004
-"""Ratios of typical differences, across filters to within one; differences that count as none."""
+_DIFFERENT = 0.02
+"""Median second difference of cells, as a share of their mean, that filters make."""
+_EQUAL = 0.006
+"""The same that chance makes."""
+_STRONGER = 1.5
+"""Ratio of typical differences across filters to those within one, from which on there are filters."""
+_ALIKE = 1.35
+"""Ratio up to which there are none."""
+_SMALL = 0.004
+"""Differences that count as none."""
 
 
 def color_filters(blocks: NDArray[Any], saturation: float, floor: float = 0.0) -> Kind | None:

@@ -182,8 +182,10 @@ def _read_packed(path: Path, data: bytes, raw: RawFormat) -> NDArray[Any]:
 
 _CELLS = 4
 """Pixels along a block whose mean is free of analyzers and colors on every sensor."""
-_LEAST_BLOCKS, _MOST_BLOCKS = 8, 128
-"""Along a quarter: with fewer, chance correlates them; more need not be compared."""
+_LEAST_BLOCKS = 8
+"""Blocks along a quarter of the picture; fewer correlate by chance."""
+_MOST_BLOCKS = 128
+"""Blocks that are compared at most."""
 _TILED = 0.4
 """Correlation of the detail in every quarter with that in the first: over 0.55 of one view, 0.2 at most of others."""
 

@@ -88,7 +88,8 @@ class ErrorSheet:
             "final": _difference(result.final, target.photograph, target.valid),
         }
         for name in ("specular", "diffuse"):
-            layer, lobe = getattr(result, name), getattr(target, name)
+            layer = getattr(result, name)
+            lobe = getattr(target, name)
             if layer is not None and lobe is not None and target.foreground is not None:
                 pictures[name] = _difference(layer, lobe / 2, target.foreground)
         if result.normal is not None and target.normal is not None and target.surface is not None:
@@ -187,7 +188,8 @@ def cross_fitted(view: View, final: Tensor, stokes: Tensor | None) -> Tensor:
         [H, W, 3] linear, on the device of ``final``.
     """
     local = view.to(final.device)
-    measured, rays = local.photograph().to(final), local.camera.rays(device=final.device)
+    measured = local.photograph().to(final)
+    rays = local.camera.rays(device=final.device)
     good = (~(local.invalid | local.saturated)).to(final)
     polarized = torch.zeros_like(final).expand(2, *final.shape) if stokes is None else stokes[1:]
     predicted = torch.cat((2 * final[None], polarized)).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
@@ -305,7 +307,9 @@ def evaluate(
         reporter.say(
             f"scored behind an analyzer that is fitted on the other half of the picture: {listed(fitted)}"
         )
-    views, by_object, sheet = {}, ErrorsByObject(facts.objects), ErrorSheet(len(tests))
+    views = {}
+    by_object = ErrorsByObject(facts.objects)
+    sheet = ErrorSheet(len(tests))
     with reporter.track("scoring", len(tests)) as advance:
         for view in tests:
             views[view.name] = _score(run, view, facts, by_object, sheet)
@@ -420,9 +424,11 @@ def frames_per_second(draw: Callable[[View], object], views: Sequence[View]) -> 
         Frames a second, or None where other work ran on the machine meanwhile.
     """
     first = _seconds(draw, views[0])
-    rounds, slow = 3, 4 * len(views) * first > MOST_SECONDS
+    rounds = 3
+    slow = 4 * len(views) * first > MOST_SECONDS
     if slow:
-        rounds, views = 1, views[: max(1, int(MOST_SECONDS / first))]
+        rounds = 1
+        views = views[: max(1, int(MOST_SECONDS / first))]
     else:
         for view in views[1:]:
             draw(view)

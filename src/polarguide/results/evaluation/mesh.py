@@ -106,7 +106,8 @@ def true_points(view: View, finer: int = 1) -> tuple[Points, Points]:
             Between pixels inverse depth is interpolated, which is exact on planes.
     """
     depth, front, whole = _known(view)
-    camera, near = view.camera, depth
+    camera = view.camera
+    near = depth
     places = [seen_points(camera, depth, front)]
     if finer > 1:
         smooth = _inner(depth, front)

@@ -22,13 +22,17 @@ from polarguide.optics.color import shown
 
 FOLDER = "POLARGUIDE_LPIPS"
 """Variable of the environment: a folder with the two files of weights."""
-NETWORK, CHANNELS = "vgg16-397923af.pth", "vgg.pth"
-"""Names of the files: of the network's convolutions, as torch's hub calls it, and of the weights of channels."""
+NETWORK = "vgg16-397923af.pth"
+"""File of the network's convolutions, as torch's hub names it."""
+CHANNELS = "vgg.pth"
+"""File of the weights of channels."""
 HELP = "docs/reference/metrics.md, LPIPS, has the commands that add them"
 _STAGES = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
 """Numbers of the convolutions between two halvings, as the file of the network counts its layers."""
-_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Mean and deviation of ImageNet's colors, for values from -1 to 1."""
+_SHIFT = (-0.030, -0.088, -0.188)
+"""Mean of ImageNet's colors, for values from -1 to 1."""
+_SCALE = (0.458, 0.448, 0.450)
+"""Standard deviation of ImageNet's colors."""
 _LEAST_LENGTH = 1e-8
 """Added to squared lengths of features, which then can be divided by."""
 
@@ -68,7 +72,8 @@ class Lpips:
         """The distance of two pictures [H, W, 3] in [0, 1] as displayed, at least 32 pixels each way."""
         shift, scale = (first.new_tensor(values).view(1, 3, 1, 1) for values in (_SHIFT, _SCALE))
         values = torch.stack((first, second)).movedim(-1, 1).float()
-        values, total = (2 * values - 1 - shift) / scale, 0.0
+        values = (2 * values - 1 - shift) / scale
+        total = 0.0
         for number, (stage, weights) in enumerate(zip(self._stages, self._weights, strict=True)):
             if number:
                 values = functional.max_pool2d(values, 2)

@@ -41,12 +41,16 @@ def error_maps(target: ViewTarget, layers: Layers) -> dict[str, ErrorMap]:
     for name in ("specular", "diffuse"):
         lobe = getattr(target, name)
         maps[f"{name}_psnr"] = _squared(layers[name], None if lobe is None else lobe / 2, target.foreground)
-    normal, true, surface = layers["normal"], target.normal, target.surface
+    normal = layers["normal"]
+    true = target.normal
+    surface = target.surface
     maps["normal_mae_deg"] = None
     if normal is not None and true is not None and surface is not None:
         angles = torch.where(surface.mask, normal_angles_deg(normal, true), 0.0)
         maps["normal_mae_deg"] = ErrorMap(angles, surface.mask.to(torch.float64))
-    stokes, measured, keep = layers.get("polarization"), target.polarization, target.polarized
+    stokes = layers.get("polarization")
+    measured = target.polarization
+    keep = target.polarized
     maps["stokes_error"] = None
     if stokes is not None and measured is not None and keep is not None:
         errors = ((stokes - measured).abs().sum(dim=-1), measured.abs().sum(dim=-1))

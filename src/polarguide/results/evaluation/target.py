@@ -60,7 +60,8 @@ class SceneFacts:
         """Look at the test views of a scene."""
         tests = scene.test_views
         centers = torch.stack([view.camera.center for view in scene.views]).numpy()
-        warnings, foregrounds = _partly_known(tests), {view.name: foreground(view) for view in tests}
+        warnings = _partly_known(tests)
+        foregrounds = {view.name: foreground(view) for view in tests}
         masks = {name: mask for name, mask in foregrounds.items() if mask is not None}
         if 0 < len(masks) < len(tests):
             lacking = [name for name in foregrounds if name not in masks]
@@ -247,7 +248,8 @@ class ViewTarget:
     def of_view(cls, view: View, facts: SceneFacts, device: torch.device) -> ViewTarget:
         """All that is known of a test view, on a device."""
         target = cls.of(view.photograph(), view.invalid, view.ground_truth, device)
-        masks, truth = facts.masks, view.ground_truth
+        masks = facts.masks
+        truth = view.ground_truth
         polarization = polarized = None
         if view.is_determined:
             polarization = _there(torch.cat(view.stokes()[1:].unbind(0), dim=-1), device)

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from polarguide.core.files import write_whole
 
-ARRAY, ELEMENTS = 34962, 34963
-"""What a buffer view is for: values at vertices, and numbers of vertices."""
+ARRAY = 34962
+"""Target of a buffer view with values at vertices."""
+ELEMENTS = 34963
+"""Target of a buffer view with numbers of vertices."""
 _COMPONENTS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125}
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 

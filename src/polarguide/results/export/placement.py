@@ -202,8 +202,10 @@ def rewrite_splats(
         PlyData([vertices], byte_order="<").write(temporary)
 
 
-IMAGES, SUFFIX = "images", ".png"
-"""The folder and the suffix of the images that a view's name stands for."""
+IMAGES = "images"
+"""Folder of the exported images."""
+SUFFIX = ".png"
+"""Suffix of the exported images."""
 # nerfstudio's cameras look along -z with y up: OpenGL's axes, not OpenCV's.
 _OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 

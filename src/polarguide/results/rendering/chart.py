@@ -29,7 +29,8 @@ LAB: Floats = np.array([
     (50.63, 51.28, -14.12), (49.57, -29.71, -28.32), (95.19, -1.03, 2.93), (81.29, -0.57, 0.44),
     (66.89, -0.75, -0.06), (50.76, -0.13, 0.14), (35.63, -0.46, -0.48), (20.64, 0.07, -0.46),
 ])  # fmt: skip
-COLUMNS, ROWS = 6, 4
+COLUMNS = 6
+ROWS = 4
 XYZ_OF_SRGB: Floats = np.array(
     [(0.4360747, 0.3850649, 0.1430804), (0.2225045, 0.7168786, 0.0606169), (0.0139322, 0.0971045, 0.7141733)]
 )
@@ -68,7 +69,8 @@ def chart_of(view: View, corners: Sequence[float]) -> Chart:
             found=f"{int(used.sum())} in {view.name}",
             remedy="Take a photograph of less exposure or from nearer, or correct the corners.",
         )
-    matrix, errors = _fitted(colors[used], used), _left_out(colors, used)
+    matrix = _fitted(colors[used], used)
+    errors = _left_out(colors, used)
     if not errors.mean() <= WORST_FIT:
         raise PolarguideError(
             "chart",

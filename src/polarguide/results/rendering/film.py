@@ -167,7 +167,8 @@ def write_film(
     Raises:
         PolarguideError: a layer that the recipe has not, cameras of several sizes, or a video that cannot be encoded.
     """
-    out, names = Path(out), checked_layers(list(layers))
+    out = Path(out)
+    names = checked_layers(list(layers))
     refuse_scene(out if out.suffix.lower() != ".mp4" else out.parent)
     if out.parent == run.folder:  # somebody else may have made the run's folder
         require_inside(run.folder, out)
@@ -207,7 +208,8 @@ def _pictures(
     """Layers side by side, a picture for each camera, with their names where these are wanted."""
     within = part_shown(run, reporter)
     depths = rendered_depths(run, cameras, within) if "depth" in layers else None
-    color, surface = run.presentation.color, bool({"normal", "depth"} & {*layers})
+    color = run.presentation.color
+    surface = bool({"normal", "depth"} & {*layers})
     polarized = not {*layers}.isdisjoint(POLARIZED)
     with reporter.track("rendering", len(cameras)) as advance:
         for number, camera in enumerate(cameras):

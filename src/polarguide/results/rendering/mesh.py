@@ -73,9 +73,11 @@ def box_around(points: Sequence[Tensor], center: Tensor, reach: float, resolutio
             "mesh", expected="surfaces before the cameras", found="none", remedy="Train for more steps."
         )
     values = near.numpy()
-    low, high = np.quantile(values, 0.005, axis=0), np.quantile(values, 0.995, axis=0)
+    low = np.quantile(values, 0.005, axis=0)
+    high = np.quantile(values, 0.995, axis=0)
     size = float((high - low).max()) / resolution
-    low, high = low - 3 * size, high + 3 * size
+    low = low - 3 * size
+    high = high + 3 * size
     nx, ny, nz = (int(n) for n in np.maximum(2, np.ceil((high - low) / size)))
     return Box(torch.from_numpy(low), size, (nx, ny, nz))
 
@@ -89,13 +91,15 @@ def fuse(box: Box, views: Iterable[tuple[Camera, Tensor, Tensor]]) -> tuple[Tens
     Returns:
         Both of the grid's shape, float32.
     """
-    total, weight = torch.zeros(box.counts), torch.zeros(box.counts)
+    total = torch.zeros(box.counts)
+    weight = torch.zeros(box.counts)
     nx, ny, nz = box.counts
     step = max(1, _SLAB // (ny * nz))
     axes = [box.low[k] + box.size * (torch.arange(n) + 0.5) for k, n in enumerate(box.counts)]
     for camera, depth, mask in views:
         depths = torch.where(mask, depth, torch.zeros_like(depth)).flatten()
-        turn, shift = camera.rotation, camera.translation
+        turn = camera.rotation
+        shift = camera.translation
         for begin in range(0, nx, step):
             part = slice(begin, min(begin + step, nx))
             local = [
@@ -119,8 +123,10 @@ def fuse(box: Box, views: Iterable[tuple[Camera, Tensor, Tensor]]) -> tuple[Tens
     return total / weight.clamp(min=1), weight
 
 
-LEAST_VIEWS, SMALLEST_PIECE = 2, 0.01
-"""Views that must have seen a voxel. Pieces with fewer faces than this share of the largest are dropped."""
+LEAST_VIEWS = 2
+"""Number of views that must have seen a voxel."""
+SMALLEST_PIECE = 0.01
+"""Pieces with fewer faces than this share of the largest piece are dropped."""
 
 
 def surface_of(box: Box, field: Tensor, weight: Tensor) -> Surface:
@@ -262,7 +268,8 @@ def painted(surface: Surface, views: list[tuple[Camera, DepthSamples]], box: Box
     """Colors and normals of the views that see each vertex, weighted by how squarely they do."""
     vertices = torch.from_numpy(surface.vertices)
     own = torch.from_numpy(surface.normals)
-    color, normal = torch.zeros_like(vertices), torch.zeros_like(vertices)
+    color = torch.zeros_like(vertices)
+    normal = torch.zeros_like(vertices)
     total = torch.zeros(len(vertices), dtype=torch.float64)
     for camera, samples in views:
         pixel, z, inside = seen_at(vertices - camera.center, camera)

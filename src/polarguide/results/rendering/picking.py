@@ -16,8 +16,11 @@ from polarguide.geometry.vectors import unit
 from polarguide.shading.result import RenderResult
 
 SEEN = 0.5  # alpha from which there is a surface
-LEAST_GAIN, MOST_GAIN = 0.02, 50.0
-DARKEST, BRIGHTEST = 2e-3, 0.98  # of a color that may be picked as white
+LEAST_GAIN = 0.02
+MOST_GAIN = 50.0
+# of a color that may be picked as white
+DARKEST = 2e-3
+BRIGHTEST = 0.98
 PATCH = 2  # pixels to each side over which a picked color is averaged
 
 
@@ -45,7 +48,8 @@ def surface_at(result: RenderResult, camera: Camera, x: float, y: float) -> Surf
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         return None
     assert result.depth is not None
-    column, row = int(x), int(y)
+    column = int(x)
+    row = int(y)
     depth = float(result.depth[row, column])
     if float(result.alpha[row, column]) < SEEN or depth <= 0:
         return None
@@ -75,7 +79,8 @@ def photograph_color(view: View, x: float, y: float) -> Tensor:
             found=f"{x:g},{y:g}",
             remedy="Count pixels from the top left corner.",
         )
-    row, column = int(y), int(x)
+    row = int(y)
+    column = int(x)
     valid = ~_patch(view.invalid | view.saturated, row, column)
     if not bool(valid.any()):
         raise PolarguideError(
@@ -89,7 +94,8 @@ def photograph_color(view: View, x: float, y: float) -> Tensor:
 
 def _patch(picture: Tensor, row: int, column: int) -> Tensor:
     """[h, w, ...] around a pixel."""
-    top, left = max(0, row - PATCH), max(0, column - PATCH)
+    top = max(0, row - PATCH)
+    left = max(0, column - PATCH)
     return picture[top : row + PATCH + 1, left : column + PATCH + 1]
 
 
@@ -125,7 +131,8 @@ def gray_world(views: Iterable[View]) -> Vector:
     Raises:
         PolarguideError: there are no such pixels, or all are black.
     """
-    total, count = torch.zeros(3, dtype=torch.float64), 0
+    total = torch.zeros(3, dtype=torch.float64)
+    count = 0
     for view in views:
         valid = ~(view.invalid | view.saturated)
         total += view.photograph()[valid].double().sum(dim=0)

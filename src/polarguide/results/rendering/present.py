@@ -130,7 +130,9 @@ class _Place:
         require_folder(
             folder, expected="the folder of a scene or a run", remedy="Give what prepare or train wrote."
         )
-        self.folder, self._device, self._reporter = folder, device, reporter
+        self.folder = folder
+        self._device = device
+        self._reporter = reporter
         self._is_run = os.path.lexists(folder / CONFIGURATION)
         if not self._is_run:
             find_layout(folder)
@@ -330,7 +332,8 @@ def _wrong(where: str, expected: str, found: str) -> PolarguideError:
 
 def described(presentation: Presentation) -> list[str]:
     """The fields that are set, a line each; "nothing is set" for an empty presentation."""
-    chart, exposure = presentation.chart, presentation.exposure
+    chart = presentation.chart
+    exposure = presentation.exposure
     lines = {
         "white balance": _listed(presentation.white_balance),
         "color chart": chart

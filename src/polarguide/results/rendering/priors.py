@@ -91,7 +91,8 @@ def prior_pictures(view: View, run: OpenedRun | None, index: float, threshold: f
     rays = view.camera.rays()
     stokes = view.stokes()
     luminance = optics.luminance(stokes)
-    dolp, aolp = optics.dolp(luminance), optics.aolp(luminance)
+    dolp = optics.dolp(luminance)
+    aolp = optics.aolp(luminance)
     zenith = optics.diffuse_zenith(dolp, index)
     guide, source = resolving_normals(view, run, rays, luminance, index)
     mask = optics.polarization_mask(

@@ -118,10 +118,8 @@ def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -
 def panorama(texels: Tensor, cubemap: RadianceCubemap, around: SceneFrame, height: int) -> Tensor:
     """Radiance [H, 2 H, 3] of raw texels [6, R, R, 3]."""
     steps = torch.arange(2 * height, dtype=torch.float64) + 0.5
-    latitude, longitude = (
-        math.pi * (0.5 - steps[:height, None] / height),
-        math.pi * (steps[None] / height - 1),
-    )
+    latitude = math.pi * (0.5 - steps[:height, None] / height)
+    longitude = math.pi * (steps[None] / height - 1)
     x, y, z = torch.broadcast_tensors(
         latitude.cos() * longitude.sin(), latitude.sin(), -latitude.cos() * longitude.cos()
     )
@@ -135,7 +133,8 @@ def texels_of(picture: Tensor, cubemap: RadianceCubemap, around: SceneFrame, res
     """Raw texels [6, R, R, 3] of a panorama [H, W, 3] of radiance, as far as raw values can hold it."""
     directions = texel_directions(resolution).double() @ around.panorama_axes()
     x, y, z = directions.unbind(-1)
-    across, down = torch.atan2(x, -z) / math.pi, -2 / math.pi * torch.asin(y.clamp(-1, 1))
+    across = torch.atan2(x, -z) / math.pi
+    down = -2 / math.pi * torch.asin(y.clamp(-1, 1))
     # One column more on each side: the panorama goes round.
     wide = pad(picture.double().movedim(-1, 0)[None], (1, 1, 0, 0), mode="circular")
     width = picture.shape[1]

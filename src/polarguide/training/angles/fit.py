@@ -63,10 +63,13 @@ def fit_angle(
         None where there is no polarization to tell an angle by.
     """
     flat = (weight / (stokes[0].mean(dim=-1).clamp(min=0) + FLOOR) ** 2)[..., None].expand_as(intensity)
-    plain, y = flat.reshape(-1).double(), intensity.reshape(-1).double()
+    plain = flat.reshape(-1).double()
+    y = intensity.reshape(-1).double()
     s0, s1, s2 = (part.reshape(-1).double() / 2 for part in stokes)
-    angle, weights = 0.0, plain
-    solution, columns = torch.zeros(3, dtype=torch.float64), torch.stack((s0, s1, s2))
+    angle = 0.0
+    weights = plain
+    solution = torch.zeros(3, dtype=torch.float64)
+    columns = torch.stack((s0, s1, s2))
     for turn in range(ROUNDS):
         if mount == "filter":
             cosine, sine = (
@@ -90,7 +93,8 @@ def fit_angle(
         return None
     covariance = _covariance(columns, plain, y - solution @ columns, intensity.shape)
     if mount == "filter":  # turned into the last round's analyzer, which is all but along the first axis
-        x, y2 = length, 0.0
+        x = length
+        y2 = 0.0
     across = torch.tensor([0.0, -y2, x], dtype=torch.float64) / length
     spread = math.degrees(math.sqrt(max(0.0, float(across @ covariance @ across))) / length / 2)
     doubt = math.sqrt(max(0.0, float(torch.linalg.eigvalsh(covariance[1:, 1:])[-1]))) / gain

@@ -233,7 +233,8 @@ class Polarizers:
     def take(self, table: Tensor) -> set[str]:
         """Go by a table of all fits [F, P, 8] from now on; the names of the views of which it changes the beliefs."""
         self.table = table
-        before, self.beliefs = self.beliefs, self._beliefs()
+        before = self.beliefs
+        self.beliefs = self._beliefs()
         return {name for name, exposures in self.beliefs.items() if before.get(name) != exposures}
 
     def judgments(self) -> list[Judgment]:
@@ -248,7 +249,8 @@ class Polarizers:
             telling = [row for row in rows if row.tells] or [row for row in rows if row.guesses]
             judgment = replace((telling or rows)[-1], unexplained=poor)
             if telling:
-                angles, spreads = [row.angle for row in telling], [row.spread for row in telling]
+                angles = [row.angle for row in telling]
+                spreads = [row.spread for row in telling]
                 angle, scatter = mean_angle(angles, spreads, self._rules.least_spread)
                 few = len(telling) < len(rows) / 2
                 judgment = replace(judgment, angle=angle, scatter=90.0 if few else scatter)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from polarguide.capture import Scene, View
 from polarguide.capture.variants import smaller
+from polarguide.core.progress import SILENT
 from polarguide.core.system import UNBOUNDED, MemoryBound
 from polarguide.raster import Backend
 from polarguide.shading.gbuffer import RenderRequest, render
@@ -51,8 +52,14 @@ class AngleTrainer:
         warn: Callable[[str], None] = lambda _: None,
         memory: MemoryBound = UNBOUNDED,
     ) -> None:
-        self.scene, self.recipe, self.settings, self.backend = scene, recipe, settings, backend
-        self.ranks, self._store, self._warn, self._memory = ranks, store, warn, memory
+        self.scene = scene
+        self.recipe = recipe
+        self.settings = settings
+        self.backend = backend
+        self.ranks = ranks
+        self._store = store
+        self._warn = warn
+        self._memory = memory
         self._fits = False
         self._set_up(state, None if state is None else state.angles)
 
@@ -62,15 +69,19 @@ class AngleTrainer:
         Args:
             state: that it goes on from; None: from the beginning. table: table of all fits so far.
         """
-        settings, search = self.settings, search_steps(self.recipe, self.settings)
+        settings = self.settings
+        search = search_steps(self.recipe, self.settings)
         self.polarizers = Polarizers(self.scene, self.recipe, settings.steps, table, search)
         self._searches = self.begins_again and not self.polarizers.settled
-        scene, store, warn = self.scene, self._store, self._warn
+        scene = self.scene
+        store = self._store
+        warn = self._warn
         if self._searches:
             scene = smaller(scene, self.recipe.angle_rules.search_size)
             settings = replace(settings, steps=search)
             self.polarizers = Polarizers(scene, self.recipe, search, table, search)
-            store, warn = None, lambda _: None
+            store = None
+            warn = SILENT.warn
         elif self.begins_again:
             scene = self.polarizers.resolved(scene)
         self._trainer = Trainer(
@@ -153,7 +164,9 @@ class AngleTrainer:
 
     def _predicted(self, view: View) -> Tensor:
         """Stokes vectors [3, H, W, 3] of the present state in a view."""
-        state, rasterize, shading = self.state, self.backend.rasterize, self.shading
+        state = self.state
+        rasterize = self.backend.rasterize
+        shading = self.shading
         self._memory.clear()
         request = RenderRequest(sh_degree=self.schedule.sh_degree(state.step))
         result = render(state.gaussians, view.camera, rasterize, request, shading=shading, light=state.light)

@@ -29,7 +29,8 @@ from polarguide.training.rules import MetalRules
 # Neighbors of a Gaussian.
 NEIGHBORS = 16
 # Capacities of the flow are integers: so many to a nat. INFINITE, in nats, is more than all that others can weigh.
-PER_NAT, INFINITE = 100, 1e5
+PER_NAT = 100
+INFINITE = 1e5
 # Radiance (full scale is 1) that is added to colors before they are compared.
 DARK = 0.02
 
@@ -82,7 +83,9 @@ def unary(measured: Evidence, allowed: Tensor, rules: MetalRules) -> Tensor:
 def minimum_cut(nats: NDArray[np.float64], graph: Graph) -> NDArray[np.bool_]:
     """The x [N] of least energy; of several the one with the fewest metals."""
     count = len(nats)
-    every, source, sink = np.arange(count), np.full(count, count), np.full(count, count + 1)
+    every = np.arange(count)
+    source = np.full(count, count)
+    sink = np.full(count, count + 1)
     begin = np.concatenate((graph.first, graph.second, source, every))
     end = np.concatenate((graph.second, graph.first, every, sink))
     weights = np.concatenate((graph.cost, graph.cost, nats.clip(min=0), (-nats).clip(min=0)))
@@ -100,7 +103,8 @@ def surfaces(
     metal: NDArray[np.bool_], nats: NDArray[np.float64], graph: Graph, least: float
 ) -> NDArray[np.bool_]:
     """Those of the metals whose pieces lower the energy by more than a piece costs."""
-    count, (first, second, cost) = len(metal), graph
+    count = len(metal)
+    first, second, cost = graph
     inside = metal[first] & metal[second] & (cost > 0.5 / PER_NAT)
     pieces = coo_matrix((np.ones(inside.sum()), (first[inside], second[inside])), shape=(count, count))
     number, piece = connected_components(pieces, directed=False)

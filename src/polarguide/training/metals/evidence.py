@@ -46,7 +46,8 @@ from polarguide.training.rules import MetalRules, MetalViews
 # Shares of its specular polarization that a dielectric's roughness may leave.
 ROUGH = (1.0, 0.85, 0.7, 0.55)
 # Reflectances that are tried: a level times a power of the observed color.
-LEVELS, POWERS = (0.5, 0.6, 0.7, 0.8, 0.88, 0.95), (0.5, 0.75, 1.0)
+LEVELS = (0.5, 0.6, 0.7, 0.8, 0.88, 0.95)
+POWERS = (0.5, 0.75, 1.0)
 # Weakest over strongest reflectance of the most deeply colored metal, gold.
 GOLD = 0.38
 # Unknowns of either explanation, for which as many views tell nothing.
@@ -88,7 +89,9 @@ def errors(samples: ViewSamples, refractive_index: float, light: float, dark: fl
     Args:
         light: mean radiance of the scene, S0. dark: radiance added to the one that errors are relative to.
     """
-    s0, across, cosine = samples.s0, samples.across, samples.cosine[..., None]
+    s0 = samples.s0
+    across = samples.across
+    cosine = samples.cosine[..., None]
     sine2 = 1 - cosine * cosine
     above = s0.clamp(min=0) + dark  # the variance of light that is counted grows with the light
     weight = samples.weight[..., None] / above
@@ -101,7 +104,9 @@ def errors(samples: ViewSamples, refractive_index: float, light: float, dark: fl
     bodies = []
     for left in ROUGH:
         over = left * specular
-        by_line, of_body, seen = weight / (1 + over * over), over + diffuse, over * s0 - across
+        by_line = weight / (1 + over * over)
+        of_body = over + diffuse
+        seen = over * s0 - across
         body = (by_line * of_body * seen).sum(dim=0) / (by_line * of_body**2).sum(dim=0).clamp(min=1e-9)
         bodies.append(mean((seen - of_body * body.clamp(min=0)) ** 2 / (1 + over * over)))
     color = (samples.weight[..., None] * s0).sum(dim=0)

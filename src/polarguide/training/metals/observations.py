@@ -75,10 +75,13 @@ def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal:
     guide, reliable = guide_normals(view.camera.to_camera(normal), rays, least_normal)
     s0, s1, s2 = view.stokes()
     x_ref, up_ref = optics.lens_frame(rays)
-    x, y = dot(guide, x_ref), dot(guide, up_ref)
+    x = dot(guide, x_ref)
+    y = dot(guide, up_ref)
     sine2 = (x * x + y * y).clamp(min=1e-6)
-    cosine2, sine = ((x * x - y * y) / sine2)[..., None], (2 * x * y / sine2)[..., None]
-    across, oblique = -(s1 * cosine2 + s2 * sine), s2 * cosine2 - s1 * sine
+    cosine2 = ((x * x - y * y) / sine2)[..., None]
+    sine = (2 * x * y / sine2)[..., None]
+    across = -(s1 * cosine2 + s2 * sine)
+    oblique = s2 * cosine2 - s1 * sine
     one = torch.ones_like(x)[..., None]
     good = (reliable & ~(view.invalid | view.saturated))[..., None]
     target = torch.cat((one, s0, across, oblique, -dot(guide, rays)[..., None]), dim=-1) * good

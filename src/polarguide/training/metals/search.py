@@ -47,7 +47,8 @@ def light_gain(
         The median of what they show over what is rendered of them; 1 without views and where they are hardly seen. Not
         so little that strengths would have to exceed 1.
     """
-    ratios, pixels = [], 0
+    ratios = []
+    pixels = 0
     for view in memory.between(evenly(views, limits.gain_views)):
         photograph = view.photograph().to(gaussians["means"].device).flatten(0, 1)
         metal = render(gaussians, view.camera, rasterize, shading=shading, light=light).metal
@@ -90,13 +91,21 @@ class MetalSearch:
         warn: Callable[[str], None],
         memory: MemoryBound,
     ) -> None:
-        self._scene, self._shading = scene, shading
-        self._between, self._rules, self._limits = recipe.metals, recipe.metal_rules, recipe.metal_views
-        self._index, self._backend, self._ranks, self._warn = settings.refractive_index, backend, ranks, warn
+        self._scene = scene
+        self._shading = shading
+        self._between = recipe.metals
+        self._rules = recipe.metal_rules
+        self._limits = recipe.metal_views
+        self._index = settings.refractive_index
+        self._backend = backend
+        self._ranks = ranks
+        self._warn = warn
         self._memory = memory
         self._on = shading.knows_metals and settings.materials == "auto"
-        self._told, self._steps = False, settings.steps
-        self._refreshes, self._looks = refreshes(recipe, settings.steps), looks(recipe, settings)
+        self._told = False
+        self._steps = settings.steps
+        self._refreshes = refreshes(recipe, settings.steps)
+        self._looks = looks(recipe, settings)
 
     def is_due(self, step: int) -> bool:
         """Whether a refresh at this step looks for metals."""
@@ -121,7 +130,8 @@ class MetalSearch:
         """Decide which Gaussians are metals, and begin with what was measured of those that are new."""
         if not any(view.is_determined or view.materials is not None for view in views):
             return
-        gaussians, rasterize = state.gaussians, self._backend.rasterize
+        gaussians = state.gaussians
+        rasterize = self._backend.rasterize
         measured = self._measure(state, views)
         if not self._told and (
             wrong := contradicted(gaussians, views, rasterize, measured.labels, self._limits, self._memory)
