@@ -228,7 +228,7 @@ def test_an_ablation_changes_something_and_is_found_by_its_name() -> None:
         for recipe in variations:
             assert recipe.name.startswith(base + ":")
             assert recipe.about.endswith(".")
-            assert recipe_named(recipe.name) is recipe
+            assert recipe_named(recipe.name) == recipe
             reference = recipe_named(base)
             same = replace(recipe, name=base, about=reference.about)
             assert same != reference, recipe.name

@@ -245,7 +245,11 @@ def test_an_exposure_clips_under_a_hundredth() -> None:
     assert clipping_exposure(values * 0) == 1.0
 
 
-PAGES = sorted(Path(polarguide.__file__).parent.rglob("*.html"))
+PAGES = sorted(
+    page
+    for package in ("polarguide", "polarguide_shots", "polarguide_bench")
+    for page in Path(polarguide.__file__).parents[1].joinpath(package).rglob("*.html")
+)
 
 
 def test_there_are_pages() -> None:

@@ -151,9 +151,8 @@ def _check_angles(values: Tensor) -> None:
 
 def _check_scalars(tensors: Mapping[str, Tensor]) -> None:
     scalars = _given(tensors, "scalars")
-    # The first checkpoints had a third, a flag that nothing reads any more.
-    if scalars.dtype != torch.int64 or tuple(scalars.shape) not in ((2,), (3,)):
+    if scalars.dtype != torch.int64 or tuple(scalars.shape) != (2,):
         raise ValueError(f"scalars of shape {list(scalars.shape)}, {scalars.dtype}, not [2], torch.int64")
-    step, frozen_until, *flag = scalars.tolist()
-    if min(step, frozen_until) < 0 or max(step, frozen_until) > 1 << 50 or flag not in ([], [0], [1]):
+    step, frozen_until = scalars.tolist()
+    if min(step, frozen_until) < 0 or max(step, frozen_until) > 1 << 50:
         raise ValueError(f"scalars {scalars.tolist()}")
