@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from faults import Fault
 
-from polarguide.recipes import RECIPES, recipe_named
+from polarguide.recipes import RECIPES
 from polarguide.training.recipe import Recipe, Repeat, Rounds, Schedule, Stage
-from polarguide_bench.recipes import ABLATIONS
+from polarguide_bench.recipes import ABLATIONS, recipe_named
 
 OF_GAUSSIANS = {name: recipe for name, recipe in RECIPES.items() if isinstance(recipe, Recipe)}
 EVERY_RECIPE = pytest.mark.parametrize("recipe", OF_GAUSSIANS.values(), ids=OF_GAUSSIANS.keys())
