@@ -98,6 +98,12 @@ class Trainer:
         centers = torch.stack([view.camera.center for view in self._views])
         self._reach = orbit(scene.points.double().numpy(), centers.double().numpy())[1]
         self._rate = math.sqrt(settings.views_per_step)
+        self._actions: Mapping[Action, Callable[[], None]] = {
+            "reset_opacity": self._reset_opacity,
+            "propagate_normals": self._propagate_normals,
+            "orient_normals": self._orient_normals,
+            "refresh_priors": self._refresh_priors,
+        }
         self._use_batch_rates()
 
     def undecided(self) -> Tensor | None:
@@ -121,10 +127,10 @@ class Trainer:
         position = self.schedule.at(state.step)
         stage = position.stage
         self.whole = not position.actions
-        if "refresh_priors" in position.actions:
-            self._feed.refresh_priors()  # first: they leave room for looks at all views
         for action in position.actions:
-            self._act(action)
+            self._actions[action]()
+        if self._needs_first_priors(stage):
+            self._refresh_priors()
         mine = self.ranks.slots(views)
         # A rank without a view renders the first one, so that it knows what has gradients, and adds nothing.
         measured = [self._backpropagate(slot, stage, bool(mine)) for slot in mine or range(1)]
@@ -180,9 +186,15 @@ class Trainer:
         """Targets of the rendering of a slot's view."""
         state = self.state
         view = self._view_of(state.step * self.settings.views_per_step + slot)
-        if stage.weights.priors and view.is_determined and state.frozen is None:
-            self._act("refresh_priors")
         return self._feed.targets(state.step, view, stage.weights, state.frozen)
+
+    def _needs_first_priors(self, stage: Stage) -> bool:
+        """True where the views of a step need priors that no action has computed so far."""
+        if not stage.weights.priors or self.state.frozen is not None:
+            return False
+        views = self.settings.views_per_step
+        first = self.state.step * views
+        return any(self._view_of(first + slot).is_determined for slot in range(views))
 
     def _view_of(self, place: int) -> View:
         """The view at a place in the sequence of all views ever trained on.
@@ -233,24 +245,28 @@ class Trainer:
         if state.environment is not None:
             state.environment.step()
 
-    def _act(self, action: Action) -> None:
-        state = self.state
+    def _reset_opacity(self) -> None:
+        reset_opacity(self.state, self.shading, self.recipe.densification.reset_opacity)
+
+    def _propagate_normals(self) -> None:
+        generator = seeded(self.settings.seed, 3, self.state.step)
         steps = self.settings.steps
-        if action == "reset_opacity":
-            reset_opacity(state, self.shading, self.recipe.densification.reset_opacity)
-        elif action == "propagate_normals":
-            generator = seeded(self.settings.seed, 3, state.step)
-            propagate_normals(state, self.shading, self.recipe.propagation, generator, steps)
-        elif action == "orient_normals":
-            views = self._memory.between(self._views)
-            outward = outward_directions(state.gaussians, views, self.backend.rasterize)
-            self.ranks.broadcast(outward)
-            state.gaussians.overwrite("outward", outward)
-        else:
-            if self._metals.is_due(state.step):
-                self._metals.look(state, self._views)
-            self._set_indices()
-            state.frozen = state.gaussians.snapshot()
+        propagate_normals(self.state, self.shading, self.recipe.propagation, generator, steps)
+
+    def _orient_normals(self) -> None:
+        gaussians = self.state.gaussians
+        views = self._memory.between(self._views)
+        outward = outward_directions(gaussians, views, self.backend.rasterize)
+        self.ranks.broadcast(outward)
+        gaussians.overwrite("outward", outward)
+
+    def _refresh_priors(self) -> None:
+        """Drop the priors of all views, look for metals where that is due, and let the present Gaussians guide."""
+        self._feed.refresh_priors()  # this leaves room for looks at all views
+        if self._metals.is_due(self.state.step):
+            self._metals.look(self.state, self._views)
+        self._set_indices()
+        self.state.frozen = self.state.gaussians.snapshot()
 
     def _set_indices(self) -> None:
         """Give Gaussians the refractive indices that the user specified for materials."""
