@@ -89,9 +89,14 @@ def pillow_damage(data: bytes) -> str | None:
     try:
         picture = opened(data)
         if isinstance(picture, BmpImageFile):
-            _, (*_, height), start, (stored, row, _) = picture.tile[0]
+            tile: Any = picture.tile[0]
+            _, (*_, height), start, (stored, row, _) = tile
             if picture.info["compression"] or ";" in stored:
                 return "a BMP file without 8, 24 or 32 bits a pixel, not compressed"
+            if start != int.from_bytes(data[10:14], "little"):
+                return (
+                    "a BMP file that states no place of its pixels, of which decoders make different pictures"
+                )
             end = start + row * height
         elif picture.n_frames > 1:
             return "an animated WebP file"
