@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
+from PIL import Image
 from PIL.BmpImagePlugin import BmpImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
@@ -100,6 +101,8 @@ def pillow_damage(data: bytes) -> str | None:
             end = start + row * height
         elif picture.n_frames > 1:
             return "an animated WebP file"
+    except Image.DecompressionBombError:  # its limit is higher than ours
+        return "a WebP file whose size is more than any camera takes"
     except Exception:
         end = len(data) + 1
     return (
