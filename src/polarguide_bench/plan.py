@@ -351,9 +351,8 @@ def jobs_at_a_time(options: ClusterOptions, count: int, memory: int, gpus: Seque
     if options.jobs or not options.local:
         return max(1, min(options.jobs or count, count))
     room = len(gpus) or (os.cpu_count() or 1) // options.threads
-    free = free_memory()
-    if free is not None and memory:
-        room = min(room, int(SHARE * free) // memory)
+    if memory:
+        room = min(room, int(SHARE * free_memory()) // memory)
     return max(1, min(room, count))
 
 

@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import hostile_files as made
 import numpy as np
 import pytest
@@ -52,6 +53,21 @@ def test_ordinary_ones_pass(tmp_path: Path) -> None:
     assert (find_damage(path.read_bytes()), declared_size(path.read_bytes())) == (None, SMALL)
     made.scans_jpeg(path, 64, 20)
     assert (find_damage(path.read_bytes()), declared_size(path.read_bytes())) == (None, (64, 64))
+
+
+@pytest.mark.parametrize("side", [12_500, 16_383])
+def test_webp_pictures_larger_than_any_camera_takes(tmp_path: Path, side: int) -> None:
+    done, data = cv2.imencode(".webp", np.zeros((16, 16, 3), np.uint8), [cv2.IMWRITE_WEBP_QUALITY, 101])
+    assert done
+    chunk = bytearray(
+        data[12:].tobytes()
+    )  # 14 bits each of width and height, less 1, behind a byte of its own
+    packed = int.from_bytes(chunk[9:13], "little") >> 28 << 28
+    chunk[9:13] = (packed | side - 1 | side - 1 << 14).to_bytes(4, "little")
+    canvas = bytes(4) + 2 * (side - 1).to_bytes(3, "little")
+    body = b"WEBPVP8X" + len(canvas).to_bytes(4, "little") + canvas + chunk
+    whole = b"RIFF" + len(body).to_bytes(4, "little") + body
+    Fault(found="more than any camera takes").raised_by(decode_stored, tmp_path / "a.webp", whole)
 
 
 def test_the_size_of_a_tiff_cut_short_is_not_known() -> None:

@@ -213,9 +213,70 @@ def test_tiff_variants(tmp_path: Path, options: dict[str, object]) -> None:
     data = path.read_bytes()
     assert find_damage(data) is None
     np.testing.assert_array_equal(decode_picture(path, data), COLORS)
-    if "bigtiff" not in options:
-        assert "a TIFF file cut short" in str(find_damage(data[: int(len(data) * 0.97)]))
-        assert find_damage(data[:6]) is not None
+    name = "BigTIFF" if "bigtiff" in options else "TIFF"
+    cuts = {find_damage(data[:length]) for length in (6, 100, int(len(data) * 0.97), len(data) - 1)}
+    assert all(damage is not None and f"a {name} file cut short" in damage for damage in cuts)
+
+
+def test_a_tiff_of_which_a_value_is_cut_off(tmp_path: Path) -> None:
+    """Its pixels are whole, and its color profile, which stands at the end, is not."""
+    path = tmp_path / "picture.tif"
+    tifffile.imwrite(path, COLORS, photometric="rgb")
+    data = bytearray(path.read_bytes())
+    order, entries = 8, struct.unpack_from("<H", data, 8)[0]
+    struct.pack_into("<HHII", data, order + 2 + 12 * (entries - 1), 34675, 7, 400, len(data))
+    assert find_damage(bytes(data) + bytes(400)) is None
+    assert "a TIFF file cut short" in str(find_damage(bytes(data) + bytes(399)))
+
+
+@pytest.mark.parametrize(
+    ("bits", "options", "shape"),
+    [
+        (8, {}, (20, 30)),
+        (8, {"palette": range(255, -1, -1)}, (20, 30)),
+        (24, {}, (20, 30, 3)),
+        (32, {}, (20, 30, 3)),
+    ],
+)
+def test_bmp_variants(tmp_path: Path, bits: int, options: dict[str, range], shape: tuple[int, ...]) -> None:
+    """Rows rise from the last; palettes of gray give gray, and the fourth byte of 32 bits is padding."""
+    light = (COLORS >> 8).astype(np.uint8)
+    channels = bits // 8
+    stored = light[..., 0] if channels == 1 else np.dstack([light, light[..., :1]])[..., :channels]
+    rows = np.zeros((20, -(-30 * channels // 4) * 4), np.uint8)
+    rows[:, : 30 * channels] = stored[::-1].reshape(20, -1)
+    levels = options.get("palette", range(256)) if bits == 8 else ()
+    palette = b"".join(bytes([level, level, level, 0]) for level in levels)
+    head = struct.pack("<IiiHHIIiiII", 40, 30, 20, 1, bits, 0, 0, 0, 0, 0, 0)
+    data = struct.pack("<2sIHHI", b"BM", 0, 0, 0, 54 + len(palette)) + head + palette + rows.tobytes()
+    expected = stored[..., :3] if channels > 1 else np.array(levels, np.uint8)[stored]
+    found = pictures.decode_stored(tmp_path / "a.bmp", data)
+    assert (found.shape, declared_size(data)) == (shape, (30, 20))
+    np.testing.assert_array_equal(found, expected)
+    for length in (20, 60, len(data) - 1):
+        assert "a BMP file cut short" in str(find_damage(data[:length]))
+    assert "no place of its pixels" in str(find_damage(data[:10] + bytes(4) + data[14:]))
+
+
+@pytest.mark.parametrize(("kind", "channels"), [(b"P5", 1), (b"P6", 3)])
+@pytest.mark.parametrize("full", [3, 200, 255, 1023, 65535])
+def test_pgm_and_ppm_keep_their_numbers(tmp_path: Path, kind: bytes, channels: int, full: int) -> None:
+    """They are not scaled by the full scale that the header states."""
+    stored = (COLORS[..., :channels].astype(np.float64) * full / 65535).astype(
+        np.uint8 if full < 256 else ">u2"
+    )
+    data = b"%s\n# a comment\n30 20\n%d\n" % (kind, full) + stored.tobytes()
+    found = pictures.decode_stored(tmp_path / "a.pgm", data)
+    np.testing.assert_array_equal(found, stored[..., ::-1] if channels == 3 else stored[..., 0])
+    assert "cut short" in str(find_damage(data[:-1]))
+
+
+@pytest.mark.parametrize("quality", [80, 101])  # 101 is without loss
+def test_webp_cut_anywhere(quality: int) -> None:
+    data = encoded(".webp", (COLORS >> 8).astype(np.uint8), cv2.IMWRITE_WEBP_QUALITY, quality)
+    assert (find_damage(data), declared_size(data)) == (None, (30, 20))
+    for length in range(12, len(data)):
+        assert "a WebP file cut short" in str(find_damage(data[:length]))
 
 
 def cut(end: int, suffix: str = ".png") -> Callable[[TinyCapture], None]:

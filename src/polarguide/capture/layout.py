@@ -391,10 +391,8 @@ def require_memory(where: Path, needed: int, what: str, *, remedy: str, limit: f
     """
     if limit is not None:
         allowed, whose = int(limit * GIBIBYTE), "as --memory allows"
-    elif (free := free_memory()) is not None:
-        allowed, whose = int(SHARE * free), f"{SHARE:.0%} of what is free"
     else:
-        return
+        allowed, whose = int(SHARE * free_memory()), f"{SHARE:.0%} of what is free"
     if needed > allowed:
         raise PolarguideError(
             where,

@@ -138,12 +138,11 @@ def _extra(name: str, use: str) -> dict[str, Any]:
 
 def _machine() -> dict[str, Any]:
     """The system, its processors, and what is free of memory and of the disk of the current folder, in GiB."""
-    free = free_memory()
     return {
         "system": platform.platform(),
         "processor": platform.machine(),
         "cores": os.cpu_count(),
-        "free_memory_gib": None if free is None else round(free / GIB, 1),
+        "free_memory_gib": round(free_memory() / GIB, 1),
         "free_disk_gib": round(shutil.disk_usage(Path.cwd()).free / GIB, 1),
     }
 
@@ -185,8 +184,7 @@ def _print(report: dict[str, Any]) -> None:
     table.add_row("polarguide", f"{report['polarguide']['version']}  {report['polarguide']['folder']}")
     table.add_row("Python", f"{report['python']['version']}  {report['python']['executable']}")
     table.add_row("system", f"{machine['system']}, {machine['cores']} cores")
-    memory = machine["free_memory_gib"]
-    table.add_row("free memory", "unknown" if memory is None else f"{memory} GiB")
+    table.add_row("free memory", f"{machine['free_memory_gib']} GiB")
     table.add_row("free disk", f"{machine['free_disk_gib']} GiB in this folder")
     if "error" not in kernels:
         table.add_row("kernels", f"{kernels['instruction_set']}, threads: {kernels['threads']}")

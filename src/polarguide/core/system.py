@@ -16,6 +16,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
 
+import psutil
+
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import MOST_THREADS
 
@@ -31,6 +33,8 @@ SETTLED = 3
 """Number of steps that determine the memory of the largest step."""
 PARTLY = 0.5
 """Of a limit, from which on ``MemoryBound.clear`` gives freed memory back."""
+_NOT_BUSY = {"idle", "iowait", "guest", "guest_nice"}
+"""Times of processors that pass without work, or that are counted as time of users as well."""
 
 Item = TypeVar("Item")
 
@@ -178,12 +182,9 @@ def peak_memory_mib() -> float | None:
     return peak / MEBIBYTE if os.uname().sysname == "Darwin" else peak / 1024
 
 
-def resident_memory() -> int | None:
-    """Bytes of memory that this process holds now, or the most that it has held; None: the system does not tell."""
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    peak = peak_memory_mib()
-    return None if peak is None else int(peak * MEBIBYTE)
+def resident_memory() -> int:
+    """Bytes of memory that this process holds now."""
+    return int(psutil.Process().memory_info().rss)
 
 
 def return_freed_memory() -> None:
@@ -210,8 +211,6 @@ class MemoryBound:
     def keep(self) -> None:
         """Call once per step, when allocations of successive steps have similar sizes."""
         resident = resident_memory()
-        if resident is None:
-            return
         if self._waits:  # steps take what they need again: under the most of it there is nothing to return
             self._most, self._waits = max(self._most, resident), self._waits - 1
             self._bound = min(max(self._least, GROWTH * self._most), self._limit)
@@ -221,8 +220,7 @@ class MemoryBound:
 
     def clear(self) -> None:
         """Call between two operations whose allocations have different sizes, such as a view's targets and a step."""
-        resident = resident_memory()
-        if resident is not None and resident > PARTLY * self._limit:
+        if resident_memory() > PARTLY * self._limit:
             return_freed_memory()
 
     def between(self, items: Iterable[Item]) -> Iterator[Item]:
@@ -269,31 +267,24 @@ def network_address() -> str | None:
         return str(probe.getsockname()[0])
 
 
-def free_memory(group: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """Bytes of memory that this process may still take, as the system and its control group say; None: they do not.
+def free_memory(group: Path = Path("/sys/fs/cgroup")) -> int:
+    """Bytes of memory that this process may still take, as the system and its control group say.
 
     What a control group holds of files goes when memory is asked for, and counts as free.
     """
-    limits = []
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        limits += [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+    available = int(psutil.virtual_memory().available)
     with contextlib.suppress(OSError, ValueError):
         free = int((group / "memory.max").read_text()) - int((group / "memory.current").read_text())
         statistics = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-        limits.append(free + int(statistics.get("inactive_file", 0)) + int(statistics.get("active_file", 0)))
-    return max(0, min(limits)) if limits else None
+        files = int(statistics.get("inactive_file", 0)) + int(statistics.get("active_file", 0))
+        available = min(available, free + files)
+    return max(0, available)
 
 
-def machine_busy_seconds() -> float | None:
-    """Processor seconds that the whole machine has been busy, or None where the system does not tell."""
-    try:
-        fields = [int(x) for x in Path("/proc/stat").read_text().partition("\n")[0].split()[1:]]
-    except (OSError, ValueError):
-        return None
-    user, nice, system, _, _, irq, softirq, *rest = fields
-    steal = rest[0] if rest else 0
-    return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
+def machine_busy_seconds() -> float:
+    """Processor seconds that the whole machine has been busy."""
+    times = psutil.cpu_times()._asdict()
+    return float(sum(seconds for name, seconds in times.items() if name not in _NOT_BUSY))
 
 
 def process_is_alive(pid: int) -> bool:

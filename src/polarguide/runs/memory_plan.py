@@ -100,7 +100,7 @@ def share_memory(
     """
     largest = max(pixels, default=0)
     total = sum(pixels)
-    now = resident_memory() or 0
+    now = resident_memory()
     work = now + own
     pictures = 0 if in_memory else (KEPT - MASKS) * total
     masks = 0 if in_memory else (MASKS - 3) * total
@@ -113,10 +113,7 @@ def share_memory(
         if allowed < least:
             raise too_little(least, allowed, what, less)
     else:
-        free = free_memory()
-        if free is None:
-            return MemoryPlan(True, None, whole)
-        allowed = now + int(SHARE * free)
+        allowed = now + int(SHARE * free_memory())
     if whole <= allowed:
         return MemoryPlan(True, None, whole)
     filled = int(FILLED * allowed)

@@ -37,11 +37,8 @@ class Stopwatch:
     def read(self) -> tuple[float, bool]:
         """Seconds so far, and whether nothing else of weight ran beside."""
         wall = time.perf_counter() - self._start
-        machine = machine_busy_seconds()
-        alone = self._alone and machine is not None and self._machine is not None
-        if alone and machine is not None and self._machine is not None:
-            foreign = (machine - self._machine) - (time.process_time() - self._own)
-            alone = foreign <= FOREIGN_SHARE * wall + 0.5
+        foreign = (machine_busy_seconds() - self._machine) - (time.process_time() - self._own)
+        alone = self._alone and foreign <= FOREIGN_SHARE * wall + 0.5
         return self._before + wall - self._pause, alone
 
 

@@ -107,8 +107,12 @@ def check_model_files(folder: Path, kind: str) -> None:
         PolarguideError: a file is truncated, damaged, or has trailing bytes.
     """
     walkers: dict[str, Callable[[bytes], int]] = {
-        "cameras": _cameras, "images": _images, "points3D": _points, "rigs": _rigs, "frames": _frames,
-    }  # fmt: skip
+        "cameras": _cameras,
+        "images": lambda data: _lists(data, _image, "<Q", 24),
+        "points3D": lambda data: _lists(data, lambda _, at: at + 43, "<Q", 8),
+        "rigs": _rigs,
+        "frames": lambda data: _lists(data, lambda _, at: at + 64, "<I", 16),
+    }
     for name, walk in walkers.items():
         path = folder / (name + kind)
         if not path.exists():
@@ -180,27 +184,28 @@ def _cameras(data: bytes) -> int:
     return at
 
 
-def _images(data: bytes) -> int:
+def _lists(data: bytes, head: Callable[[bytes, int], int], counter: str, entry: int) -> int:
+    """The end of records that each have a head, a count, and as many entries of ``entry`` bytes.
+
+    ``head`` returns the end of the head at a place; ``counter`` is the type of the count, for ``struct``.
+    """
     (count,) = struct.unpack_from("<Q", data)
     at = 8
-    for _ in range(_at_most(count, len(data) // 73)):
-        if not all(map(math.isfinite, struct.unpack_from("<7d", data, at + 4))):
-            raise ValueError("an image whose pose is not finite")
-        name = data.find(b"\0", at + 64, at + 64 + _LONGEST_NAME)
-        if name < 0:
-            raise ValueError("an image without the end of its name")
-        (points,) = struct.unpack_from("<Q", data, name + 1)
-        at = name + 9 + 24 * _at_most(points, (len(data) - name) // 24)
+    for _ in range(_at_most(count, len(data) // 8)):
+        at = head(data, at)
+        (entries,) = struct.unpack_from(counter, data, at)
+        at += struct.calcsize(counter)
+        at += entry * _at_most(entries, (len(data) - at) // entry)
     return at
 
 
-def _points(data: bytes) -> int:
-    (count,) = struct.unpack_from("<Q", data)
-    at = 8
-    for _ in range(_at_most(count, len(data) // 51)):
-        (track,) = struct.unpack_from("<Q", data, at + 43)
-        at += 51 + 8 * _at_most(track, (len(data) - at) // 8)
-    return at
+def _image(data: bytes, at: int) -> int:
+    if not all(map(math.isfinite, struct.unpack_from("<7d", data, at + 4))):
+        raise ValueError("an image whose pose is not finite")
+    name = data.find(b"\0", at + 64, at + 64 + _LONGEST_NAME)
+    if name < 0:
+        raise ValueError("an image without the end of its name")
+    return name + 1
 
 
 def _rigs(data: bytes) -> int:
@@ -216,16 +221,6 @@ def _rigs(data: bytes) -> int:
                 at += 1 + 56 * bool(has_pose)
         if at > len(data):
             raise ValueError("a rig without its end")
-    return at
-
-
-def _frames(data: bytes) -> int:
-    (count,) = struct.unpack_from("<Q", data)
-    at = 8
-    for _ in range(_at_most(count, len(data) // 68)):
-        (pictures,) = struct.unpack_from("<I", data, at + 64)
-        at += 68
-        at += 16 * _at_most(pictures, (len(data) - at) // 16)
     return at
 
 

@@ -24,16 +24,16 @@ from PIL import Image
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.formats.arrays import array_kind
 from polarguide.capture.formats.decoders import (
+    TIFF,
     heif_head,
     heif_tags,
     is_heif,
     is_webp,
-    webp_chunks,
+    opened,
 )
 from polarguide.capture.formats.integrity import (
     LARGEST_PIXELS,
     ORIENTATION,
-    TIFF,
     jpeg_segments,
     png_chunk,
 )
@@ -220,27 +220,30 @@ def tags_of(data: bytes) -> dict[int, Any]:
 
     Pillow reads tags only: of pictures with 16 bits a channel it would return 8.
     """
-    tiff = data
-    if data.startswith(b"\xff\xd8"):
-        contents = (content for kind, content in jpeg_segments(data) if kind == 0xE1)
-        tiff = next((content[6:] for content in contents if content.startswith(b"Exif\0\0")), b"")
-    elif data.startswith(b"\x89PNG"):
-        tiff = png_chunk(data, b"eXIf") or b""
-    elif is_webp(data):
-        tiff = next((data[at:end] for kind, at, end in webp_chunks(data) if kind == b"EXIF"), b"")
-        tiff = tiff.removeprefix(b"Exif\0\0")
-    elif is_heif(data):
-        tiff = heif_tags(data).removeprefix(b"Exif\0\0")
-    if tiff[:4] not in TIFF:
-        return {}
     exif = Image.Exif()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            exif.load(tiff)
+            exif.load(_block_of_tags(data))
             return {**exif, **exif.get_ifd(_DIRECTORY)}
     except Exception:  # Pillow raises a dozen kinds for tags that are damaged, and promises none
         return {}
+
+
+def _block_of_tags(data: bytes) -> bytes:
+    """The EXIF block of a picture file, which is built like a TIFF file; empty where it has none."""
+    block = data
+    if data.startswith(b"\xff\xd8"):
+        contents = (content for kind, content in jpeg_segments(data) if kind == 0xE1)
+        block = next((content for content in contents if content.startswith(b"Exif\0\0")), b"")
+    elif data.startswith(b"\x89PNG"):
+        block = png_chunk(data, b"eXIf") or b""
+    elif is_webp(data):
+        block = opened(data).info.get("exif", b"")
+    elif is_heif(data):
+        block = heif_tags(data)
+    block = block.removeprefix(b"Exif\0\0")
+    return block if block[:4] in TIFF else b""
 
 
 _MAKER, _MODEL, _DIRECTORY = 271, 272, 34665

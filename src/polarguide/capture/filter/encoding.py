@@ -23,8 +23,8 @@ from polarguide.capture import checks
 from polarguide.capture.exposures import Angle
 from polarguide.capture.filter.camera_files import is_camera_raw, number_of, tags_of
 from polarguide.capture.filter.shots import Shots
-from polarguide.capture.formats.decoders import HIGH_RANGE, heif_colors, is_heif
-from polarguide.capture.formats.integrity import BIG_TIFF, PNG, TIFF, png_chunk
+from polarguide.capture.formats.decoders import BIG_TIFF, HIGH_RANGE, TIFF, heif_colors, is_heif
+from polarguide.capture.formats.integrity import PNG, png_chunk
 from polarguide.capture.formats.pictures import is_lossy, linear_codes, read_picture
 from polarguide.core.errors import PolarguideError, optional_import
 

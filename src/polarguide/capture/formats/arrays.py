@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import math
 import re
-import struct
 import tokenize
 import zipfile
 import zlib
@@ -159,7 +158,7 @@ def _array(data: bytes, kinds: str = "biuf") -> NDArray[Any]:
 
 
 _HDR_SIZE = re.compile(rb"[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
-_EXR_MAGIC, _EXR_PARTS = b"\x76\x2f\x31\x01", 0x1000
+_EXR_MAGIC = b"\x76\x2f\x31\x01"
 
 
 def read_radiance(path: Path) -> NDArray[np.float32]:
@@ -218,12 +217,8 @@ def _read_exr(path: Path, *choices: Sequence[str]) -> NDArray[Any]:
     found = "an empty file" if not data else "one that is damaged, cut short or something else"
     if data.startswith(_EXR_MAGIC):
         try:
-            exr_size(data)
+            exr_size(path)  # the package takes memory for all pixels as it opens them
             with in_utf8(path) as name, package.File(str(name), separate_channels=True) as file:
-                window = file.header()["dataWindow"]
-                width, height = (int(window[1][axis]) - int(window[0][axis]) + 1 for axis in (0, 1))
-                if not 0 < width * height <= LARGEST_PIXELS:
-                    raise ValueError(f"{width}x{height} pixels")
                 channels = file.channels()
                 for names in choices:
                     if all(name in channels for name in names):
@@ -251,31 +246,20 @@ def hdr_size(data: bytes) -> tuple[int, int] | None:
     return None if size is None or not data.startswith(b"#?") else (int(size[2]), int(size[1]))
 
 
-def exr_size(data: bytes) -> tuple[int, int]:
-    """Width and height of the last window in the headers of an OpenEXR file, before the package takes memory for it.
+def exr_size(path: Path) -> tuple[int, int]:
+    """Width and height of the last window in the headers of an OpenEXR file, of which nothing is decoded.
 
     Raises:
-        ValueError, struct.error: one is larger than any picture, or there is none.
+        ValueError: a window is larger than any picture.
+        Exception: of several kinds, where the file is damaged.
+        PolarguideError: the package OpenEXR is missing.
     """
-    if not data.startswith(_EXR_MAGIC):
-        raise ValueError("no OpenEXR file")
-    width = height = 0
-    (version,) = struct.unpack_from("<I", data, 4)
-    at, windowed = 8, False
-    while data[at : at + 1] not in (b"\0", b""):
-        while data[at : at + 1] not in (b"\0", b""):
-            name = data.index(b"\0", at)
-            kind = data.index(b"\0", name + 1)
-            (size,) = struct.unpack_from("<I", data, kind + 1)
-            if data[at:name] == b"dataWindow":
-                left, top, right, bottom = struct.unpack_from("<4i", data, kind + 5)
-                width, height, windowed = right - left + 1, bottom - top + 1, True
-                if min(width, height) < 1 or width * height > LARGEST_PIXELS:
-                    raise ValueError(f"{width}x{height} pixels")
-            at = kind + 5 + size
-        at += 1
-        if not version & _EXR_PARTS:
-            break
-    if not windowed:
-        raise ValueError("no size")
+    package = optional_import("OpenEXR", str(path))
+    with in_utf8(path) as name, package.File(str(name), header_only=True) as file:
+        windows = [part.header["dataWindow"] for part in file.parts]
+    sizes = [tuple(int(high) - int(low) + 1 for low, high in zip(*window, strict=True)) for window in windows]
+    width, height = max(sizes, key=math.prod)
+    if width * height > LARGEST_PIXELS:
+        raise ValueError(f"{width}x{height} pixels")
+    width, height = sizes[-1]
     return width, height

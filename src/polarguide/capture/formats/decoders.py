@@ -1,7 +1,8 @@
-"""Formats that OpenCV is not asked for: BMP, PGM, PPM, HEIC and TIFF, their samples and headers; headers of WebP."""
+"""Formats that OpenCV is not asked for: HEIC and TIFF, their samples and headers; headers of BMP, PGM, PPM and WebP."""
 
 from __future__ import annotations
 
+import contextlib
 import io
 import itertools
 import logging
@@ -10,11 +11,14 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
+from PIL import Image
+from PIL.BmpImagePlugin import BmpImageFile
+from PIL.WebPImagePlugin import WebPImageFile
 
 from polarguide.core.errors import optional_import
 
@@ -24,30 +28,38 @@ _PNM_HEAD = re.compile(
     rb"P[56](?:\s+|#[^\n]*\n)+?(\d{1,9})(?:\s+|#[^\n]*\n)+?(\d{1,9})(?:\s+|#[^\n]*\n)+?(\d{1,5})\s"
 )
 _LARGEST_HEAD = 4096
-_BMP_BITS = (8, 24, 32)
-_ANIMATED = 2
 
 
 @dataclass(frozen=True)
-class PlainHead:
-    """The header of an uncompressed file.
+class PnmHead:
+    """The header of a PGM or PPM file.
 
     Attributes:
-        size: width and height. channels: samples of a pixel. full: value of full scale.
-        start: where the samples begin. row: bytes of a row. rising: whether the lowest row comes first.
+        size: width and height. full: value of full scale. end: where the samples end.
     """
 
     size: tuple[int, int]
-    channels: int
     full: int
-    start: int
-    row: int
-    rising: bool = False
+    end: int
 
-    @property
-    def end(self) -> int:
-        """Where the samples end."""
-        return self.start + self.row * self.size[1]
+
+def pnm_head(data: bytes) -> PnmHead | None:
+    """The header of a PGM or PPM file; None where it has none that is read. Pillow does not tell full scale."""
+    match = _PNM_HEAD.match(data[:_LARGEST_HEAD])
+    if match is None:
+        return None
+    width, height, full = (int(text) for text in match.groups())
+    samples = width * height * (1 if data[:2] == b"P5" else 3)
+    end = match.end() + samples * (1 if full < 256 else 2)
+    return PnmHead((width, height), full, end) if 0 < full < 1 << 16 else None
+
+
+def pnm_damage(data: bytes) -> str | None:
+    """The damage that the structure of a PGM or PPM file shows, in words, or None."""
+    head = pnm_head(data)
+    if head is None:
+        return "a PGM or PPM file without a size and full scale"
+    return None if head.end <= len(data) else f"a PGM or PPM file cut short (it ends after {len(data)} bytes)"
 
 
 def is_webp(data: bytes) -> bool:
@@ -55,96 +67,47 @@ def is_webp(data: bytes) -> bool:
     return data[:4] == b"RIFF" and data[8:12] == b"WEBP"
 
 
-def plain_head(data: bytes) -> PlainHead | None:
-    """The header of a PGM, PPM or BMP file; None where it has none that is read."""
-    if data[:2] in PNM:
-        match = _PNM_HEAD.match(data[:_LARGEST_HEAD])
-        if match is None:
-            return None
-        width, height, full = (int(text) for text in match.groups())
-        channels = 1 if data[:2] == b"P5" else 3
-        row = width * channels * (1 if full < 256 else 2)
-        return PlainHead((width, height), channels, full, match.end(), row) if 0 < full < 1 << 16 else None
-    if data[:2] != BMP or len(data) < 54:
-        return None
-    start, head, width, height, _, bits, packing = struct.unpack_from("<IIiiHHI", data, 10)
-    if head < 40 or bits not in _BMP_BITS or packing or width <= 0 or not height:
-        return None
-    row = (width * bits // 8 + 3) // 4 * 4
-    return PlainHead((width, abs(height)), bits // 8, 255, start, row, rising=height > 0)
+def opened(data: bytes) -> BmpImageFile | WebPImageFile:
+    """A BMP or WebP file as Pillow opens it, which decodes nothing yet. It needs the whole of a WebP file.
 
-
-def plain_pixels(data: bytes, head: PlainHead) -> NDArray[Any]:
-    """The samples of a file that holds all that its header promises: [H, W] or [H, W, 3] in OpenCV's order.
-
-    Palettes of 8-bit BMP files are applied, unless they are the levels of gray.
+    Raises:
+        Exception: of several kinds, where the file is damaged.
     """
-    width, height = head.size
-    rows = np.frombuffer(data, np.uint8, head.row * height, head.start).reshape(height, head.row)
-    if data[:2] in PNM:
-        samples = rows if head.full < 256 else rows.view(">u2").astype(np.uint16)
-        pixels = samples.reshape(height, width, head.channels)
-        return pixels[..., 0].copy() if head.channels == 1 else pixels[..., ::-1].copy()
-    pixels = rows[:, : width * head.channels].reshape(height, width, head.channels)
-    pixels = pixels[::-1] if head.rising else pixels
-    if head.channels > 1:
-        return pixels[..., :3].copy()  # the fourth byte is padding
-    (length,) = struct.unpack_from("<I", data, 14)
-    (used,) = struct.unpack_from("<I", data, 46)
-    palette = np.zeros((256, 4), np.uint8)
-    stored = np.frombuffer(data[14 + length : min(head.start, 14 + length + 4 * (used or 256))], np.uint8)
-    palette[: len(stored) // 4] = stored[: len(stored) // 4 * 4].reshape(-1, 4)
-    colors = palette[:, :3]
-    gray = (colors == colors[:, :1]).all()
-    return np.asarray(colors[pixels[..., 0], 0] if gray else colors[pixels[..., 0]])
+    return (WebPImageFile if is_webp(data) else BmpImageFile)(io.BytesIO(data))
 
 
-def webp_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Kind, start and end of the contents of the chunks of a WebP file; the last may end beyond the file."""
-    at = 12
-    while at + 8 <= len(data):
-        kind, length = struct.unpack_from("<4sI", data, at)
-        yield kind, at + 8, at + 8 + length
-        at += 8 + length + length % 2
-
-
-def webp_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the header of a WebP file; None where there are none, or of an animation."""
-    for kind, at, _ in webp_chunks(data):
-        head = data[at : at + 10]
-        if len(head) < 10:
-            return None
-        if kind == b"VP8X":
-            if head[0] & _ANIMATED:
-                return None
-            return 1 + int.from_bytes(head[4:7], "little"), 1 + int.from_bytes(head[7:10], "little")
-        if kind == b"VP8L":
-            packed = int.from_bytes(head[1:5], "little")
-            return 1 + (packed & 0x3FFF), 1 + (packed >> 14 & 0x3FFF)
-        if kind == b"VP8 ":
-            width, height = struct.unpack_from("<HH", head, 6)
-            return width & 0x3FFF, height & 0x3FFF
-        return None
+def pillow_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height of a BMP or WebP file; None where there are none."""
+    with contextlib.suppress(Exception):
+        return opened(data).size
     return None
 
 
-def plain_damage(data: bytes) -> str | None:
-    """The damage that the structure of a BMP, PGM, PPM or WebP file shows, in words, or None."""
-    if is_webp(data):
-        if webp_size(data) is None:
-            return "a WebP file without a size, or an animated one"
-        chunks = list(webp_chunks(data))
-        return (
-            None if chunks[-1][2] <= len(data) else f"a WebP file cut short (it ends after {len(data)} bytes)"
-        )
-    name = "BMP" if data[:2] == BMP else "PGM or PPM"
-    head = plain_head(data)
-    if head is None:
-        kinds = "8, 24 or 32 bits a pixel, not compressed" if name == "BMP" else "a size and full scale"
-        return f"a {name} file without {kinds}"
-    if head.start < 2 or head.end > len(data):
-        return f"a {name} file cut short (it ends after {len(data)} bytes)"
-    return None
+def pillow_damage(data: bytes) -> str | None:
+    """The damage that the structure of a BMP or WebP file shows, in words, or None."""
+    name = "WebP" if is_webp(data) else "BMP"
+    end = 0
+    try:
+        picture = opened(data)
+        if isinstance(picture, BmpImageFile):
+            tile: Any = picture.tile[0]
+            _, (*_, height), start, (stored, row, _) = tile
+            if picture.info["compression"] or ";" in stored:
+                return "a BMP file without 8, 24 or 32 bits a pixel, not compressed"
+            if start != int.from_bytes(data[10:14], "little"):
+                return (
+                    "a BMP file that states no place of its pixels, of which decoders make different pictures"
+                )
+            end = start + row * height
+        elif picture.n_frames > 1:
+            return "an animated WebP file"
+    except Image.DecompressionBombError:  # its limit is higher than ours
+        return "a WebP file whose size is more than any camera takes"
+    except Exception:
+        end = len(data) + 1
+    return (
+        None if end <= len(data) else f"a {name} file cut short or damaged (it ends after {len(data)} bytes)"
+    )
 
 
 _BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif", b"avis")
@@ -359,7 +322,47 @@ def decode_tiff(data: bytes) -> NDArray[Any]:
     return pixels
 
 
+TIFF = (b"II*\0", b"MM\0*")
+BIG_TIFF = (b"II+\0", b"MM\0+")
 _LARGEST = 281
+_SIDES = [256, 257]
+_PLAIN_TYPES = (3, 4)
+"""Of width and height: unsigned numbers of 16 and 32 bits."""
+_LONG8 = 16
+
+
+def tiff_size(file: BinaryIO) -> tuple[int, int] | None:
+    """Width and height in the header of a TIFF or BigTIFF file, of which no more is read; see ``_plain_size``."""
+    with contextlib.suppress(Exception), tifffile.TiffFile(file) as opened:  # it raises what it pleases
+        return _plain_size(opened)
+    return None
+
+
+def _plain_size(file: tifffile.TiffFile) -> tuple[int, int] | None:
+    """Width and height; None where a side is not there, stands there twice or has another type than usual."""
+    tags = file.pages.first.tags
+    sides = [tag for code in _SIDES for tag in tags.getall(code) or ()]
+    types = (*_PLAIN_TYPES, _LONG8) if file.is_bigtiff else _PLAIN_TYPES
+    if [tag.code for tag in sides] != _SIDES or any(tag.dtype not in types for tag in sides):
+        return None
+    return int(sides[0].value), int(sides[1].value)
+
+
+def tiff_damage(data: bytes) -> str | None:
+    """The damage that the structure of a TIFF or BigTIFF file shows, in words, or None."""
+    name = "TIFF" if data[:4] in TIFF else "BigTIFF"
+    try:
+        with tifffile.TiffFile(io.BytesIO(data)) as file:
+            page = file.pages.first
+            (entries,) = struct.unpack_from(file.tiff.tagnoformat, data, page.offset)
+            spans = zip(page.dataoffsets, page.databytecounts, strict=False)
+            # It passes over entries whose values are not in the file.
+            whole = len(page.tags) == entries and all(at + size <= len(data) for at, size in spans)
+            if _plain_size(file) is None:
+                return f"a {name} file without one plain size"
+    except Exception:  # as above
+        whole = False
+    return None if whole else f"a {name} file cut short (it ends after {len(data)} bytes)"
 
 
 def tiff_full_scale(file: tifffile.TiffFile) -> int | None:

@@ -6,6 +6,7 @@ part. Parsing the structure first gives the same answer with every decoder.
 
 from __future__ import annotations
 
+import io
 import re
 import struct
 import zlib
@@ -13,35 +14,33 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from polarguide.capture.formats.decoders import (
+    BIG_TIFF,
     BMP,
     PNM,
+    TIFF,
     heif_damage,
     heif_head,
     is_heif,
     is_webp,
-    plain_damage,
-    plain_head,
-    webp_size,
+    pillow_damage,
+    pillow_size,
+    pnm_damage,
+    pnm_head,
+    tiff_damage,
+    tiff_size,
 )
 from polarguide.core.errors import PolarguideError
 
 PNG = b"\x89PNG\r\n\x1a\n"
 # Within JPEG scan data, 0xFF followed by 0 is a stuffed byte and by 0xD0-0xD7 a restart; all else ends it.
 _JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
-_TIFF_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
-_TIFF_CODES = {1: "B", 3: "H", 4: "I"}
 ORIENTATION = 274
-TIFF = (b"II*\0", b"MM\0*")
-BIG_TIFF = (b"II+\0", b"MM\0+")
 # Marks without a length: one that nobody uses, and restarts.
 _JPEG_ALONE = (0x01, *range(0xD0, 0xD8))
-MOST_ENTRIES = 4096
-"""Entries of a TIFF directory that are read: files have some thirty, and a count of BigTIFF may claim 2^64."""
 # Of a progressive JPEG file. Encoders write ten or so; each is decoded over the whole picture, be it empty or not.
 _MOST_SCANS = 200
 LARGEST_PIXELS = 150_000_000
 """More pixels than any camera has: a file that claims more is refused before memory is taken for it."""
-_TIFF_STRIPS = ((273, 279), (324, 325))
 
 
 def damaged(path: Path, expected: str, found: str) -> PolarguideError:
@@ -64,14 +63,12 @@ def find_damage(data: bytes) -> str | None:
         return _png_damage(data)
     if data.startswith(b"\xff\xd8"):
         return _jpeg_damage(data)
-    if data[:4] in TIFF:
-        if not _tiff_is_complete(data):
-            return f"a TIFF file cut short (it ends after {len(data)} bytes)"
-        return None if _tiff_size(data) is not None else "a TIFF file without one plain size"
-    if data[:4] in BIG_TIFF:  # the decoder finds what is cut short
-        return None if declared_size(data) is not None else "a BigTIFF file without one plain size"
-    if data[:2] == BMP or data[:2] in PNM or is_webp(data):
-        return plain_damage(data)
+    if data[:4] in (*TIFF, *BIG_TIFF):
+        return tiff_damage(data)
+    if data[:2] == BMP or is_webp(data):
+        return pillow_damage(data)
+    if data[:2] in PNM:
+        return pnm_damage(data)
     if is_heif(data):
         return heif_damage(data)
     return "a file of another kind"
@@ -83,15 +80,15 @@ def declared_size(data: bytes) -> tuple[int, int] | None:
         return struct.unpack_from(">II", data, 16) if data[12:16] == b"IHDR" and len(data) >= 24 else None
     if data.startswith(b"\xff\xd8"):
         return _jpeg_size(data)
-    if is_webp(data):
-        return webp_size(data)
-    if data[:2] == BMP or data[:2] in PNM:
-        head = plain_head(data)
+    if data[:2] == BMP or is_webp(data):
+        return pillow_size(data)
+    if data[:2] in PNM:
+        head = pnm_head(data)
         return None if head is None else head.size
     if is_heif(data):
         turned = heif_head(data)
         return None if turned is None else turned.size
-    return _tiff_size(data) if data[:4] in (*TIFF, *BIG_TIFF) else None
+    return tiff_size(io.BytesIO(data)) if data[:4] in (*TIFF, *BIG_TIFF) else None
 
 
 def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
@@ -139,47 +136,12 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
         yield kind, data[start:end]
 
 
-def tiff_entries(data: bytes) -> Iterator[tuple[int, int, int, int]]:
-    """Tag, type and count of the entries in the first directory of a TIFF or BigTIFF file, and places of their values.
-
-    Raises:
-        struct.error, OverflowError: the file is too short.
-    """
-    order, big = tiff_order(data), data[:4] in BIG_TIFF  # places and counts of BigTIFF have 64 bits
-    head, counter, place = ("HHQ", "Q", 12) if big else ("HHI", "H", 8)
-    (start,) = struct.unpack_from(order + head[2:], data, 8 if big else 4)
-    (count,) = struct.unpack_from(order + counter, data, start)
-    first, size = start + struct.calcsize(counter), 20 if big else 12
-    for at in range(first, first + size * min(count, MOST_ENTRIES), size):
-        yield *struct.unpack_from(order + head, data, at), at + place
-
-
-def tiff_order(data: bytes) -> str:
-    """The order of bytes of a TIFF file, for ``struct``."""
-    return "<" if data[:2] == b"II" else ">"
-
-
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
     for kind, content in jpeg_segments(data):
         if 0xC0 <= kind <= 0xCF and kind not in (0xC4, 0xC8, 0xCC) and len(content) >= 5:
             height, width = struct.unpack_from(">HH", content, 1)
             return width, height
     return None
-
-
-def _tiff_size(data: bytes) -> tuple[int, int] | None:
-    """The same of a TIFF or BigTIFF file; None where a side has another type than usual or stands there twice."""
-    codes = {3: "H", 4: "I", 16: "Q"} if data[:4] in BIG_TIFF else {3: "H", 4: "I"}
-    sides: dict[int, int] = {}
-    try:
-        for tag, kind, _, at in tiff_entries(data):
-            if tag in (256, 257):
-                if tag in sides or kind not in codes:
-                    return None
-                (sides[tag],) = struct.unpack_from(tiff_order(data) + codes[kind], data, at)
-    except (struct.error, OverflowError):
-        return None
-    return (sides[256], sides[257]) if len(sides) == 2 else None
 
 
 def _png_damage(data: bytes) -> str | None:
@@ -207,23 +169,3 @@ def _jpeg_damage(data: bytes) -> str | None:
     if kinds.count(0xDA) > _MOST_SCANS:
         return f"a JPEG file of {kinds.count(0xDA)} scans"
     return None if _jpeg_size(data) is not None else "a JPEG file without a size"
-
-
-def _tiff_is_complete(data: bytes) -> bool:
-    """Whether the first directory of a TIFF file and all of its strips or tiles lie within the file."""
-    order, tags = tiff_order(data), {}
-    try:
-        for tag, kind, length, place in tiff_entries(data):
-            size = length * _TIFF_SIZES.get(kind, 0)
-            at = place if size <= 4 else struct.unpack_from(order + "I", data, place)[0]
-            if at + size > len(data):
-                return False
-            if kind in _TIFF_CODES and any(tag in pair for pair in _TIFF_STRIPS):
-                tags[tag] = struct.unpack_from(f"{order}{length}{_TIFF_CODES[kind]}", data, at)
-    except struct.error:
-        return False
-    for offsets, sizes in _TIFF_STRIPS:
-        if offsets in tags and sizes in tags:
-            ends = (at + size for at, size in zip(tags[offsets], tags[sizes], strict=False))
-            return all(end <= len(data) for end in ends)
-    return True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
-import struct
+import re
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,29 +16,27 @@ from numpy.typing import NDArray
 
 from polarguide.capture.formats.arrays import BROKEN, array_header, exr_size, hdr_size
 from polarguide.capture.formats.decoders import (
+    BIG_TIFF,
+    BMP,
     JPEG_IN_TIFF,
+    TIFF,
     UnreadableTiffError,
     decode_tiff,
     heif_pixels,
     is_heif,
     is_webp,
-    plain_head,
-    plain_pixels,
+    pnm_head,
     rescaled,
     tiff_full_scale,
-    webp_chunks,
+    tiff_size,
 )
 from polarguide.capture.formats.integrity import (
-    BIG_TIFF,
     LARGEST_PIXELS,
-    MOST_ENTRIES,
     PNG,
-    TIFF,
     damaged,
     declared_size,
     find_damage,
     significant_bits,
-    tiff_order,
 )
 from polarguide.capture.view import FULL_CODE
 from polarguide.core.errors import PolarguideError
@@ -240,8 +238,8 @@ def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
     Raises:
         PolarguideError: the file is damaged, cut short, of another kind, or has samples that are no picture's.
     """
-    # TIFF goes to tifffile, PNG, JPEG and WebP to OpenCV once their structure is known to be whole, and to no other
-    # decoder: Pillow would return 8 bits of 16-bit color.
+    # TIFF goes to tifffile and HEIC to pillow-heif, the others to OpenCV once their structure is known to be whole, and
+    # none to Pillow: it would return 8 bits of 16-bit color.
     damage = find_damage(data)
     size = None if damage is not None else declared_size(data)
     if size is not None and size[0] * size[1] > LARGEST_PIXELS:
@@ -249,7 +247,6 @@ def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
     if damage is not None:
         raise _unreadable(path, damage)
     pixels = None
-    head = plain_head(data)
     if data[:4] in (*TIFF, *BIG_TIFF):
         try:
             pixels = decode_tiff(data)
@@ -263,8 +260,6 @@ def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
             ) from None
         except Exception:  # tifffile and its codecs raise what they please for damaged files
             pixels = None
-    elif head is not None:
-        return plain_pixels(data, head)
     elif is_heif(data):
         try:
             return heif_pixels(path, data)
@@ -277,6 +272,8 @@ def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
     else:
         with contextlib.suppress(cv2.error):
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if pixels is not None and data[:2] == BMP and pixels.ndim == 3:
+            pixels = pixels[..., :3]  # the fourth byte is padding
     if pixels is None:
         _require_room(path, size)
         raise _unreadable(path, "one that cannot be decoded")
@@ -303,7 +300,8 @@ def is_lossy(path: Path) -> bool:
 def _loses_detail(data: bytes) -> bool:
     """True where the compression of a picture changes its values. The content decides, not the suffix."""
     if is_webp(data):
-        return any(kind == b"VP8 " for kind, _, _ in webp_chunks(data))
+        kind = re.search(rb"VP8[ L]", data)  # the name of the first chunk that holds pixels
+        return kind is not None and kind[0] == b"VP8 "
     if data[:4] in (*TIFF, *BIG_TIFF):
         with tifffile.TiffFile(io.BytesIO(data)) as tiff:
             return int(tiff.pages.first.compression) in JPEG_IN_TIFF
@@ -328,7 +326,7 @@ def stated_full_scale(path: Path, file: BinaryIO, samples: NDArray[Any]) -> int 
     if head.startswith(PNG):
         return _full_of_significant(colors, significant_bits(head))
     full = None
-    plain = plain_head(head)
+    plain = pnm_head(head)
     if plain is not None:
         full = plain.full if plain.full < np.iinfo(samples.dtype).max else None
     elif head[:4] in (*TIFF, *BIG_TIFF):
@@ -409,14 +407,16 @@ def stated_size(path: Path) -> tuple[int, int] | None:
     """
     if not path.is_file():  # a pipe, a folder, a link to nowhere: whoever reads it says so
         return None
-    with contextlib.suppress(struct.error, OverflowError, *BROKEN), open(path, "rb") as file:
+    with contextlib.suppress(*BROKEN), open(path, "rb") as file:
         start = file.read(16)
         if start[:4] in (*TIFF, *BIG_TIFF):
-            return declared_size(_directory(file, start))
-        head = start + file.read(HEAD)
+            file.seek(0)
+            return tiff_size(file)
+        head = start + file.read(LARGEST_FILE if is_webp(start) else HEAD)
         suffix = path.suffix.lower()
-        reader = {".hdr": hdr_size, ".exr": exr_size, ".npy": _array_size}.get(suffix, declared_size)
-        return reader(head)
+        if suffix == ".exr":
+            return exr_size(path)
+        return {".hdr": hdr_size, ".npy": _array_size}.get(suffix, declared_size)(head)
     return None
 
 
@@ -429,14 +429,6 @@ def read_picture(path: Path) -> bytes:
     size = stated_size(path)
     largest = ROOM if size is None else min(LARGEST_FILE, ROOM + LARGEST_PIXEL * size[0] * size[1])
     return read_file(path, largest=largest)
-
-
-def _directory(file: BinaryIO, start: bytes) -> bytes:
-    """The head of a TIFF file with its first directory right behind it, wherever it stands in the file."""
-    big = start[:4] in BIG_TIFF
-    place, head = tiff_order(start) + ("Q" if big else "I"), 8 if big else 4
-    file.seek(struct.unpack_from(place, start, head)[0])
-    return start[:head] + struct.pack(place, head + struct.calcsize(place)) + file.read(20 * MOST_ENTRIES)
 
 
 def _array_size(head: bytes) -> tuple[int, int] | None:

@@ -61,7 +61,7 @@ def require_room(texture: int) -> None:
         PolarguideError: the texture does not fit.
     """
     needed, free = BYTES_PER_TEXEL * texture**2, free_memory()
-    if free is not None and needed > free:
+    if needed > free:
         raise PolarguideError(
             "--texture",
             expected=f"a texture that fits into {free / 1e9:.1f} GB of free memory",
