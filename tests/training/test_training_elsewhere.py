@@ -44,7 +44,9 @@ def test_a_step_of_every_stage_stays_there_and_waits_for_nothing(tiny_scene: Sce
         for step in stages.values():
             for again in (False, True):
                 trainer.state.step, before = step, device.waits
-                trainer._backpropagate(0, trainer.schedule.at(step).stage, True)
+                stage = trainer.schedule.at(step).stage
+                trainer._act((), stage)
+                trainer._backpropagate(0, stage, True)
                 trainer._join_gradients(idle=False)
                 trainer._optimize()
                 assert not again or device.waits == before, step
@@ -96,7 +98,7 @@ def test_what_a_recipe_begins_and_ends_with(tiny_scene: Scene, tmp_path: Path, n
         with OtherDevice():
             trainer = make_trainer(tiny_scene, RECIPES[name], STEPS, backend=backend)
             if RECIPES[name].oriented:
-                trainer._act("orient_normals")
+                trainer._act(("orient_normals",), RECIPES[name].stages[0])
                 outward.append(trainer.state.gaussians["outward"].detach().to("cpu"))
             write_run_ply(tmp_path / "run.ply", trainer.state, trainer.shading)
         written.append(read_ply(tmp_path / "run.ply"))

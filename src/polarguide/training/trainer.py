@@ -7,7 +7,7 @@ there and asks nothing back.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -127,10 +127,7 @@ class Trainer:
         position = self.schedule.at(state.step)
         stage = position.stage
         self.whole = not position.actions
-        for action in position.actions:
-            self._actions[action]()
-        if self._needs_first_priors(stage):
-            self._refresh_priors()
+        self._act(position.actions, stage)
         mine = self.ranks.slots(views)
         # A rank without a view renders the first one, so that it knows what has gradients, and adds nothing.
         measured = [self._backpropagate(slot, stage, bool(mine)) for slot in mine or range(1)]
@@ -187,6 +184,13 @@ class Trainer:
         state = self.state
         view = self._view_of(state.step * self.settings.views_per_step + slot)
         return self._feed.targets(state.step, view, stage.weights, state.frozen)
+
+    def _act(self, actions: Sequence[Action], stage: Stage) -> None:
+        """Do the actions that are due before a step, and compute priors that the step needs."""
+        for action in actions:
+            self._actions[action]()
+        if self._needs_first_priors(stage):
+            self._refresh_priors()
 
     def _needs_first_priors(self, stage: Stage) -> bool:
         """True where the views of a step need priors that no action has computed so far."""
