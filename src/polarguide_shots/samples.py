@@ -15,19 +15,19 @@ from torch import Tensor
 
 from polarguide.capture import checks
 from polarguide.capture.calibration import ANGLES, Calibration
+from polarguide.capture.develop import stated_exposures
 from polarguide.capture.exposures import Angle, Exposure, analyzers, turned
 from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
-from polarguide.capture.filter.encoding import VIDEO, kind_of_file, transfer_of_set
+from polarguide.capture.filter.encoding import VIDEO, kind_of_file, transfer_of_pictures
 from polarguide.capture.filter.shots import Shots, read_stack, stacked
 from polarguide.capture.formats.decoders import rescaled
 from polarguide.capture.formats.pictures import linear_codes
 from polarguide.capture.layout import require_memory
 from polarguide.capture.picture_sets import Mask, SetSamples
 from polarguide.capture.sensor.pattern import FULL_16, Levels, clipping_bits, estimate_levels
-from polarguide.capture.view import View
+from polarguide.capture.view import FULL_CODE, View
 from polarguide.capture.view_reader import ViewData, require_alike
 from polarguide.core.errors import PolarguideError
-from polarguide.preparation.shot_exposures import stated_exposures
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.sets import SetPicture, known_places, read_frames
 
@@ -121,7 +121,9 @@ def _samples(
     every, step = np.arange(np.iinfo(kind).max + 1, dtype=kind), 1 / float(np.iinfo(kind).max)
     if levels is not None:
         every, step = rescaled(every, levels.white), 1 / levels.white
-    decision = transfer_of_set(files, options.transfer, _judged(read, every), angles, video=film)
+    decision = transfer_of_pictures(
+        files, options.transfer, lambda: [(_judged(read, every), angles)], video=film
+    )
     transfer = decision.transfer
     linear = linear_codes(every, transfer)
     as_stored = levels is None and kind == np.uint16 and transfer == "linear"
@@ -261,11 +263,7 @@ def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:
     """The gain of each picture: as the table states, else as the files state their exposure; and notes."""
     gains = [picture.gain for picture in pictures]
     if all(gain is None and picture.frame is None for gain, picture in zip(gains, pictures, strict=True)):
-        stated, missing = stated_exposures({"": [picture.path for picture in pictures]})
-        if stated:
-            return stated[""], [corrected_note(stated[""])]
-        if missing:
-            return [1.0] * len(pictures), [missing]
+        return stated_of_shot([picture.path for picture in pictures])
     return [1.0 if gain is None else gain for gain in gains], []
 
 
@@ -302,13 +300,25 @@ def behind_lens(view: View, intensities: Tensor, exposures: Sequence[Exposure]) 
     return intensities + torch.einsum("ksyx,syxc->kyxc", more, view.stokes()[1:]) / 2
 
 
-def samples_of_loaded(view: View, dark: Mask, saturated: Mask, step: float) -> SetSamples:
+def state_of(view: View) -> tuple[Mask, Mask, float]:
+    """Dark and saturated pixels of a view, and one stored value as a share of full scale."""
+    codes = view.codes.numpy()
+    peak, lost = codes.max(axis=(0, 3)), view.saturated.numpy()
+    # Of pixels without polarization information, those nearer to black than to the brightest of the view are dark.
+    dark = (lost & (peak < peak.max() / 2)) | (peak == 0)
+    # Codes are multiples of what one stored value is, unless they were decoded or averaged.
+    step = int(np.gcd.reduce(np.flatnonzero(np.bincount(codes.ravel()))))
+    return dark, lost & ~dark, max(step, 1) / FULL_CODE
+
+
+def samples_of_loaded(view: View) -> SetSamples:
     """The samples of a view as loaded: with its mask, its exposures, and rays through a filter before the lens.
 
     Raises:
         PolarguideError: its known pictures do not determine Stokes vectors.
     """
     places = known_places(view.name, view.exposures)
+    dark, saturated, step = state_of(view)
     exposures = [replace(view.exposures[k], gain=1.0) for k in places]
     intensities = behind_lens(view, view.intensities()[places], exposures)
     invalid = view.invalid.numpy()
@@ -335,6 +345,12 @@ def _unused(count: int) -> tuple[str, ...]:
     return (f"{count} pictures without a known angle are not used.",) if count else ()
 
 
-def corrected_note(stated: Sequence[float]) -> str:
-    """The exposures of a single shot that its files state, for the user."""
-    return f"The files state exposures that differ by a factor of {max(stated) / min(stated):.3g}; corrected."
+def stated_of_shot(paths: Sequence[Path]) -> tuple[list[float], list[str]]:
+    """The relative exposures that the files of a single shot state, else ones; and notes for the user."""
+    stated, missing = stated_exposures({"": paths})
+    exposures = stated.get("", [1.0] * len(paths))
+    factor = f"{max(exposures) / min(exposures):.3g}" if stated else ""
+    corrected = (
+        f"The files state exposures that differ by a factor of {factor}; corrected." if stated else missing
+    )
+    return exposures, [corrected] if corrected else []
