@@ -50,7 +50,6 @@ from polarguide_shots.maps import (
     Mask,
     NoiseModel,
     Part,
-    averaged_factor,
     estimated_noise,
     given_noise,
     interpolation_factors,
@@ -91,8 +90,7 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     files.require_kind(sample_blocks(values, SIDE), levels)
     assert options.sensor is not None
     blocks = [sample_blocks(values, 2 * pattern.period)]
-    angles, _, usable = files.light_of_blocks(blocks, levels, dark, values.shape)
-    ratio = pair_ratio(angles, usable)
+    ratio, _ = files.light_of_blocks(blocks, levels, dark, values.shape)
     gains, gain_notes = gains_of(ratio, options, _GAINS)
     mode, way = options.demosaic, options.interpolation
     step = DEMOSAIC_MODES[mode]
@@ -115,7 +113,7 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     dark_pixels, masked = (
         spoiled(samples, pattern, mode=mode, interpolation=way) for samples in (black, defective)
     )
-    factors = interpolation_factors(options.sensor, x, y, mode)
+    factors, averaged = interpolation_factors(options.sensor, x, y, mode)
     turned = np.broadcast_to(factors.mean(axis=0), factors.shape)  # one that mixes all four angles
     return Developed(
         intensities=oriented(picture.intensities, options.calibration),
@@ -124,7 +122,7 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
         masked=masked,
         noise=noise,
         factors=oriented(factors, options.calibration) if options.calibration.permutes else turned,
-        mean_variance=averaged_factor(options.sensor, x, y, mode),
+        mean_variance=averaged,
         pair_ratio=ratio,
         notes=(*notes, *gain_notes),
         origin=(0, 0) if cut is None else (cut[1].start // step, cut[0].start // step),
@@ -138,7 +136,7 @@ def _levels_of(
     """Black, full scale and saturation of a mosaic, and notes of what its type does not imply."""
     container, full = 8 * stored.dtype.itemsize, None
     if shot.stored is None:
-        container, full = files.container(shot.files[0], stored), files.full_scale(shot.files[0], stored)
+        container, full = files.depth(shot.files[0], stored)
     levels = estimate_levels(
         int(stored.max()),
         int(np.bitwise_or.reduce(stored, None)),
@@ -210,9 +208,6 @@ def develop(shot: ExposureSet, options: ShotOptions, part: Part | None = None) -
     Raises:
         PolarguideError: one is missing, cannot be read, or does not fit the others or the options.
     """
-    if shot.fault is not None:
-        raise shot.fault
-    options.require_kind(shot.kind, shot.name)
     if shot.kind == "mosaic":
         try:
             return develop_mosaic(shot, options, part)
@@ -234,9 +229,6 @@ def set_samples(shot: ExposureSet, options: ShotOptions) -> SetSamples | None:
     Raises:
         PolarguideError: a file is missing, cannot be read, or does not fit the others or the options.
     """
-    if shot.fault is not None:
-        raise shot.fault
-    options.require_kind(shot.kind, shot.name)
     if shot.kind == "set" and shot.stored is not None:
         return samples_of_arrays(shot.name, shot.stored, shot.angles, options)
     if shot.kind == "set":

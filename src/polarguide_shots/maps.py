@@ -216,26 +216,21 @@ def noise_line(x: NDArray[np.float64], y: NDArray[np.float64], least: float) -> 
     return max(float(floor), least), max(float(slope), 0.0)
 
 
-def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> NDArray[np.float32]:
-    """Variance of each developed intensity, as a multiple of a sample's: [4, p, p] over a period p of the pattern.
+@lru_cache(maxsize=8)
+def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> tuple[NDArray[np.float32], float]:
+    """Variance of developed intensities, as a multiple of a sample's: of each, and of the mean of many.
 
     Interpolated values are means of samples and have less noise. The weights of the samples are the responses of the
     demosaicing to an impulse at each position of the pattern. Guided interpolation, which is not linear, is taken to be
-    bilinear, and luminance as the mean of the colors. ``x`` and ``y`` are where the pattern of the sensor begins.
+    bilinear, and luminance as the mean of the colors.
+
+    Args:
+        sensor: name of the sensor. x, y: column and row at which its pattern begins. mode: of demosaicing.
+
+    Returns:
+        Factors [4, p, p] over a period p of the pattern. Variance of the mean of many intensities times their number:
+        more than the mean of the factors, as interpolated neighbors share samples.
     """
-    return _variances(sensor, x, y, mode)[0]
-
-
-def averaged_factor(sensor: str, x: int, y: int, mode: str) -> float:
-    """Variance of the mean of many developed intensities, times their number, as a multiple of a sample's: more than
-    the mean of ``interpolation_factors``, as interpolated neighbors share samples.
-    """
-    return _variances(sensor, x, y, mode)[1]
-
-
-@lru_cache(maxsize=8)
-def _variances(sensor: str, x: int, y: int, mode: str) -> tuple[NDArray[np.float32], float]:
-    """``interpolation_factors`` and ``averaged_factor``."""
     pattern = sensor_pattern(sensor).shifted(x, y)
     side, step = 4 * _REACH, DEMOSAIC_MODES[mode]
     period, cell = max(1, pattern.period // step), max(pattern.period, step)

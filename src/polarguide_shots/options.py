@@ -75,10 +75,6 @@ class ShotOptions(RawOptions):
             )
         return self
 
-    def changed(self) -> list[str]:
-        """Names of the options that are not as they are by default."""
-        return changed(self)
-
     def called(self, name: str) -> str:
         """Name of an option in messages; of the calibration, its contents."""
         if name == "calibration":

@@ -83,6 +83,9 @@ def read_shot(
                 remedy="find_shots lists them; read them one by one.",
             )
         shot = found[0]
+    if shot.fault is not None:
+        raise shot.fault
+    options.require_kind(shot.kind, shot.name)
     samples = set_samples(shot, options)
     if samples is not None:
         return maps_of_set(shot.name, shot.paths, samples, options)

@@ -6,7 +6,7 @@ Whole captures and single shots are developed here. Callers choose the pictures 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from polarguide.capture.calibration import (
     Gains,
     balancing_gains,
     oriented,
+    pair_ratio,
 )
 from polarguide.capture.checks import measured_gains, pair_moments
 from polarguide.capture.filter.camera_files import (
@@ -145,13 +146,12 @@ class MosaicFiles:
         values = values[:, ::-1] if flip in ("x", "xy") else values
         return values[::-1] if flip in ("y", "xy") else values
 
-    def container(self, path: Path, values: NDArray[Any]) -> int:
-        """Bits that a pixel takes in the file."""
-        return self._raw.container(path, values.dtype)
-
-    def full_scale(self, path: Path, values: NDArray[Any]) -> int | None:
-        """The full scale that a file states for its values; None where it does not, or where ``bits`` says it."""
-        return self._raw.full_scale(path, values) if self._options.bits is None else None
+    def depth(self, path: Path, values: NDArray[Any]) -> tuple[int, int | None]:
+        """Bits that a pixel takes in a file, and the full scale that it states for its values: None where it states
+        none, or where ``bits`` says it.
+        """
+        stated = self._raw.full_scale(path, values) if self._options.bits is None else None
+        return self._raw.container(path, values.dtype), stated
 
     def require_kind(self, blocks: NDArray[Any], levels: Levels) -> None:
         """Refuse mosaics of the other kind of sensor: nothing later would tell."""
@@ -182,11 +182,11 @@ class MosaicFiles:
         levels: Levels,
         dark: NDArray[np.float32] | None,
         shape: tuple[int, ...],
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Intensities at the centers of blocks: by angle [4, N], by color [3, N], and whether each is usable [N].
+    ) -> tuple[float | None, NDArray[np.float64]]:
+        """The ratio of the pair sums, None where it is too dark to tell, and colors [3, N] of usable blocks.
 
         Samples of different angles lie beside one another; weights that interpolate all of them to the center of a
-        block of two periods keep gradients of the picture out of the ratio of the pair sums.
+        block of two periods keep gradients of the picture out of the ratio.
 
         Args:
             samples: ``sample_blocks`` of two periods from each mosaic.
@@ -216,8 +216,8 @@ class MosaicFiles:
             filters = np.tile(self.pattern.colors, (2, 2))
             colors = np.stack([weighted[:, filters == c].sum(axis=1) for c in range(3)]) / [[4], [8], [4]]
         base = levels.black if floor is None else floor
-        usable = (values < levels.saturation).all(axis=(1, 2)) & (values > base).any(axis=(1, 2))
-        return angles, colors, np.asarray(usable)
+        usable = np.asarray((values < levels.saturation).all(axis=(1, 2)) & (values > base).any(axis=(1, 2)))
+        return pair_ratio(angles, usable), colors[:, usable]
 
     def linear(
         self,
@@ -415,6 +415,27 @@ def exposures_of_view(
 def _gains(logs: NDArray[np.float64]) -> Gains:
     first, second, third, fourth = (float(value) for value in np.exp(logs))
     return first, second, third, fourth
+
+
+COMPARABLE = "Keep one kind: their brightness cannot be compared."
+"""What to do about several kinds of files in one capture or set."""
+
+
+def require_one(where: Path, found: Iterable[tuple[str, Path]], expected: str, remedy: str) -> None:
+    """Refuse pictures that differ in what they should share, such as their size; the first file of each is named.
+
+    Args:
+        where: their folder. found: of each file, what it has, and its path. expected, remedy: for the message.
+
+    Raises:
+        PolarguideError: two differ.
+    """
+    first: dict[str, Path] = {}
+    for name, path in found:
+        first.setdefault(name, path)
+    if len(first) > 1:
+        named = " and ".join(f"{name} ({path.name})" for name, path in list(first.items())[:4])
+        raise PolarguideError(where, expected=expected, found=named, remedy=remedy)
 
 
 def levels_of_shots(

@@ -22,12 +22,14 @@ from polarguide.capture.calibration import (
 )
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.develop import (
+    COMPARABLE,
     as_displayed,
     exposure_notes,
     exposures_of_view,
     gains_of,
     levels_of_shots,
     light_of_files,
+    require_one,
     stated_exposures,
 )
 from polarguide.capture.exposures import Angle, angle_text, turned
@@ -349,16 +351,13 @@ class SinglesSource(ShotsSource):
             PolarguideError: the photographs are too large, or not of one size.
         """
         self._require_memory("photographs of a view")
-        sizes: dict[str, Path] = {}  # but for the side they were held on
-        for path in self._shots:
-            size = None if is_camera_raw(path) else stated_size(path)
-            if size is not None:
-                sizes.setdefault(f"{max(size)}x{min(size)}", path)
-        self._require_one(sizes, "size", "Export all pictures of one camera alike, without a crop.")
-        kinds: dict[str, Path] = {}
-        for path in self._shots:
-            kinds.setdefault(kind_of_file(path), path)
-        self._require_one(kinds, "kind of file", "Keep one kind: their brightness cannot be compared.")
+        stated_sizes = ((stated_size(path), path) for path in self._shots if not is_camera_raw(path))
+        # Width and height may be exchanged by the side that the camera was held on.
+        sizes = ((f"{max(size)}x{min(size)}", path) for size, path in stated_sizes if size is not None)
+        alike = "Export all pictures of one camera alike, without a crop."
+        require_one(self._root, sizes, "photographs of one size", alike)
+        kinds = ((kind_of_file(path), path) for path in self._shots)
+        require_one(self._root, kinds, "photographs of one kind of file", COMPARABLE)
         levels, counted = levels_of_shots(self._shots, self._white, self._settings)
         decision = self._decided(levels)
         stated, missing = light_of_files(self._of_view, advance)
@@ -392,18 +391,6 @@ class SinglesSource(ShotsSource):
         ]
         upright = np.stack([apply_orientation(picture, code) for picture in developed.linear])
         return self._developed(developed, upright, {"exposures": exposures}, angles)
-
-    def _require_one(self, values: dict[str, Path], what: str, remedy: str) -> None:
-        """Refuse photographs of two cameras, sizes or kinds of files: the first photograph of each, by its name.
-
-        Raises:
-            PolarguideError: there are two.
-        """
-        if len(values) > 1:
-            names = [f"{name} ({path.name})" for name, path in list(values.items())[:2]]
-            raise PolarguideError(
-                self._root, expected=f"photographs of one {what}", found=" and ".join(names), remedy=remedy
-            )
 
     def _angles(self, view: str) -> list[Angle]:
         return [shot.angle for shot in self._singles[view]]

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.calibration import UNIDENTIFIED, oriented, pair_ratio
+from polarguide.capture.calibration import UNIDENTIFIED, oriented
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.datasets.dataset import Dataset, resized_mask
 from polarguide.capture.develop import QUARTER_TURNS, MosaicFiles, gains_of, sample_blocks
@@ -118,8 +118,7 @@ class MosaicSource(Source):
             values = self._mosaics.read(path)
             shape = shape or (values.shape, values.dtype)
             self._require_alike(path, values, shape)
-            container = self._mosaics.container(path, values)
-            stated[path] = self._mosaics.full_scale(path, values)
+            container, stated[path] = self._mosaics.depth(path, values)
             counts += np.bincount(values.ravel(), minlength=len(counts))
             cut = self._mosaics.cut(values)
             samples.append(sample_blocks(cut, 2 * self._pattern.period))
@@ -136,15 +135,14 @@ class MosaicSource(Source):
         if self._dataset is None:
             self._mosaics.require_kind(np.concatenate(blocks), levels)
         dark = self._mosaics.dark(shape[0])
-        angles, colors, usable = self._mosaics.light_of_blocks(samples, levels, dark, cut.shape)
-        ratio = pair_ratio(angles, usable)
+        ratio, colors = self._mosaics.light_of_blocks(samples, levels, dark, cut.shape)
         gains, notes = gains_of(ratio, settings, _GAINS if settings.gains == "auto" else {})
         notes += [] if self._dataset is None else self._dataset.notes
         notes += level_notes(levels, counts, container, settings.bits, full)
         standing_out = int(self._defects(levels).sum())
         if standing_out:
             notes.append(defects_note(standing_out, shape[0][0] * shape[0][1]))
-        white = self._white or gray_world(colors[:, usable])
+        white = self._white or gray_world(colors)
         peak = max(white) / min(gains) * settings.calibration.peak
         analyzers = self._mosaics.analyzers
         if analyzers is not None:
