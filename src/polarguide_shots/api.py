@@ -9,6 +9,7 @@ from pathlib import Path
 from polarguide.capture import Scene
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.metadata import refractive_index_of
+from polarguide.capture.raw_options import changed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
 from polarguide.core.options import PathLike, SceneOptions, index_of
@@ -121,11 +122,11 @@ def _index_from_scene_json(paths: Sequence[PathLike]) -> float | None:
 
 def _require_options_of_maps(shots: ShotOptions, *, maps: bool) -> None:
     """Refuse options of shots that mean nothing for views of a scene; ``maps``: maps are written."""
-    changed = [name for name in shots.changed() if not (maps and name in _OF_MAPS)]
-    if changed:
-        more = " With --formats it applies to the maps." if changed[0] in _OF_MAPS else ""
+    given = [name for name in changed(shots) if not (maps and name in _OF_MAPS)]
+    if given:
+        more = " With --formats it applies to the maps." if given[0] in _OF_MAPS else ""
         raise PolarguideError(
-            shots.called(changed[0]),
+            shots.called(given[0]),
             expected="shots",
             found="a scene with poses",
             remedy=f"Leave it out: the scene has developed pictures and cameras.{more}",

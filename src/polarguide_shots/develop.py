@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture import checks
-from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented, pair_ratio
+from polarguide.capture.calibration import UNIT_GAINS, oriented, pair_ratio
+from polarguide.capture.develop import (
+    MosaicFiles,
+    as_displayed,
+    calibration_of,
+    exposures_of_view,
+    gains_of,
+    sample_blocks,
+)
 from polarguide.capture.exposures import FOUR
-from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
+from polarguide.capture.filter.camera_files import apply_orientation
 from polarguide.capture.filter.develop import align_shots, estimate_shifts, linear_intensities, moved_shots
-from polarguide.capture.filter.encoding import transfer_of_set
+from polarguide.capture.filter.encoding import transfer_of_pictures
 from polarguide.capture.filter.shots import _READ, Shots, read_stack, require_four_shots, stacked
 from polarguide.capture.layout import (
     KEPT,
@@ -24,8 +31,6 @@ from polarguide.capture.layout import (
     require_memory_of_each,
     select_views,
 )
-from polarguide.capture.sensor.analyzer_file import read_analyzers
-from polarguide.capture.sensor.analyzers import AnalyzerCalibration, spread_to_cells
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic, spoiled
 from polarguide.capture.sensor.pattern import (
     SENSOR_SIZES,
@@ -33,24 +38,19 @@ from polarguide.capture.sensor.pattern import (
     Levels,
     Pattern,
     estimate_levels,
-    tiled,
     unusable_samples,
 )
 from polarguide.capture.view import ANGLES, FULL_CODE, View
 from polarguide.capture.view_reader import ViewData, read_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_file
-from polarguide.preparation.mosaic_source import MosaicFiles, block_intensities, sample_blocks
-from polarguide.preparation.shot_exposures import exposures_of_view, stated_exposures
 from polarguide_shots.maps import (
     Developed,
     Map,
     Mask,
     NoiseModel,
     Part,
-    averaged_factor,
     estimated_noise,
-    gains_of,
     given_noise,
     interpolation_factors,
 )
@@ -58,36 +58,43 @@ from polarguide_shots.options import ShotOptions
 from polarguide_shots.samples import (
     SetSamples,
     behind_lens,
-    corrected_note,
     levels_of_shot,
     piled_up,
     read_set,
     samples_of_arrays,
-    samples_of_loaded,
     samples_of_view,
+    state_of,
+    stated_of_shot,
 )
-from polarguide_shots.sets import ExposureSet, known_places
+from polarguide_shots.sets import ExposureSet
 
 AROUND = 32
 """Pixels around a part that are developed with it: more than any interpolation reaches."""
 
 
+_GAINS = {
+    "off": "I0 + I90 is {:+.2%} off I45 + I135: the angles or the encoding are probably wrong.",
+    "corrected": "I0 + I90 is {:+.2%} off I45 + I135; corrected.",
+    "left": "I0 + I90 is {:+.2%} off I45 + I135; not corrected (--gains auto does, a calibration does better).",
+}
+
+
 def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -> Developed:
-    files = MosaicFiles(options.preparation())
-    stored, container, full = _stored(shot, files)
+    files = MosaicFiles(options)
+    stored = files.read(shot.where, shot.stored)
     pattern = files.pattern
     _require_on_sensor(shot.where, stored.shape, options)
     dark = files.dark(stored.shape)
     values = files.cut(stored)
-    levels, notes = _levels_of(stored, container, full, options)
+    levels, notes = _levels_of(shot, stored, files, options)
     files.require_kind(sample_blocks(values, SIDE), levels)
     assert options.sensor is not None
-    x, y = options.offset_x + files.crop[0], options.offset_y + files.crop[1]
-    analyzers = _analyzers(stored.shape, options)
-    ratio = _ratio_of(values, dark, levels, pattern, None if analyzers is None else (analyzers, (x, y)))
-    gains, gain_notes = gains_of(ratio, options)
+    blocks = [sample_blocks(values, 2 * pattern.period)]
+    ratio, _ = files.light_of_blocks(blocks, levels, dark, values.shape)
+    gains, gain_notes = gains_of(ratio, options, _GAINS)
     mode, way = options.demosaic, options.interpolation
     step = DEMOSAIC_MODES[mode]
+    x, y = files.corner
     cut = _cut(part, values.shape, step)
     whole = (values.shape[1] // step, values.shape[0] // step) if cut is not None else None
     if cut is not None:  # what is judged of the shot as a whole is judged
@@ -96,27 +103,26 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     saturated, black = unusable_samples(values, levels, dark)
     defective = defects([np.minimum(values, levels.white)], pattern.period)
     notes += [defects_note(int(defective.sum()), values.size)] if defective.any() else []
-    linear = levels.linear(values, dark)
-    if analyzers is not None:
-        linear = analyzers.apply(linear, offset=(x, y))
-        saturated, black, defective = map(spread_to_cells, (saturated, black, defective))
+    linear, masks = files.linear(values, levels, dark, saturated, black, defective, corner=(x, y))
+    saturated, black, defective = masks
     if gains != UNIT_GAINS:
-        of_angle = dict(zip(ANGLES, gains, strict=True))
-        linear *= tiled(np.vectorize(lambda a: np.float32(1 / of_angle[a]))(pattern.angles), linear.shape)
+        linear *= files.sample_factors(linear.shape, gains)
     lsb = 1 / (levels.white - levels.black)
     noise = given_noise(options, lsb) or _noise_of(linear, saturated | black | defective, pattern, lsb)
     picture = demosaic(linear, saturated, pattern, mode=mode, interpolation=way, colored=False)
     dark_pixels, masked = (
         spoiled(samples, pattern, mode=mode, interpolation=way) for samples in (black, defective)
     )
+    factors, averaged = interpolation_factors(options.sensor, x, y, mode)
+    turned = np.broadcast_to(factors.mean(axis=0), factors.shape)  # one that mixes all four angles
     return Developed(
         intensities=oriented(picture.intensities, options.calibration),
         dark=dark_pixels,
         saturated=picture.invalid,
         masked=masked,
         noise=noise,
-        factors=_placed(interpolation_factors(options.sensor, x, y, mode), options.calibration),
-        mean_variance=averaged_factor(options.sensor, x, y, mode),
+        factors=oriented(factors, options.calibration) if options.calibration.permutes else turned,
+        mean_variance=averaged,
         pair_ratio=ratio,
         notes=(*notes, *gain_notes),
         origin=(0, 0) if cut is None else (cut[1].start // step, cut[0].start // step),
@@ -124,19 +130,13 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     )
 
 
-def _stored(shot: ExposureSet, files: MosaicFiles) -> tuple[NDArray[Any], int, int | None]:
-    """The values of a mosaic, the bits that one takes where it is stored, and the full scale that the file states."""
-    if shot.stored is not None:
-        return files.given(shot.stored, shot.name), 8 * shot.stored.dtype.itemsize, None
-    path = shot.files[0]
-    stored = files.read(path)
-    return stored, files.container(path, stored), files.full_scale(path, stored)
-
-
 def _levels_of(
-    stored: NDArray[Any], container: int, full: int | None, options: ShotOptions
+    shot: ExposureSet, stored: NDArray[Any], files: MosaicFiles, options: ShotOptions
 ) -> tuple[Levels, list[str]]:
     """Black, full scale and saturation of a mosaic, and notes of what its type does not imply."""
+    container, full = 8 * stored.dtype.itemsize, None
+    if shot.stored is None:
+        container, full = files.depth(shot.files[0], stored)
     levels = estimate_levels(
         int(stored.max()),
         int(np.bitwise_or.reduce(stored, None)),
@@ -155,23 +155,6 @@ def _levels_of(
     if pile is not None and pile < levels.saturation:
         levels, notes = replace(levels, saturation=pile), [*notes, *piled]
     return replace(levels, gamma=options.gamma), notes
-
-
-def _ratio_of(
-    values: NDArray[Any],
-    dark: NDArray[np.float32] | None,
-    levels: Levels,
-    pattern: Pattern,
-    corrected: tuple[AnalyzerCalibration, tuple[int, int]] | None,
-) -> float | None:
-    """The ratio of the pair sums; ``corrected``: by a calibration, from this column and row of the sensor on."""
-    side, matrices = 2 * pattern.period, None
-    if corrected is not None:
-        of_cells = corrected[0].correction(corrected[1], values.shape[::-1])
-        matrices = np.stack([[sample_blocks(cell, pattern.period) for cell in row] for row in of_cells])
-    floor = None if dark is None else sample_blocks(dark, side)
-    angles, _, usable = block_intensities([sample_blocks(values, side)], levels, floor, pattern, matrices)
-    return pair_ratio(angles, usable)
 
 
 def _noise_of(linear: NDArray[np.float32], bad: Mask, pattern: Pattern, lsb: float) -> NoiseModel:
@@ -201,28 +184,6 @@ def _cut(part: Part | None, shape: tuple[int, ...], step: int) -> tuple[slice, s
     return (rows, columns) if 0 < 2 * area <= shape[0] * shape[1] else None
 
 
-def _analyzers(shape: tuple[int, ...], options: ShotOptions) -> AnalyzerCalibration | None:
-    """The calibration of the sensor, checked against what it is to correct; read once for all shots."""
-    path = options.analyzers
-    if path is None:
-        return None
-    calibration = calibration_of(path)
-    calibration.require_sensor(options.sensor, path)
-    calibration.require_region((options.offset_x, options.offset_y), (shape[1], shape[0]), path)
-    return calibration
-
-
-def calibration_of(path: Path) -> AnalyzerCalibration:
-    require_file(path, expected="a file of polarguide calibrate", remedy="Check --calibration.")
-    state = path.stat()
-    return _read(path, state.st_mtime_ns, state.st_size)
-
-
-@lru_cache(maxsize=1)
-def _read(path: Path, *_: int) -> AnalyzerCalibration:
-    return read_analyzers(path)
-
-
 def _require_on_sensor(path: Path | str, shape: tuple[int, ...], options: ShotOptions) -> None:
     """Refuse what is larger than the sensor: another one, or no mosaic."""
     assert options.sensor is not None
@@ -237,13 +198,6 @@ def _require_on_sensor(path: Path | str, shape: tuple[int, ...], options: ShotOp
         )
 
 
-def _placed(factors: Map, calibration: Calibration) -> Map:
-    """The factors by true angle."""
-    if calibration.permutes:
-        return oriented(factors, calibration)
-    return np.broadcast_to(factors.mean(axis=0), factors.shape)
-
-
 _MAPS = 4 * (4 * 3 + 3 + 5)
 """Bytes for each pixel of the intensities and of what is derived from them first, all at once."""
 
@@ -254,9 +208,6 @@ def develop(shot: ExposureSet, options: ShotOptions, part: Part | None = None) -
     Raises:
         PolarguideError: one is missing, cannot be read, or does not fit the others or the options.
     """
-    if shot.fault is not None:
-        raise shot.fault
-    options.require_kind(shot.kind, shot.name)
     if shot.kind == "mosaic":
         try:
             return develop_mosaic(shot, options, part)
@@ -278,9 +229,6 @@ def set_samples(shot: ExposureSet, options: ShotOptions) -> SetSamples | None:
     Raises:
         PolarguideError: a file is missing, cannot be read, or does not fit the others or the options.
     """
-    if shot.fault is not None:
-        raise shot.fault
-    options.require_kind(shot.kind, shot.name)
     if shot.kind == "set" and shot.stored is not None:
         return samples_of_arrays(shot.name, shot.stored, shot.angles, options)
     if shot.kind == "set":
@@ -299,15 +247,20 @@ def check_files(options: ShotOptions) -> None:
     """
     if options.dark_frame is not None:
         require_file(options.dark_frame, expected="a dark frame", remedy="Check --dark-frame.")
-    if options.analyzers is not None:
-        calibration_of(options.analyzers).require_sensor(options.sensor, options.analyzers)
+    calibration_of(options)
 
 
 def _four(shot: ExposureSet, levels: Levels | None = None) -> Shots:
-    """The four pictures of a shot, of its files or in memory."""
-    return (
-        read_shots(shot.files, levels=levels) if shot.stored is None else stacked(shot.stored, levels=levels)
-    )
+    """The four pictures of a shot, of its files or in memory.
+
+    Raises:
+        PolarguideError: a file cannot be read, or they differ in size, depth or orientation.
+    """
+    if shot.stored is not None:
+        return stacked(shot.stored, levels=levels)
+    remedy = "Make the pictures smaller, all by the same factor."
+    require_memory_of_each(list(shot.files.values()), _READ, "four shots", remedy=remedy)
+    return read_stack([shot.files[angle] for angle in ANGLES], levels=levels)
 
 
 def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
@@ -318,7 +271,7 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
     levels, notes = levels_of_shot(shots.pictures, 8 * shots.pictures.dtype.itemsize, options)
     if levels is not None:
         shots = _four(shot, levels)
-    decision = transfer_of_set(paths, options.transfer, shots, ANGLES)
+    decision = transfer_of_pictures(paths, options.transfer, lambda: [(shots, ANGLES)])
     transfer = decision.transfer
     notes += [decision.note, *filter(None, [decision.doubt])]
     linear = linear_intensities(shots.pictures, transfer)
@@ -330,19 +283,21 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
         moved = moved_shots(shifts)
         notes += [f"Shots moved, in pixels: {', '.join(moved)}."] if moved else []
     saturated = np.asarray(clipped.any(axis=0))
-    stated, missing = stated_exposures({shot.name: paths})
-    exposed = np.asarray(stated.get(shot.name, UNIT_GAINS))
-    notes += [corrected_note(stated[shot.name])] if stated else [missing] if missing else []
+    stated, corrected = stated_of_shot(paths)
+    exposed = np.asarray(stated or UNIT_GAINS)
+    notes += corrected
     if options.gains == "auto" and options.calibration.gains is None:
         labels = [path.name for path in paths] or [f"picture {number}" for number in (1, 2, 3, 4)]
-        measured = exposures_of_view(labels, linear.mean(axis=3), ~(saturated | dark), exposed.tolist())
-        exposed = np.asarray(measured.gains)
-        notes += [f"Shots {measured.warning}"] if measured.warning else []
+        measured, warning = exposures_of_view(
+            labels, linear.mean(axis=3), ~(saturated | dark), exposed.tolist()
+        )
+        exposed = np.asarray(measured)
+        notes += [f"Shots {warning}"] if warning else []
     if (exposed != 1.0).any():
         linear = linear / exposed.astype(np.float32)[:, None, None, None]
     gray = linear.mean(axis=3)
     ratio = pair_ratio(gray, ~(saturated | dark))
-    gains, gain_notes = gains_of(ratio, options)
+    gains, gain_notes = gains_of(ratio, options, _GAINS)
     if gains != UNIT_GAINS:
         linear = linear / np.asarray(gains, np.float32)[:, None, None, None]
         gray = linear.mean(axis=3)
@@ -351,10 +306,7 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
     samples = 1 if (shots.pictures[..., :1] == shots.pictures).all() else 3
     factor = 1.0 if noise is None else 1 / samples
     noise = noise or estimated_noise(gray, ~(saturated | dark), lsb / samples**0.5)
-    turned = np.stack(
-        [apply_orientation(p, shots.orientation) for p in oriented(linear, options.calibration)]
-    )
-    upright = oriented(turned, orientation_calibration(shots.orientation))
+    upright = as_displayed(linear, options.calibration, shots.orientation)
     return Developed(
         intensities=np.ascontiguousarray(upright),
         dark=np.ascontiguousarray(apply_orientation(dark, shots.orientation)),
@@ -396,30 +348,9 @@ def _read_view(shot: ExposureSet, options: ShotOptions) -> tuple[ViewData, int |
 def develop_view(view: View, options: ShotOptions) -> Developed:
     """The intensities of a view of a scene at 0, 45, 90 and 135 degrees, as its ``codes`` and masks are."""
     intensities = behind_lens(view, view.intensities(), FOUR)
-    dark, lost, step = _state_of(view)
+    dark, lost, step = state_of(view)
     masks = dark, lost, view.invalid.numpy(), None if view.mask is None else view.mask.numpy()
     return _undistorted(intensities.numpy(), masks, step, options)
-
-
-def samples_of(view: View) -> SetSamples:
-    """The samples of a view of a scene at other angles.
-
-    Raises:
-        PolarguideError: its pictures do not determine Stokes vectors.
-    """
-    known_places(view.name, view.exposures)
-    return samples_of_loaded(view, *_state_of(view))
-
-
-def _state_of(view: View) -> tuple[Mask, Mask, float]:
-    """Dark and saturated pixels of a view, and one stored value as a share of full scale."""
-    codes = view.codes.numpy()
-    peak, lost = codes.max(axis=(0, 3)), view.saturated.numpy()
-    # Of pixels without polarization information, those nearer to black than to the brightest of the view are dark.
-    dark = (lost & (peak < peak.max() / 2)) | (peak == 0)
-    # Codes are multiples of what one stored value is, unless they were decoded or averaged.
-    step = int(np.gcd.reduce(np.flatnonzero(np.bincount(codes.ravel()))))
-    return dark, lost & ~dark, max(step, 1) / FULL_CODE
 
 
 def _undistorted(
@@ -441,14 +372,3 @@ def _undistorted(
         pair_ratio=pair_ratio(gray, good),
         notes=(),
     )
-
-
-def read_shots(files: dict[int, Path], *, levels: Levels | None = None) -> Shots:
-    """Read the four shots of a view, as ``read_stack`` does.
-
-    Raises:
-        PolarguideError: one cannot be read, or they differ in size, depth or orientation.
-    """
-    remedy = "Make the pictures smaller, all by the same factor."
-    require_memory_of_each(list(files.values()), _READ, "four shots", remedy=remedy)
-    return read_stack([files[angle] for angle in ANGLES], levels=levels)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -11,9 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.calibration import UNIT_GAINS, balancing_gains
 from polarguide.capture.picture_sets import PictureFit
-from polarguide.capture.sensor.analyzers import imbalance_notes
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, demosaic
 from polarguide.capture.sensor.pattern import sensor_pattern
 from polarguide.capture.view import ANGLES
@@ -180,13 +179,27 @@ def estimated_noise(intensities: Any, usable: NDArray[np.bool_], step: float) ->
     mean, excess = (i0 + i45 + i90 + i135) / 4, i0 + i90 - i45 - i135
     # Whole numbers have no fine quantiles: even noise of one step makes them so, and is taken off again.
     excess += np.random.default_rng(0).uniform(-0.5, 0.5, len(excess)) * step
-    parts = np.array_split(np.argsort(mean), min(_BINS, max(1, len(mean) // _FEWEST)))
-    levels, spreads = [], []
-    for part in parts:
-        off = np.abs(excess[part] - np.median(excess[part]))
-        levels.append(float(mean[part].mean()))
-        spreads.append(max(((1.4826 * float(np.median(off))) ** 2 - least) / 4, least))
-    return NoiseModel(*noise_line(np.array(levels), np.array(spreads), least), "estimated")
+
+    def variance(part: NDArray[np.intp]) -> float:
+        spread = 1.4826 * float(np.median(np.abs(excess[part] - np.median(excess[part]))))
+        return (spread**2 - least) / 4
+
+    return binned_noise(mean, variance, least)
+
+
+def binned_noise(
+    levels: NDArray[np.float64], variance: Callable[[NDArray[np.intp]], float], least: float
+) -> NoiseModel:
+    """The noise of samples by their variances in bins of brightness.
+
+    Args:
+        levels: intensities of the samples, [N]. variance: gives that of some samples, by their places.
+        least: variance that is believed at least.
+    """
+    parts = np.array_split(np.argsort(levels), min(_BINS, max(1, len(levels) // _FEWEST)))
+    means = np.array([levels[part].mean() for part in parts])
+    variances = np.array([max(variance(part), least) for part in parts])
+    return NoiseModel(*noise_line(means, variances, least), "estimated")
 
 
 def noise_line(x: NDArray[np.float64], y: NDArray[np.float64], least: float) -> tuple[float, float]:
@@ -203,26 +216,21 @@ def noise_line(x: NDArray[np.float64], y: NDArray[np.float64], least: float) -> 
     return max(float(floor), least), max(float(slope), 0.0)
 
 
-def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> NDArray[np.float32]:
-    """Variance of each developed intensity, as a multiple of a sample's: [4, p, p] over a period p of the pattern.
+@lru_cache(maxsize=8)
+def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> tuple[NDArray[np.float32], float]:
+    """Variance of developed intensities, as a multiple of a sample's: of each, and of the mean of many.
 
     Interpolated values are means of samples and have less noise. The weights of the samples are the responses of the
     demosaicing to an impulse at each position of the pattern. Guided interpolation, which is not linear, is taken to be
-    bilinear, and luminance as the mean of the colors. ``x`` and ``y`` are where the pattern of the sensor begins.
+    bilinear, and luminance as the mean of the colors.
+
+    Args:
+        sensor: name of the sensor. x, y: column and row at which its pattern begins. mode: of demosaicing.
+
+    Returns:
+        Factors [4, p, p] over a period p of the pattern. Variance of the mean of many intensities times their number:
+        more than the mean of the factors, as interpolated neighbors share samples.
     """
-    return _variances(sensor, x, y, mode)[0]
-
-
-def averaged_factor(sensor: str, x: int, y: int, mode: str) -> float:
-    """Variance of the mean of many developed intensities, times their number, as a multiple of a sample's: more than
-    the mean of ``interpolation_factors``, as interpolated neighbors share samples.
-    """
-    return _variances(sensor, x, y, mode)[1]
-
-
-@lru_cache(maxsize=8)
-def _variances(sensor: str, x: int, y: int, mode: str) -> tuple[NDArray[np.float32], float]:
-    """``interpolation_factors`` and ``averaged_factor``."""
     pattern = sensor_pattern(sensor).shifted(x, y)
     side, step = 4 * _REACH, DEMOSAIC_MODES[mode]
     period, cell = max(1, pattern.period // step), max(pattern.period, step)
@@ -251,7 +259,6 @@ def _variances(sensor: str, x: int, y: int, mode: str) -> tuple[NDArray[np.float
 
 
 Mask = NDArray[np.bool_]
-_LARGE_IMBALANCE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,24 +288,3 @@ class Developed:
 
 Part = tuple[int, int, int, int]
 """Column and row at which a part of a picture begins, its width and height."""
-
-
-def gains_of(
-    ratio: float | None, options: ShotOptions
-) -> tuple[tuple[float, float, float, float], tuple[str, ...]]:
-    """Gains of the four pictures, and what to say of them."""
-    if options.analyzers is not None:
-        return UNIT_GAINS, tuple(imbalance_notes(ratio))
-    if options.calibration.gains is not None:
-        return options.calibration.gains, ()
-    if ratio is None:
-        return UNIT_GAINS, ()
-    deviation = f"I0 + I90 is {ratio - 1:+.2%} off I45 + I135"
-    gains = balancing_gains(ratio)
-    if gains is None:
-        return UNIT_GAINS, (f"{deviation}: the angles or the encoding are probably wrong.",)
-    if options.gains == "auto":
-        return gains, (f"{deviation}; corrected.",)
-    if abs(ratio - 1) > _LARGE_IMBALANCE:
-        return UNIT_GAINS, (f"{deviation}; not corrected (--gains auto does, a calibration does better).",)
-    return UNIT_GAINS, ()

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 from msgspec import Meta
 
-from polarguide.capture.calibration import Calibration, checked
-from polarguide.capture.sensor.pattern import MosaicOptions, Positive, SensorName, require_sensor
+from polarguide.capture.raw_options import OWNERS, RawOptions, changed, misplaced
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import check_finite
-from polarguide.core.records import check_options, option_name
-from polarguide.preparation.settings import PrepareSettings
+from polarguide.core.records import option_name
 
 Kind = Literal["mosaic", "filter", "set", "scene"]
 """What a shot is made of: one file, one each at 0, 45, 90 and 135 degrees, others at any angles, a view of a scene."""
-_KINDS: dict[Kind, str] = {
+_KINDS = {
     "mosaic": "raw mosaics",
     "filter": "shots through a filter",
     "set": "sets at other angles",
@@ -30,26 +28,13 @@ _ONE: dict[Kind, str] = {
     "set": "a set at other angles",
     "scene": "a view of a scene",
 }
-_OWNERS: dict[str, tuple[Kind, ...]] = {
-    **dict.fromkeys(
-        (
-            "sensor", "packing", "width", "height", "offset_x", "offset_y", "black_level", "dark_frame", "gamma",
-            "flip", "demosaic", "interpolation", "analyzers",
-        ),
-        ("mosaic",),
-    ),
-    "bits": ("mosaic", "filter", "set"),
-    "saturation": ("mosaic", "filter", "set"),
-    "transfer": ("filter", "set", "scene"),
-    "align": ("filter",),
-    "gains": ("mosaic", "filter"),
-}  # fmt: skip
-"""Options that mean something for some kinds of shots only."""
+_OWNERS = OWNERS | {"align": ("filter",), "gains": ("mosaic", "filter")}
+"""Single shots are corrected for their own gains, and only four are aligned."""
 _OPTION_OF = {"analyzers": "--calibration (of polarguide calibrate)", "align": "--no-align"}
 
 
 @dataclass(frozen=True)
-class ShotOptions(MosaicOptions):
+class ShotOptions(RawOptions):
     """How the files of a shot become intensities, and from when on a pixel counts.
 
     Attributes:
@@ -57,38 +42,19 @@ class ShotOptions(MosaicOptions):
             the camera. Without it files are shots through a filter.
         bits: Bits of a value in 16-bit files; without it 16 for shots through a filter, for mosaics 12 if no value
             exceeds 4095, else 16.
-        dark_frame: Picture with the lens covered, subtracted in place of the black level.
         saturation: Stored value from which the sensor saturates; without it that at which samples pile up, or full
             scale.
-        gamma: Gamma that the camera applied to mosaics: stored = light ^ gamma.
-        flip: Which way the mosaics were mirrored (Reverse X, Reverse Y), or the degrees by which they were turned
-            counter-clockwise: undone before anything else.
         demosaic: full, half or quarter resolution of the sensor.
-        interpolation: How half and full fill in colors and angles.
-        transfer: Encoding of filter shots; auto by the curvature of the response.
         align: Estimate and correct small shifts between the four shots of a filter; sets at other angles are not moved.
         gains: none corrects only exposures that the files state (EXIF), auto also what the light of each shot tells of
             the gains of the angles.
-        calibration: gains, order, sense and zero of the angles.
-        analyzers: calibration of the sensor that polarguide calibrate wrote, for raw mosaics; takes the place of gains.
         full_well: Electrons of a sample at full scale, for its noise; without it the noise is estimated from each shot.
         read_noise: Electrons of noise without light; goes with the full well.
         snr: DoLP in units of its standard deviation from which on an angle counts.
     """
 
-    sensor: SensorName | None = None
-    bits: Annotated[int, Meta(ge=8, le=16)] | None = None
-    dark_frame: Path | None = None
-    saturation: Positive | None = None
-    gamma: Annotated[float, Meta(ge=0.1, le=4.0)] = 1.0
-    flip: Literal["none", "x", "y", "xy", "90", "270"] = "none"
     demosaic: Literal["half", "quarter", "full"] = "full"
-    interpolation: Literal["bilinear", "guided"] = "bilinear"
-    transfer: Literal["auto", "linear", "srgb"] = "auto"
-    align: bool = True
     gains: Literal["auto", "none"] = "none"
-    calibration: Annotated[Calibration, tyro.conf.Suppress] = field(default_factory=Calibration)
-    analyzers: Annotated[Path | None, tyro.conf.Suppress] = None
     full_well: Annotated[float, Meta(ge=10, le=1e9)] | None = None
     read_noise: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
     snr: Annotated[float, Meta(ge=0, le=1000)] = 3.0
@@ -99,9 +65,7 @@ class ShotOptions(MosaicOptions):
         Raises:
             PolarguideError: a value is out of range, or means nothing beside the others.
         """
-        require_sensor(self.sensor)
-        check_options(self)
-        checked(self.calibration, "calibration")
+        self.require_valid()
         if self.read_noise and self.full_well is None:
             raise PolarguideError(
                 "--read-noise",
@@ -111,14 +75,10 @@ class ShotOptions(MosaicOptions):
             )
         return self
 
-    def changed(self) -> list[str]:
-        """Names of the options that are not as they are by default."""
-        return _changed(self)
-
     def called(self, name: str) -> str:
         """Name of an option in messages; of the calibration, its contents."""
         if name == "calibration":
-            return f"calibration ({', '.join(_changed(self.calibration))})"
+            return f"calibration ({', '.join(changed(self.calibration))})"
         return _OPTION_OF.get(name, option_name(name))
 
     def require_kind(self, kind: Kind, name: str) -> None:
@@ -131,17 +91,15 @@ class ShotOptions(MosaicOptions):
             PolarguideError: one is set.
         """
         here = f"{name}, {_ONE[kind]}"
-        for option in self.changed():
-            owners = _OWNERS.get(option, (kind,))
-            if kind not in owners:
-                words = " and ".join(_KINDS[owner] for owner in owners)
-                more = " Raw mosaics need --sensor." if owners == ("mosaic",) and self.sensor is None else ""
-                raise PolarguideError(
-                    self.called(option),
-                    expected=f"{words}: the option is for these",
-                    found=here,
-                    remedy=f"Leave it out; it changes nothing there.{more}",
-                )
+        for option, owners in misplaced(self, kind, _KINDS, _OWNERS):
+            alone = owners == [_KINDS["mosaic"]] and self.sensor is None
+            more = " Raw mosaics need --sensor." if alone else ""
+            raise PolarguideError(
+                self.called(option),
+                expected=f"{' and '.join(owners)}: the option is for these",
+                found=here,
+                remedy=f"Leave it out; it changes nothing there.{more}",
+            )
         if kind == "scene" and self.calibration.gains is not None:
             raise PolarguideError(
                 "calibration (gains)",
@@ -149,17 +107,6 @@ class ShotOptions(MosaicOptions):
                 found=here,
                 remedy="Leave the gains out; order, sense and zero apply. prepare --calibration corrects a scene.",
             )
-
-    def preparation(self) -> PrepareSettings:
-        """The same as settings of ``prepare``, whose readers are used."""
-        known = {f.name for f in fields(PrepareSettings)}
-        return PrepareSettings(**{f.name: getattr(self, f.name) for f in fields(self) if f.name in known})
-
-
-def _changed(options: Any) -> list[str]:
-    """Names of the fields of a dataclass that are not as they are by default."""
-    default = type(options)()
-    return [f.name for f in fields(options) if getattr(options, f.name) != getattr(default, f.name)]
 
 
 @dataclass(frozen=True)

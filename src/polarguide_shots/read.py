@@ -23,11 +23,12 @@ from polarguide.core.options import check_finite, index_of
 from polarguide.core.text import decimals
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
-from polarguide_shots.develop import develop, develop_view, samples_of, set_samples
+from polarguide_shots.develop import develop, develop_view, set_samples
 from polarguide_shots.exposures import find_shots
 from polarguide_shots.fit import DARK_SNR, maps_of_set
 from polarguide_shots.maps import Developed, Map, Part, Reason, ShotMaps
 from polarguide_shots.options import ShotOptions
+from polarguide_shots.samples import samples_of_loaded
 from polarguide_shots.sets import ExposureSet, require_determined
 
 UNREADABLE = (PolarguideError, OSError, MemoryError)
@@ -67,7 +68,7 @@ def read_shot(
     options = (options or ShotOptions()).checked()
     if isinstance(shot, View):
         if shot.exposures != FOUR:
-            return maps_of_set(shot.name, (), samples_of(shot), options)
+            return maps_of_set(shot.name, (), samples_of_loaded(shot), options)
         return maps_of(ExposureSet(shot.name, "scene", {}), develop_view(shot, options), options)
     if is_array(shot):
         shot = array_shot(stacked_array(shot), options, angles)
@@ -82,6 +83,9 @@ def read_shot(
                 remedy="find_shots lists them; read them one by one.",
             )
         shot = found[0]
+    if shot.fault is not None:
+        raise shot.fault
+    options.require_kind(shot.kind, shot.name)
     samples = set_samples(shot, options)
     if samples is not None:
         return maps_of_set(shot.name, shot.paths, samples, options)

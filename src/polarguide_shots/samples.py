@@ -15,19 +15,19 @@ from torch import Tensor
 
 from polarguide.capture import checks
 from polarguide.capture.calibration import ANGLES, Calibration
+from polarguide.capture.develop import COMPARABLE, require_one, stated_exposures
 from polarguide.capture.exposures import Angle, Exposure, analyzers, turned
 from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
-from polarguide.capture.filter.encoding import VIDEO, kind_of_file, transfer_of_set
+from polarguide.capture.filter.encoding import VIDEO, kind_of_file, transfer_of_pictures
 from polarguide.capture.filter.shots import Shots, read_stack, stacked
 from polarguide.capture.formats.decoders import rescaled
 from polarguide.capture.formats.pictures import linear_codes
 from polarguide.capture.layout import require_memory
 from polarguide.capture.picture_sets import Mask, SetSamples
 from polarguide.capture.sensor.pattern import FULL_16, Levels, clipping_bits, estimate_levels
-from polarguide.capture.view import View
+from polarguide.capture.view import FULL_CODE, View
 from polarguide.capture.view_reader import ViewData, require_alike
 from polarguide.core.errors import PolarguideError
-from polarguide.preparation.shot_exposures import stated_exposures
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.sets import SetPicture, known_places, read_frames
 
@@ -44,42 +44,17 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
         PolarguideError: one cannot be read, they differ in size, depth or orientation, or they do not fit into memory.
     """
     require_no_order(options.calibration, name)
-    unused = len(pictures)
-    pictures = [picture for picture in pictures if not isinstance(picture.angle, str)]
-    unused -= len(pictures)
-    _require_one_kind(pictures)
-    count = len(pictures)
-    values: NDArray[Any] | None = None
-    lost: NDArray[Any] | None = None
-    dark: Mask | None = None
-    code, gray, kind = 1, True, np.dtype(np.uint16)
-    for place, shot in enumerate(_read_each(pictures)):
-        stored = shot.pictures[0]
-        gray = gray and bool((stored[..., :1] == stored).all())
-        if values is None or lost is None or dark is None:
-            code = shot.orientation
-            needed = (count * (2 * (1 if gray else 3) + 1) + _FITTED) * stored[..., 0].size
-            remedy = "Make the pictures smaller, all by the same factor."
-            require_memory(pictures[0].path, needed, f"{count} pictures of {name}", remedy=remedy)
-            values = np.empty((count, *stored.shape[:2], 1 if gray else 3), np.uint16)
-            lost, dark = np.empty(values.shape[:3], bool), np.ones(values.shape[1:3], bool)
-        elif not gray and values.shape[3] == 1:
-            values = np.repeat(values, 3, axis=3)
-        values[place] = stored[..., : values.shape[3]]
-        lost[place] = shot.clipped[0]
-        kind = stored.dtype
-        dark &= shot.dark
-    assert values is not None
-    assert lost is not None
-    assert dark is not None
-    gains, words = _gains(pictures)
-    read = Shots(values, code, lost, dark)
-    angles = [_degrees(picture.angle) for picture in pictures]
-    labels = tuple(picture.label for picture in pictures)
-    files = list(dict.fromkeys(picture.path for picture in pictures))
-    film = files[0] if pictures[0].frame is not None else None
+    known = [picture for picture in pictures if not isinstance(picture.angle, str)]
+    kinds = ((kind_of_file(p.path) if p.frame is None else VIDEO, p.path) for p in known)
+    require_one(known[0].path.parent, kinds, "a set of one kind of file", COMPARABLE)
+    read, kind = _gathered(name, known[0].path, len(known), _read_each(known))
+    gains, words = _gains(known)
+    angles = [_degrees(picture.angle) for picture in known]
+    labels = tuple(picture.label for picture in known)
+    files = list(dict.fromkeys(picture.path for picture in known))
+    film = files[0] if known[0].frame is not None else None
     samples = _samples(read, kind, labels, angles, gains, options, files, film)
-    return replace(samples, notes=(*samples.notes, *words, *_unused(unused)))
+    return replace(samples, notes=(*samples.notes, *words, *_unused(len(pictures) - len(known))))
 
 
 def samples_of_arrays(
@@ -92,14 +67,40 @@ def samples_of_arrays(
     """
     require_no_order(options.calibration, name)
     places = [k for k, angle in enumerate(angles) if not isinstance(angle, str)]
-    shots = stacked(stored[places])
-    gray = bool((shots.pictures[..., :1] == shots.pictures).all())
-    values = shots.pictures[..., :1] if gray else shots.pictures
-    read = replace(shots, pictures=values.astype(np.uint16), clipped=shots.clipped.copy())
+    read, kind = _gathered(name, Path(name), len(places), (stacked(stored[k : k + 1]) for k in places))
     labels = tuple(f"picture {k + 1}" for k in places)
     known = [_degrees(angles[k]) for k in places]
-    samples = _samples(read, stored.dtype, labels, known, [1.0] * len(places), options)
+    samples = _samples(read, kind, labels, known, [1.0] * len(places), options)
     return replace(samples, notes=(*samples.notes, *_unused(len(angles) - len(places))))
+
+
+def _gathered(name: str, where: Path, count: int, pictures: Iterator[Shots]) -> tuple[Shots, np.dtype[Any]]:
+    """Pictures as one array of uint16, of one channel where all are gray; and the type that they were stored in.
+
+    Args:
+        name: of the set. where: for messages. count: how many pictures there are. pictures: one at a time.
+
+    Raises:
+        PolarguideError: the pictures and what is fitted to them do not fit into memory.
+    """
+    first = next(pictures)
+    colors = 1 if _is_gray(first) else 3
+    needed = (count * (2 * colors + 1) + _FITTED) * first.dark.size
+    remedy = "Make the pictures smaller, all by the same factor."
+    require_memory(where, needed, f"{count} pictures of {name}", remedy=remedy)
+    values = np.empty((count, *first.dark.shape, colors), np.uint16)
+    lost, dark = np.empty(values.shape[:3], bool), np.ones(values.shape[1:3], bool)
+    for place, shot in enumerate(itertools.chain([first], pictures)):
+        if values.shape[3] == 1 and not _is_gray(shot):
+            values = np.repeat(values, 3, axis=3)
+        values[place] = shot.pictures[0, ..., : values.shape[3]]
+        lost[place] = shot.clipped[0]
+        dark &= shot.dark
+    return Shots(values, first.orientation, lost, dark), first.pictures.dtype
+
+
+def _is_gray(shot: Shots) -> bool:
+    return bool((shot.pictures[..., :1] == shot.pictures).all())
 
 
 def _samples(
@@ -121,7 +122,9 @@ def _samples(
     every, step = np.arange(np.iinfo(kind).max + 1, dtype=kind), 1 / float(np.iinfo(kind).max)
     if levels is not None:
         every, step = rescaled(every, levels.white), 1 / levels.white
-    decision = transfer_of_set(files, options.transfer, _judged(read, every), angles, video=film)
+    decision = transfer_of_pictures(
+        files, options.transfer, lambda: [(_judged(read, every), angles)], video=film
+    )
     transfer = decision.transfer
     linear = linear_codes(every, transfer)
     as_stored = levels is None and kind == np.uint16 and transfer == "linear"
@@ -239,33 +242,11 @@ def _video(path: Path, frames: Sequence[int | None]) -> Iterator[Shots]:
         yield Shots(picture[None], 1, clipped[None], ~lit)
 
 
-def _require_one_kind(pictures: Sequence[SetPicture]) -> None:
-    """Refuse files of several kinds.
-
-    Raises:
-        PolarguideError: there are such.
-    """
-    kinds: dict[str, Path] = {}
-    for picture in pictures:
-        kinds.setdefault(VIDEO if picture.frame is not None else kind_of_file(picture.path), picture.path)
-    if len(kinds) > 1:
-        raise PolarguideError(
-            pictures[0].path.parent,
-            expected="a set of one kind of file",
-            found=" and ".join(f"{kind} ({path.name})" for kind, path in kinds.items()),
-            remedy="Keep one kind: their brightness cannot be compared.",
-        )
-
-
 def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:
     """The gain of each picture: as the table states, else as the files state their exposure; and notes."""
     gains = [picture.gain for picture in pictures]
     if all(gain is None and picture.frame is None for gain, picture in zip(gains, pictures, strict=True)):
-        stated, missing = stated_exposures({"": [picture.path for picture in pictures]})
-        if stated:
-            return stated[""], [corrected_note(stated[""])]
-        if missing:
-            return [1.0] * len(pictures), [missing]
+        return stated_of_shot([picture.path for picture in pictures])
     return [1.0 if gain is None else gain for gain in gains], []
 
 
@@ -302,13 +283,25 @@ def behind_lens(view: View, intensities: Tensor, exposures: Sequence[Exposure]) 
     return intensities + torch.einsum("ksyx,syxc->kyxc", more, view.stokes()[1:]) / 2
 
 
-def samples_of_loaded(view: View, dark: Mask, saturated: Mask, step: float) -> SetSamples:
+def state_of(view: View) -> tuple[Mask, Mask, float]:
+    """Dark and saturated pixels of a view, and one stored value as a share of full scale."""
+    codes = view.codes.numpy()
+    peak, lost = codes.max(axis=(0, 3)), view.saturated.numpy()
+    # Of pixels without polarization information, those nearer to black than to the brightest of the view are dark.
+    dark = (lost & (peak < peak.max() / 2)) | (peak == 0)
+    # Codes are multiples of what one stored value is, unless they were decoded or averaged.
+    step = int(np.gcd.reduce(np.flatnonzero(np.bincount(codes.ravel()))))
+    return dark, lost & ~dark, max(step, 1) / FULL_CODE
+
+
+def samples_of_loaded(view: View) -> SetSamples:
     """The samples of a view as loaded: with its mask, its exposures, and rays through a filter before the lens.
 
     Raises:
         PolarguideError: its known pictures do not determine Stokes vectors.
     """
     places = known_places(view.name, view.exposures)
+    dark, saturated, step = state_of(view)
     exposures = [replace(view.exposures[k], gain=1.0) for k in places]
     intensities = behind_lens(view, view.intensities()[places], exposures)
     invalid = view.invalid.numpy()
@@ -335,6 +328,12 @@ def _unused(count: int) -> tuple[str, ...]:
     return (f"{count} pictures without a known angle are not used.",) if count else ()
 
 
-def corrected_note(stated: Sequence[float]) -> str:
-    """The exposures of a single shot that its files state, for the user."""
-    return f"The files state exposures that differ by a factor of {max(stated) / min(stated):.3g}; corrected."
+def stated_of_shot(paths: Sequence[Path]) -> tuple[list[float], list[str]]:
+    """The relative exposures that the files of a single shot state, else ones; and notes for the user."""
+    stated, missing = stated_exposures({"": paths})
+    exposures = stated.get("", [1.0] * len(paths))
+    factor = f"{max(exposures) / min(exposures):.3g}" if stated else ""
+    corrected = (
+        f"The files state exposures that differ by a factor of {factor}; corrected." if stated else missing
+    )
+    return exposures, [corrected] if corrected else []

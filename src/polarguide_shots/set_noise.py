@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.picture_sets import FEWEST_PIXELS, MOST_PIXELS, SetSamples, typical_variance
-from polarguide_shots.maps import NoiseModel, noise_line
+from polarguide_shots.maps import NoiseModel, binned_noise
 
 Floats = NDArray[np.float64]
-_BINS = 24
 _REDUNDANT = 0.05
 """Share of a sample's noise that the fit has to leave for its residual to say something."""
 
@@ -36,12 +35,7 @@ def estimated_set_noise(samples: SetSamples, gray: Floats, used: NDArray[np.bool
     squares = ((gray[used] - fitted) ** 2).sum(axis=0)
     flat = float((free / gains**2).sum())
     level = (free / gains) @ np.maximum(fitted, 0) / flat
-    parts = np.array_split(np.argsort(level), min(_BINS, max(1, len(level) // FEWEST_PIXELS)))
-    levels = np.array([level[part].mean() for part in parts])
-    variances = np.array(
-        [max(typical_variance(squares[part], freedom) * freedom / flat, least) for part in parts]
-    )
-    return NoiseModel(*noise_line(levels, variances, least), "estimated")
+    return binned_noise(level, lambda part: typical_variance(squares[part], freedom) * freedom / flat, least)
 
 
 def neighbor_noise(samples: SetSamples) -> NoiseModel:
@@ -63,7 +57,4 @@ def neighbor_noise(samples: SetSamples) -> NoiseModel:
     level, apart = np.concatenate(levels), np.concatenate(differences)
     if len(level) < FEWEST_PIXELS:
         return NoiseModel(least, 0.0, "estimated")
-    parts = np.array_split(np.argsort(level), min(_BINS, max(1, len(level) // FEWEST_PIXELS)))
-    means = np.array([max(float(level[part].mean()), 0.0) for part in parts])
-    variances = np.array([max(typical_variance(apart[part] ** 2, 1) / 1.5, least) for part in parts])
-    return NoiseModel(*noise_line(means, variances, least), "estimated")
+    return binned_noise(level, lambda part: typical_variance(apart[part] ** 2, 1) / 1.5, least)

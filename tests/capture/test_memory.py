@@ -17,11 +17,11 @@ from hostile_files import deflated_tiff, exr, header, two_sizes_hdr
 from tiny_capture import NAMES, TinyCapture, write_tiny_capture
 
 from polarguide.capture import load_scene, view_reader
+from polarguide.capture.develop import WORKED
 from polarguide.capture.formats.integrity import declared_size
 from polarguide.capture.formats.pictures import decode_stored, read_picture, stated_size
 from polarguide.capture.layout import KEPT, READ, SHARE
 from polarguide.core.system import free_memory
-from polarguide.preparation.mosaic_source import WORKED
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide_shots.options import ShotOptions

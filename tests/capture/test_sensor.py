@@ -10,6 +10,7 @@ import pytest
 from camera_files import COLOR, MONO, behind, busy_light, mosaic, pack, smooth_light, write_mosaic
 from faults import Fault
 
+from polarguide.capture.develop import sample_blocks
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, DemosaicedPicture, demosaic
 from polarguide.capture.sensor.pattern import (
     SENSORS,
@@ -21,7 +22,6 @@ from polarguide.capture.sensor.pattern import (
     unusable_samples,
 )
 from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, packed_size, read_mosaic, unpack
-from polarguide.preparation.mosaic_source import sample_blocks
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide_shots.calibration.settings import CalibrateSettings

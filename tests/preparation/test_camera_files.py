@@ -15,6 +15,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.checks import measured_gains, pair_moments
+from polarguide.capture.develop import MosaicFiles, exposures_of_view, stated_exposures
 from polarguide.capture.filter.camera_files import exif_data
 from polarguide.capture.filter.develop import align_shots, estimate_shifts
 from polarguide.capture.filter.encoding import (
@@ -24,7 +25,7 @@ from polarguide.capture.filter.encoding import (
     slope_of_shots,
     stated_encoding,
     stated_transfer,
-    transfer_of_set,
+    transfer_of_pictures,
 )
 from polarguide.capture.filter.shots import Shots, read_stack
 from polarguide.capture.formats.pictures import decode_mask, decode_picture
@@ -33,9 +34,8 @@ from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, t
 from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
 from polarguide.optics.color import srgb_encode_array as srgb_encode
 from polarguide.preparation.filter_source import SinglesSource
-from polarguide.preparation.mosaic_source import MosaicFiles, MosaicSource
+from polarguide.preparation.mosaic_source import MosaicSource
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.preparation.shot_exposures import exposures_of_view, stated_exposures
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.read import read_shot
 
@@ -92,12 +92,12 @@ def test_exposures_that_files_state_are_taken_back(tmp_path, stated):
         image.save(paths[-1], exif=exif)
     light = stated_exposures({"v": paths}, lambda done: None)[0].get("v", [1.0] * 4)
     true = 1 / np.array(stated if light != [1.0] * 4 else (100, 100, 140, 100))
-    found = exposures_of_view(
+    gains, warning = exposures_of_view(
         [path.name for path in paths], four() * true[:, None, None] * 50, np.ones((96, 128), bool), light
     )
-    assert np.array(found.gains) / found.gains[0] == pytest.approx(true / true[0], rel=2e-3)
-    assert bool(found.warning) == (light == [1.0] * 4)
-    assert not found.warning or ("v_90.jpg" in found.warning and "v_45.jpg" not in found.warning)
+    assert np.array(gains) / gains[0] == pytest.approx(true / true[0], rel=2e-3)
+    assert bool(warning) == (light == [1.0] * 4)
+    assert not warning or ("v_90.jpg" in warning and "v_45.jpg" not in warning)
 
 
 COLORS = np.random.default_rng(1).integers(0, 1 << 16, (12, 10, 3)).astype(np.uint16)
@@ -366,7 +366,7 @@ def test_the_encoding_is_measured_whatever_the_exposures(tmp_path, encode, trans
             exif.get_ifd(0x8769)[0x829A] = IFDRational(1, time)
         paths.append(tmp_path / f"v_{angle}.jpg")
         image.save(paths[-1], quality=100, exif=exif)
-    found = transfer_of_set(paths, "auto", read_stack(paths), (0, 45, 90, 135))
+    found = transfer_of_pictures(paths, "auto", lambda: [(read_stack(paths), (0, 45, 90, 135))])
     assert (found.transfer, found.doubt) == (transfer, "")
     assert "curvature" in found.note
 

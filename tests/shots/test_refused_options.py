@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from faults import Fault
 
 import polarguide
 from polarguide.capture.calibration import Calibration
+from polarguide.capture.raw_options import OWNERS, RawOptions
+from polarguide.preparation.settings import PrepareSettings
 from polarguide_shots.exposures import find_shots
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.read import read_shot
@@ -24,6 +27,15 @@ MOSAIC_ONLY: list[dict[str, Any]] = [
     {"black_level": 500.0}, {"flip": "x"}, {"gamma": 0.8}, {"demosaic": "quarter"}, {"packing": "12p"},
     {"dark_frame": Path("none.png")}, {"offset_x": 2}, {"interpolation": "guided"}, {"width": 2448},
 ]  # fmt: skip
+
+
+def test_every_option_with_owners_is_one() -> None:
+    """A name that no option has would refuse nothing."""
+    prepared, shots, common = (
+        {f.name for f in fields(kind)} for kind in (PrepareSettings, ShotOptions, RawOptions)
+    )
+    assert set(OWNERS) <= prepared | shots
+    assert common - set(OWNERS) == {"gains", "calibration"}
 
 
 @pytest.mark.parametrize("given", MOSAIC_ONLY)

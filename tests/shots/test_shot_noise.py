@@ -80,16 +80,16 @@ def test_sigma_of_shots_is_the_spread_of_their_maps(tmp_path: Path, colors: int)
 
 
 def test_interpolated_values_have_less_noise() -> None:
-    factors = interpolation_factors("IMX250MZR", 0, 0, "full")
+    factors, _ = interpolation_factors("IMX250MZR", 0, 0, "full")
     assert factors.shape == (4, 2, 2)
     # The pixel of 90 degrees has its own sample, means of two to the sides, and of four along the diagonals.
     np.testing.assert_allclose(factors[:, 0, 0], [0.25, 0.5, 1.0, 0.5])
-    shifted = interpolation_factors("IMX250MZR", 1, 1, "full")
+    shifted, _ = interpolation_factors("IMX250MZR", 1, 1, "full")
     np.testing.assert_allclose(shifted[:, 0, 0], [1.0, 0.5, 0.25, 0.5])
     # Four samples of an angle in 4x4 pixels; of the colors one red, two green and one blue.
-    np.testing.assert_allclose(interpolation_factors("IMX250MZR", 0, 0, "quarter")[:, 0, 0], 1 / 4)
+    np.testing.assert_allclose(interpolation_factors("IMX250MZR", 0, 0, "quarter")[0][:, 0, 0], 1 / 4)
     np.testing.assert_allclose(
-        interpolation_factors("IMX250MYR", 0, 0, "quarter")[:, 0, 0], 2.5 / 9, rtol=1e-6
+        interpolation_factors("IMX250MYR", 0, 0, "quarter")[0][:, 0, 0], 2.5 / 9, rtol=1e-6
     )
 
 

@@ -18,22 +18,28 @@ from numpy.typing import NDArray
 from polarguide.capture.calibration import (
     LARGEST_IMBALANCE,
     UNIT_GAINS,
-    balancing_gains,
-    oriented,
     pair_ratio,
 )
 from polarguide.capture.colmap.poses import Geometry
+from polarguide.capture.develop import (
+    COMPARABLE,
+    as_displayed,
+    exposure_notes,
+    exposures_of_view,
+    gains_of,
+    levels_of_shots,
+    light_of_files,
+    require_one,
+    stated_exposures,
+)
 from polarguide.capture.exposures import Angle, angle_text, turned
 from polarguide.capture.filter.camera_files import (
-    ExposureData,
     Lens,
     apply_orientation,
     camera_groups,
     is_camera_raw,
-    missing_tags,
     orientation,
     orientation_calibration,
-    read_exposure_data,
     stored_frame,
 )
 from polarguide.capture.filter.develop import (
@@ -45,13 +51,9 @@ from polarguide.capture.filter.develop import (
     shift_notes,
 )
 from polarguide.capture.filter.encoding import (
-    CAMERA_RAW,
     TransferDecision,
-    decide_transfer,
-    given_transfer,
     kind_of_file,
-    slope_of_shots,
-    stated_transfer,
+    transfer_of_pictures,
 )
 from polarguide.capture.filter.shots import (
     Shots,
@@ -70,16 +72,13 @@ from polarguide.capture.write import EXACT, Rounding
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.progress import Advance
 from polarguide.preparation.settings import PrepareSettings, white_gains
-from polarguide.preparation.shot_exposures import (
-    ShotExposures,
-    exposure_notes,
-    exposures_of_view,
-    levels_of_shots,
-    stated_exposures,
-)
 from polarguide.preparation.source import DevelopedView, Source, Stored
 
 _JUDGED_VIEWS = 8
+_GAINS = {
+    "dark": "(I0 + I90)/(I45 + I135) is too dark to measure; not corrected.",
+    "off": "(I0 + I90)/(I45 + I135) is off by {:+.1%}, too much for gains; not corrected.",
+}
 # Bytes for each pixel of a shot: as stored and stacked, linear, aligned or turned, written.
 _WORKED = 3 * (2 + 2 + 4 + 4 + 4)
 
@@ -139,16 +138,15 @@ class ShotsSource(Source):
 
     def _decided(self, levels: Levels | None) -> TransferDecision:
         """The transfer of the capture: as given, or by a few views spread over it and what the files state."""
-        kind = CAMERA_RAW if all(map(is_camera_raw, self._shots)) else kind_of_file(self._shots[0])
-        given = given_transfer(kind, self._settings.transfer)
-        if given is not None:
-            return given
-        stated = stated_transfer(self._shots)
         several = [view for view in self.views if len(self._of_view[view]) > 1]
         views = several[:: max(1, math.ceil(len(several) / _JUDGED_VIEWS))] or self.views[:1]
-        judged = [read_stack(self._of_view[view], self._white, levels) for view in views]
-        slope = slope_of_shots(judged, [self._angles(view) for view in views]) if several else None
-        decision = decide_transfer(kind, stated, eight=judged[0].pictures.dtype == np.uint8, slope=slope)
+        decision = transfer_of_pictures(
+            self._shots,
+            self._settings.transfer,
+            lambda: [
+                (read_stack(self._of_view[view], self._white, levels), self._angles(view)) for view in views
+            ],
+        )
         if decision.doubt:
             warnings.warn(decision.doubt, PolarguideWarning, stacklevel=2)
         return decision
@@ -273,42 +271,31 @@ class FilterSource(ShotsSource):
         developed = self._linear(view, measured, align=settings.align)
         usable, paths = ~developed.invalid, self._of_view[view]
         light = [measured["light"].get(self._name(path), 1.0) for path in paths]
-        exposed = ShotExposures(UNIT_GAINS)
+        exposed, warning = UNIT_GAINS, ""
         if settings.gains == "auto":
-            exposed = exposures_of_view(
+            exposed, warning = exposures_of_view(
                 [path.name for path in paths], developed.linear.mean(axis=3), usable, light
             )
-        if exposed.warning:
-            warnings.warn(f"{view}: {exposed.warning}", PolarguideWarning, stacklevel=2)
-        linear = developed.linear / np.asarray(exposed.gains, np.float32)[:, None, None, None]
+        if warning:
+            warnings.warn(f"{view}: {warning}", PolarguideWarning, stacklevel=2)
+        linear = developed.linear / np.asarray(exposed, np.float32)[:, None, None, None]
         ratio = pair_ratio(linear.mean(axis=3), usable)
-        gains = settings.calibration.gains or UNIT_GAINS
-        if settings.calibration.gains is None and settings.gains == "auto":
-            balance = balancing_gains(ratio)
-            gains = balance or UNIT_GAINS
-            if balance is None:
-                why = (
-                    "is too dark to measure"
-                    if ratio is None
-                    else f"is off by {ratio - 1:+.1%}, too much for gains"
-                )
-                developed.notes.append(f"{view}: (I0 + I90)/(I45 + I135) {why}; not corrected.")
+        gains, why = gains_of(ratio, settings, _GAINS if settings.gains == "auto" else {})
+        developed.notes += [f"{view}: {note}" for note in why]
         # A shot that the pair sums brighten beyond what its file states may exceed full scale: it counts as clipped.
         factors = np.asarray(measured["scale"] / np.asarray(gains), np.float32)
         linear = linear * factors[:, None, None, None]
         developed.invalid |= np.asarray((linear > 1.0).any(axis=(0, 3)))
-        linear = oriented(np.minimum(linear, 1.0), settings.calibration)
-        code = developed.orientation
-        turned = np.stack([apply_orientation(picture, code) for picture in linear])
+        turned = as_displayed(np.minimum(linear, 1.0), settings.calibration, developed.orientation)
         record = {
             "shifts": [[shift.x, shift.y] for shift in developed.shifts],
             "warps": [shift.warp for shift in developed.shifts],
             "shifts_corrected": [shift.corrected for shift in developed.shifts],
             "pair_ratio": ratio,
-            "light": [round(value, 6) for value in exposed.gains],
+            "light": [round(value, 6) for value in exposed],
             "gains": list(gains),
         }
-        return self._developed(developed, oriented(turned, orientation_calibration(code)), record)
+        return self._developed(developed, turned, record)
 
 
 def development_of(paths: Sequence[Path], settings: PrepareSettings) -> tuple[float, float, float]:
@@ -364,28 +351,18 @@ class SinglesSource(ShotsSource):
             PolarguideError: the photographs are too large, or not of one size.
         """
         self._require_memory("photographs of a view")
-        sizes: dict[str, Path] = {}  # but for the side they were held on
-        for path in self._shots:
-            size = None if is_camera_raw(path) else stated_size(path)
-            if size is not None:
-                sizes.setdefault(f"{max(size)}x{min(size)}", path)
-        self._require_one(sizes, "size", "Export all pictures of one camera alike, without a crop.")
-        kinds: dict[str, Path] = {}
-        for path in self._shots:
-            kinds.setdefault(kind_of_file(path), path)
-        self._require_one(kinds, "kind of file", "Keep one kind: their brightness cannot be compared.")
+        stated_sizes = ((stated_size(path), path) for path in self._shots if not is_camera_raw(path))
+        # Width and height may be exchanged by the side that the camera was held on.
+        sizes = ((f"{max(size)}x{min(size)}", path) for size, path in stated_sizes if size is not None)
+        alike = "Export all pictures of one camera alike, without a crop."
+        require_one(self._root, sizes, "photographs of one size", alike)
+        kinds = ((kind_of_file(path), path) for path in self._shots)
+        require_one(self._root, kinds, "photographs of one kind of file", COMPARABLE)
         levels, counted = levels_of_shots(self._shots, self._white, self._settings)
         decision = self._decided(levels)
-        every: dict[Path, ExposureData] = {}
-        for number, view in enumerate(self.views, 1):
-            every |= {path: read_exposure_data(path) for path in self._of_view[view]}
-            advance(number)
-        missing, light = missing_tags(every), {}
-        if not missing:
-            light = {
-                self._name(path): value for path, taken in every.items() if (value := taken.light) is not None
-            }
-        stating = f"{'All' if light else 'None'} of {len(every)} files state their exposure (EXIF)."
+        stated, missing = light_of_files(self._of_view, advance)
+        light = {self._name(path): value for path, value in stated.items()}
+        stating = f"{'All' if light else 'None'} of {len(self._shots)} files state their exposure (EXIF)."
         return {
             "transfer": decision.transfer,
             "scale": 1.0,
@@ -414,18 +391,6 @@ class SinglesSource(ShotsSource):
         ]
         upright = np.stack([apply_orientation(picture, code) for picture in developed.linear])
         return self._developed(developed, upright, {"exposures": exposures}, angles)
-
-    def _require_one(self, values: dict[str, Path], what: str, remedy: str) -> None:
-        """Refuse photographs of two cameras, sizes or kinds of files: the first photograph of each, by its name.
-
-        Raises:
-            PolarguideError: there are two.
-        """
-        if len(values) > 1:
-            names = [f"{name} ({path.name})" for name, path in list(values.items())[:2]]
-            raise PolarguideError(
-                self._root, expected=f"photographs of one {what}", found=" and ".join(names), remedy=remedy
-            )
 
     def _angles(self, view: str) -> list[Angle]:
         return [shot.angle for shot in self._singles[view]]

@@ -6,50 +6,34 @@ import dataclasses
 import json
 import math
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tyro
 from msgspec import Meta
 
-from polarguide.capture.calibration import Calibration, Sense, checked, read_calibration
+from polarguide.capture.calibration import Calibration, Sense, read_calibration
+from polarguide.capture.raw_options import RawOptions, misplaced
 from polarguide.capture.sensor.analyzer_file import is_analyzer_file
-from polarguide.capture.sensor.pattern import MosaicOptions, Positive, require_sensor
 from polarguide.core.errors import PolarguideError
-from polarguide.core.records import check_options, option_name
+from polarguide.core.records import option_name
 from polarguide.core.text import decimals
 from polarguide.geometry.polarizer import ANGLES
 
 Dataset = Literal["pandora", "pisr", "nersp", "neisf", "gnerp", "phygap"]
 ORIGINS = ("auto", "dataset", "sfm", "none")
 """What poses can be instead of a path."""
-_MOSAIC_ONLY = (
-    "sensor", "packing", "width", "height", "bits", "offset_x", "offset_y", "black_level", "dark_frame",
-    "saturation", "white_balance", "demosaic", "interpolation", "register", "analyzers", "precision",
-    "gamma", "flip",
-)  # fmt: skip
-# Options that mean something for some formats only.
-_OPTIONS = {
-    "mosaic": _MOSAIC_ONLY,
-    "pisr": _MOSAIC_ONLY,
-    "filter": ("transfer", "align", "white_balance", "precision", "bits", "saturation"),
-    "singles": (
-        "transfer",
-        "align",
-        "white_balance",
-        "precision",
-        "bits",
-        "saturation",
-        "angles",
-        "shots_per_view",
-    ),
-    "gnerp": ("transfer",),
+_WORDS = {
+    "mosaic": "raw mosaics",
+    "pisr": "pisr",
+    "filter": "rotating filters",
+    "singles": "single shots",
+    "gnerp": "gnerp",
 }
 
 
 @dataclass(frozen=True)
-class PrepareSettings(MosaicOptions):
+class PrepareSettings(RawOptions):
     """Source of a scene folder, and how it is prepared.
 
     Attributes:
@@ -57,25 +41,17 @@ class PrepareSettings(MosaicOptions):
             through a filter at any angles, each with a pose of its own), else takes mosaics.
         bits: Bits of a sensor value in 16-bit files; without it those of the value at which samples pile up, else 12 if
             no value exceeds 4095, else 16.
-        gamma: Gamma that the camera applied to mosaics: stored = light ^ gamma.
-        flip: Which way the mosaics were mirrored (Reverse X, Reverse Y), or the degrees by which they were turned
-            counter-clockwise: undone before anything else.
-        dark_frame: Picture with the lens covered, subtracted in place of the black level.
         saturation: Stored value from which the sensor saturates; without it full scale.
         white_balance: none, gray (the mean color becomes gray), or gains of R, G and B such as 1.9,1,1.6.
         demosaic: half, quarter or full resolution of the sensor.
-        interpolation: How half and full fill in colors and angles.
         register: Bring the four angles of half size, which lie half a pixel apart, to one place.
         transfer: Encoding of filter shots (auto: by the curvature of the response, as inspect judges it) and of GNeRP.
-        align: Estimate and correct small shifts between the four shots of a filter.
         angles: Polarizer angles of singles: unknown or none for all, numbers in the order of the files that repeat
             (such as 0,60,120), or the path of a table (.csv); without it angles.csv, folders or names say them.
         shots_per_view: Consecutive photographs, by name, that are one view; --angles has as many angles, or a word.
             Without it, groups that show one place are found.
         gains: auto corrects what the light tells of the gains of the angles, and estimates the exposure of every single
             shot; none leaves them. Gains of a calibration go first.
-        calibration: gains, order, sense and zero of the angles.
-        analyzers: calibration of the sensor that polarguide calibrate wrote; takes the place of gains.
         precision: source rounds the intensities to less than a fifth of a step of the camera's values, full to 16 bits,
             in larger files.
         poses: sfm, dataset, none, or the path of a COLMAP model, transforms.json (nerfstudio), cameras.xml (Metashape)
@@ -92,22 +68,10 @@ class PrepareSettings(MosaicOptions):
     """
 
     format: Literal["auto", "mosaic", "filter", "singles"] | Dataset = "auto"
-    bits: Annotated[int, Meta(ge=8, le=16)] | None = None
-    gamma: Annotated[float, Meta(ge=0.1, le=4.0)] = 1.0
-    flip: Literal["none", "x", "y", "xy", "90", "270"] = "none"
-    dark_frame: Path | None = None
-    saturation: Positive | None = None
     white_balance: str = "none"
-    demosaic: Literal["half", "quarter", "full"] = "half"
-    interpolation: Literal["bilinear", "guided"] = "bilinear"
     register: bool = True
-    transfer: Literal["auto", "linear", "srgb"] = "auto"
-    align: bool = True
     angles: str | None = None
     shots_per_view: Annotated[int, Meta(ge=1, le=72)] | None = None
-    gains: Literal["auto", "none"] = "auto"
-    calibration: Annotated[Calibration, tyro.conf.Suppress] = field(default_factory=Calibration)
-    analyzers: Annotated[Path | None, tyro.conf.Suppress] = None
     precision: Literal["source", "full"] = "source"
     poses: str = "auto"
     poses_of: Literal["auto", "stored", "displayed"] = "auto"
@@ -124,9 +88,7 @@ class PrepareSettings(MosaicOptions):
         Raises:
             PolarguideError: a value is out of range.
         """
-        require_sensor(self.sensor)
-        check_options(self)
-        checked(self.calibration, "calibration")
+        self.require_valid()
         white_gains(self.white_balance)
         if self.analyzers is not None and self.calibration.gains is not None:
             raise PolarguideError(
@@ -215,16 +177,14 @@ def check_format(settings: PrepareSettings, kind: str) -> None:
     Raises:
         PolarguideError: one is set.
     """
-    default = PrepareSettings()
-    mine = _OPTIONS.get(kind, ())
-    for name in sorted({name for names in _OPTIONS.values() for name in names} - set(mine)):
-        if getattr(settings, name) != getattr(default, name):
-            raise PolarguideError(
-                option_name(name),
-                expected=f"only flags that apply to the format {kind}",
-                found=f"one for {_owners(name)}",
-                remedy="Leave it out, or choose another --format.",
-            )
+    for name, owners in sorted(misplaced(settings, kind, _WORDS)):
+        *others, last = owners
+        raise PolarguideError(
+            option_name(name),
+            expected=f"only flags that apply to the format {kind}",
+            found=f"one for {', '.join(others)} and {last}" if others else f"one for {last}",
+            remedy="Leave it out, or choose another --format.",
+        )
     calibration = settings.calibration
     if kind == "singles" and (calibration.gains is not None or calibration.order != ANGLES):
         raise PolarguideError(
@@ -240,13 +200,6 @@ def check_format(settings: PrepareSettings, kind: str) -> None:
             found=str(settings.calibration.gains),
             remedy="Leave the gains out; order, sense and zero apply.",
         )
-
-
-def _owners(name: str) -> str:
-    """The formats that an option is for, in words."""
-    words = {"mosaic": "raw mosaics", "filter": "rotating filters", "singles": "single shots"}
-    *others, last = (words.get(kind, kind) for kind, names in _OPTIONS.items() if name in names)
-    return f"{', '.join(others)} and {last}" if others else last
 
 
 def white_gains(text: str) -> tuple[float, float, float] | None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.develop import sample_blocks
 from polarguide.capture.layout import describe_contents, index_files
 from polarguide.capture.sensor.pattern import (
     SIDE,
@@ -25,7 +26,6 @@ from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mos
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_folder
 from polarguide.core.progress import Reporter
-from polarguide.preparation.mosaic_source import sample_blocks
 from polarguide_shots.calibration.settings import CalibrateSettings
 
 FEWEST = 5

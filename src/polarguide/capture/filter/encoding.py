@@ -366,13 +366,18 @@ def slope_of_shots(shots: Sequence[Shots], angles: Sequence[Sequence[Angle]]) ->
     return slope
 
 
-def transfer_of_set(
-    paths: Sequence[Path], transfer: str, shots: Shots, angles: Sequence[Angle], *, video: Path | None = None
+def transfer_of_pictures(
+    paths: Sequence[Path],
+    transfer: str,
+    judged: Callable[[], Sequence[tuple[Shots, Sequence[Angle]]]],
+    *,
+    video: Path | None = None,
 ) -> TransferDecision:
-    """The transfer of the pictures of one set.
+    """The transfer of the pictures of a capture or of one set.
 
     Args:
-        paths: their files; none of pictures in memory. transfer: as given, or auto. shots, angles: the pictures.
+        paths: their files; none of pictures in memory. transfer: as given, or auto.
+        judged: reads the shots of some views and the angles of each; all views have several pictures, or it is one.
         video: the file, if they are its frames.
 
     Raises:
@@ -383,8 +388,9 @@ def transfer_of_set(
     if given is not None:
         return given
     stated = stated_video_transfer(video) if video else stated_transfer(paths) if paths else None
-    eight = shots.pictures.dtype == np.uint8
-    return decide_transfer(kind, stated, eight=eight, slope=slope_of_shots([shots], [angles]))
+    shots, angles = zip(*judged(), strict=True)
+    slope = slope_of_shots(shots, angles) if len(angles[0]) > 1 else None
+    return decide_transfer(kind, stated, eight=shots[0].pictures.dtype == np.uint8, slope=slope)
 
 
 def _doubt(slope: Slope | None, transfer: str) -> str:
