@@ -46,7 +46,8 @@ from polarguide_bench.plan import jobs_at_a_time, own_gpus
 from polarguide_bench.report import recorded_health
 from polarguide_bench.tables import formatted
 
-PAGE, TABLE = "index.html", "results.csv"
+PAGE = "index.html"
+TABLE = "results.csv"
 
 
 @dataclass(frozen=True)
@@ -239,7 +240,8 @@ def is_scene(folder: Path) -> bool:
 def _task(capture: Capture, root: Path, options: BatchOptions) -> Processing:
     path = capture.path.absolute()
     folder = (root / CAPTURES / capture.name).absolute()
-    stamp, earlier = source_stamp(path), None
+    stamp = source_stamp(path)
+    earlier = None
     with contextlib.suppress(
         PolarguideError
     ):  # the process that works on it says what is wrong with its record
@@ -286,7 +288,8 @@ def _rows(tasks: dict[str, Processing], failures: dict[str, str]) -> list[Row]:
     """A row for each capture, by what its folder holds."""
     rows = []
     for name, task in tasks.items():
-        folder, error = Path(task.folder), failures.get(name, "")
+        folder = Path(task.folder)
+        error = failures.get(name, "")
         record = None
         try:
             record = CaptureRecord.load(folder)

@@ -133,7 +133,8 @@ def perform(
     from distributed import get_worker
     from distributed.worker import thread_state
 
-    worker, key = get_worker(), thread_state.key
+    worker = get_worker()
+    key = thread_state.key
     device = {"CUDA_VISIBLE_DEVICES": gpus[int(worker.name) % len(gpus)]} if gpus else {}
     for message in messages:
         try:

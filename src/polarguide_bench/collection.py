@@ -114,7 +114,8 @@ class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.request.digest == request.digest != "":
             alike.add("stamp")
         for name in Request.__struct_fields__:
-            before, now = getattr(self.request, name), getattr(request, name)
+            before = getattr(self.request, name)
+            now = getattr(request, name)
             if before != now and name not in alike:
                 raise PolarguideError(
                     folder,

@@ -246,7 +246,8 @@ def _train(
 
 def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
     """The tasks that finish a run."""
-    compute, folder = _compute(comparison), str(run.folder.absolute())
+    compute = _compute(comparison)
+    folder = str(run.folder.absolute())
     training = Training(
         scene=str(run.scene.path.absolute()),
         folder=folder,
@@ -320,7 +321,8 @@ def collect(
         comparison, scenes, plan: the requested comparison.
         failures: last words of runs that failed, by their folders.
     """
-    options, settings = comparison.options, comparison.settings
+    options = comparison.options
+    settings = comparison.settings
     content = {
         "format": FORMAT,
         "provenance": {

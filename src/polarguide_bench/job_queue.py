@@ -83,7 +83,9 @@ class _Active:
     """A job that was handed to a worker."""
 
     def __init__(self, job: Job, future: Future, advance: Advance) -> None:
-        self.job, self.future, self._advance = job, future, advance
+        self.job = job
+        self.future = future
+        self._advance = advance
 
     def report(self) -> int:
         """Pass on how far it is; returns how much is done."""
@@ -119,7 +121,9 @@ class _Progress:
     """Progress of many jobs: one bar for all, and one for each running job."""
 
     def __init__(self, jobs: Sequence[Job], reporter: Reporter, stack: contextlib.ExitStack) -> None:
-        self._reporter, self._total, self._ended = reporter, len(jobs), 0
+        self._reporter = reporter
+        self._total = len(jobs)
+        self._ended = 0
         self._done = {job.folder: job.progress()[0] for job in jobs}
         self._all = stack.enter_context(reporter.track("all", sum(job.total for job in jobs)))
         self._stack = stack
@@ -184,10 +188,13 @@ def run_jobs(
         KeyboardInterrupt: raised meanwhile, as by Ctrl-C; passed on when all children have stopped.
         PolarguideError: the scheduler has gone.
     """
-    waiting, active, losses = deque(jobs), list[_Active](), _Losses()
+    waiting = deque(jobs)
+    active = list[_Active]()
+    losses = _Losses()
     with contextlib.ExitStack() as stack:
         progress = _Progress(jobs, reporter, stack)
-        slots, asked_at = workers.slots(), time.monotonic()
+        slots = workers.slots()
+        asked_at = time.monotonic()
         try:
             while waiting or active:
                 while waiting and len(active) < max(1, min(slots, workers.most)):
@@ -205,7 +212,8 @@ def run_jobs(
                 progress.report(active, slots)
                 time.sleep(POLL_SECONDS)
                 if time.monotonic() - asked_at > ASK_SECONDS:
-                    slots, asked_at = workers.slots(), time.monotonic()
+                    slots = workers.slots()
+                    asked_at = time.monotonic()
                     workers.replace_lost()
         except BaseException:  # whatever happens here, no child goes on unwatched
             _stop(active, workers)
@@ -226,7 +234,8 @@ def _handed_out(job: Job, workers: Workers, progress: _Progress) -> _Active:
 
 def _stop(active: Sequence[_Active], workers: Workers) -> None:
     """Cancel all, and wait until their processes have ended; a second Ctrl-C kills these."""
-    client, keys = workers.client, [each.future.key for each in active]
+    client = workers.client
+    keys = [each.future.key for each in active]
     with contextlib.suppress(Exception):  # the scheduler may be what has gone
         client.cancel([each.future for each in active], force=True)
         try:

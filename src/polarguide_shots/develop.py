@@ -92,14 +92,17 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     blocks = [sample_blocks(values, 2 * pattern.period)]
     ratio, _ = files.light_of_blocks(blocks, levels, dark, values.shape)
     gains, gain_notes = gains_of(ratio, options, _GAINS)
-    mode, way = options.demosaic, options.interpolation
+    mode = options.demosaic
+    way = options.interpolation
     step = DEMOSAIC_MODES[mode]
     x, y = files.corner
     cut = _cut(part, values.shape, step)
     whole = (values.shape[1] // step, values.shape[0] // step) if cut is not None else None
     if cut is not None:  # what is judged of the shot as a whole is judged
-        values, dark = np.ascontiguousarray(values[cut]), None if dark is None else dark[cut]
-        x, y = x + cut[1].start, y + cut[0].start
+        values = np.ascontiguousarray(values[cut])
+        dark = None if dark is None else dark[cut]
+        x = x + cut[1].start
+        y = y + cut[0].start
     saturated, black = unusable_samples(values, levels, dark)
     defective = defects([np.minimum(values, levels.white)], pattern.period)
     notes += [defects_note(int(defective.sum()), values.size)] if defective.any() else []
@@ -134,7 +137,8 @@ def _levels_of(
     shot: ExposureSet, stored: NDArray[Any], files: MosaicFiles, options: ShotOptions
 ) -> tuple[Levels, list[str]]:
     """Black, full scale and saturation of a mosaic, and notes of what its type does not imply."""
-    container, full = 8 * stored.dtype.itemsize, None
+    container = 8 * stored.dtype.itemsize
+    full = None
     if shot.stored is None:
         container, full = files.depth(shot.files[0], stored)
     levels = estimate_levels(
@@ -153,7 +157,8 @@ def _levels_of(
         notes.append(f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale.")
     pile, piled = piled_up(stored, container, options)
     if pile is not None and pile < levels.saturation:
-        levels, notes = replace(levels, saturation=pile), [*notes, *piled]
+        levels = replace(levels, saturation=pile)
+        notes = [*notes, *piled]
     return replace(levels, gamma=options.gamma), notes
 
 
@@ -276,7 +281,8 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
     notes += [decision.note, *filter(None, [decision.doubt])]
     linear = linear_intensities(shots.pictures, transfer)
     lsb = 1 / float(np.iinfo(shots.pictures.dtype).max if levels is None else levels.white)
-    clipped, dark = shots.clipped, shots.dark
+    clipped = shots.clipped
+    dark = shots.dark
     if options.align:
         shifts = estimate_shifts(linear)
         linear, clipped = align_shots(linear, clipped, shifts)

@@ -174,7 +174,8 @@ def _or_fault(
     except PolarguideError as error:
         fault = error
     except OSError as error:
-        found, remedy = error.strerror or str(error), "Check its permissions."
+        found = error.strerror or str(error)
+        remedy = "Check its permissions."
         fault = PolarguideError(folder, expected="a folder that can be read", found=found, remedy=remedy)
     return [ExposureSet(folder.resolve().name, "filter", {}, fault=fault, others=(folder,))]
 
@@ -221,13 +222,15 @@ def _views(layout: Layout) -> list[ExposureSet]:
     """
     shots = []
     for name in layout.names:
-        others, fault = layout.others.get(name, ()), None
+        others = layout.others.get(name, ())
+        fault = None
         if others:
             try:
                 known_places(name, [exposure for _, exposure in others])
             except PolarguideError as error:
                 fault = error
-        files, more = layout.pictures.get(name, {}), tuple(path for path, _ in others)
+        files = layout.pictures.get(name, {})
+        more = tuple(path for path, _ in others)
         shots.append(ExposureSet(name, "scene", files, layout.root, name, fault, more))
     if shots and all(shot.fault is not None for shot in shots):
         assert shots[0].fault is not None

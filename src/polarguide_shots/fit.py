@@ -78,10 +78,13 @@ class SetModel:
         """Leave out the sample that is off most, pixel by pixel, while one is off by more than noise is."""
         at = np.flatnonzero(fit.determined)
         while at.size:
-            weights, picked = fit.weights[:, at], gray[:, at]
+            weights = fit.weights[:, at]
+            picked = gray[:, at]
             # Of four samples nobody can tell which is wrong: all are equally far off.
             testable = (weights > 0).sum(axis=0) >= 5
-            at, weights, picked = at[testable], weights[:, testable], picked[:, testable]
+            at = at[testable]
+            weights = weights[:, testable]
+            picked = picked[:, testable]
             if not at.size:
                 return
             off = picked - self.rows @ fit.stokes[:, at]
@@ -94,8 +97,10 @@ class SetModel:
             weights = weights[:, beyond]
             weights[worst[beyond], np.arange(beyond.size)] = 0
             determined = self._determined((weights > 0).astype(np.float32))
-            weights, beyond = weights[:, determined], beyond[determined]
-            at, picked = at[beyond], picked[:, beyond]
+            weights = weights[:, determined]
+            beyond = beyond[determined]
+            at = at[beyond]
+            picked = picked[:, beyond]
             if at.size:
                 fit.weights[:, at] = weights
                 fit.stokes[:, at], fit.covariance[:, at] = self._solve(weights, picked)
@@ -143,7 +148,8 @@ def maps_of_set(name: str, files: tuple[Path, ...], samples: SetSamples, options
     gray = samples.gray(chosen).astype(np.float64)
     judgment = judge(samples, gray)
     notes = [*samples.notes, *judgment.notes]
-    noise, channels = given_noise(options, samples.step), samples.values.shape[-1]
+    noise = given_noise(options, samples.step)
+    channels = samples.values.shape[-1]
     share = 1.0 if noise is None else 1 / channels
     if noise is None and judgment.used.sum() > 3:
         noise = estimated_set_noise(samples, gray, judgment.used)

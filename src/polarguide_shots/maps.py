@@ -176,7 +176,8 @@ def estimated_noise(intensities: Any, usable: NDArray[np.bool_], step: float) ->
     if len(chosen) < _FEWEST:
         return NoiseModel(least, 0.0, "estimated")
     i0, i45, i90, i135 = (np.ravel(i)[chosen].astype(np.float64) for i in intensities)
-    mean, excess = (i0 + i45 + i90 + i135) / 4, i0 + i90 - i45 - i135
+    mean = (i0 + i45 + i90 + i135) / 4
+    excess = i0 + i90 - i45 - i135
     # Whole numbers have no fine quantiles: even noise of one step makes them so, and is taken off again.
     excess += np.random.default_rng(0).uniform(-0.5, 0.5, len(excess)) * step
 
@@ -204,14 +205,18 @@ def binned_noise(
 
 def noise_line(x: NDArray[np.float64], y: NDArray[np.float64], least: float) -> tuple[float, float]:
     """Floor and slope, neither negative, of the line through variances; errors of a variance grow with it."""
-    weight, floor, slope = 1 / y, float(y.mean()), 0.0
+    weight = 1 / y
+    floor = float(y.mean())
+    slope = 0.0
     for _ in range(3):
         matrix = np.stack([np.ones_like(x), x], axis=1) * weight[:, None]
         (floor, slope), *_ = np.linalg.lstsq(matrix, y * weight, rcond=None)
         if slope < 0:
-            floor, slope = float((y * weight**2).sum() / (weight**2).sum()), 0.0
+            floor = float((y * weight**2).sum() / (weight**2).sum())
+            slope = 0.0
         elif floor < least:
-            floor, slope = least, float((((y - least) * x) * weight**2).sum() / ((x * weight) ** 2).sum())
+            floor = least
+            slope = float((((y - least) * x) * weight**2).sum() / ((x * weight) ** 2).sum())
         weight = 1 / np.maximum(floor + slope * x, least)
     return max(float(floor), least), max(float(slope), 0.0)
 
@@ -232,8 +237,10 @@ def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> tuple[NDArr
         more than the mean of the factors, as interpolated neighbors share samples.
     """
     pattern = sensor_pattern(sensor).shifted(x, y)
-    side, step = 4 * _REACH, DEMOSAIC_MODES[mode]
-    period, cell = max(1, pattern.period // step), max(pattern.period, step)
+    side = 4 * _REACH
+    step = DEMOSAIC_MODES[mode]
+    period = max(1, pattern.period // step)
+    cell = max(pattern.period, step)
     inner = slice(_REACH // step, 2 * _REACH // step)
     summed = np.zeros(len(ANGLES))
     # Half size is the mean over cells of full size, but for S0, of whose noise DoLP and AoLP hardly depend.

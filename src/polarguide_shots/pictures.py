@@ -160,11 +160,9 @@ def stretch_of(kind: MapKind, values: NDArray[Any], maps: ShotMaps) -> Stretch:
 
 def drawn(kind: MapKind, values: NDArray[Any], maps: ShotMaps, stretch: Stretch, step: int = 1) -> Picture:
     """The map in colors, without legend, every ``step``-th pixel: uint8 RGB [H, W, 3]."""
-    values, dolp, reason = (
-        values[::step, ::step],
-        maps.dolp[::step, ::step],
-        maps.reason[::step, ::step],
-    )
+    values = values[::step, ::step]
+    dolp = maps.dolp[::step, ::step]
+    reason = maps.reason[::step, ::step]
     height, width = reason.shape
     picture: Picture = np.empty((height, width, 3), np.uint8)
     for part in tiles(height, width):
@@ -247,7 +245,9 @@ def _mark(kind: MapKind, stretch: Stretch, scale: float) -> Picture:
 
 
 def _bar(kind: MapKind, stretch: Stretch, scale: float) -> Picture:
-    wide, high, margin = round(320 * scale), round(96 * scale), round(20 * scale)
+    wide = round(320 * scale)
+    high = round(96 * scale)
+    margin = round(20 * scale)
     mark: Picture = np.full((high, wide + 2 * margin, 3), 255, np.uint8)
     ramp = torch.linspace(stretch.low, stretch.high, wide).expand(round(34 * scale), -1)
     top = round(16 * scale)
@@ -267,7 +267,8 @@ def _bar(kind: MapKind, stretch: Stretch, scale: float) -> Picture:
 def _patches(high: int, scale: float) -> Picture:
     mark: Picture = np.full((high, round(520 * scale), 3), 255, np.uint8)
     for number, (code, color) in enumerate(REASON_COLORS.items()):
-        x, y = round((12 + 170 * (number % 3)) * scale), round((14 + 40 * (number // 3)) * scale)
+        x = round((12 + 170 * (number % 3)) * scale)
+        y = round((14 + 40 * (number // 3)) * scale)
         side = round(24 * scale)
         mark[y : y + side, x : x + side] = color
         cv2.rectangle(mark, (x, y), (x + side, y + side), INK, 1)

@@ -97,9 +97,11 @@ def fault_of(shot: ExposureSet, error: BaseException) -> PolarguideError:
     if isinstance(error, PolarguideError):
         return error
     if isinstance(error, OSError):
-        found, remedy = error.strerror or str(error), "Check the files and their disk."
+        found = error.strerror or str(error)
+        remedy = "Check the files and their disk."
     else:
-        found, remedy = "it needs more memory than there is", "Free memory, or take a smaller region."
+        found = "it needs more memory than there is"
+        remedy = "Free memory, or take a smaller region."
     expected = "a shot that can be read, and room for its maps"
     return PolarguideError(shot.where, expected=expected, found=found, remedy=remedy)
 
@@ -120,7 +122,8 @@ def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> Sh
     reason = torch.zeros((height, width), dtype=torch.uint8)
     factors = torch.from_numpy(np.ascontiguousarray(developed.factors))
     period = factors.shape[1]
-    floor, slope = developed.noise.floor, developed.noise.slope
+    floor = developed.noise.floor
+    slope = developed.noise.slope
     pattern: torch.Tensor | None = None
     for part in tiles(height, width):
         samples = torch.from_numpy(developed.intensities[:, part])
@@ -298,19 +301,28 @@ def _chosen_normal(
     zeniths = torch.stack((optics.diffuse_zenith(dolp, index), below, above))
     guess = unit(torch.tensor(TOWARD))
     x_ref, up_ref = optics.lens_frame(rays)
-    right, up, along = dot(x_ref, guess), dot(up_ref, guess), dot(rays, guess)
-    cosine, sine = torch.cos(aolp), torch.sin(aolp)
+    right = dot(x_ref, guess)
+    up = dot(up_ref, guess)
+    along = dot(rays, guess)
+    cosine = torch.cos(aolp)
+    sine = torch.sin(aolp)
     # Across the ray, toward the guess: with azimuth AoLP, and a quarter turn from it.
-    diffuse_side, specular_side = cosine * right + sine * up, cosine * up - sine * right
-    sines, cosines = torch.sin(zeniths), torch.cos(zeniths)
+    diffuse_side = cosine * right + sine * up
+    specular_side = cosine * up - sine * right
+    sines = torch.sin(zeniths)
+    cosines = torch.cos(zeniths)
     possible = (dolp <= optics.diffuse_dolp_limit(index)) | (s0 <= 0)
     score = torch.where(possible, sines[0] * diffuse_side.abs() - cosines[0] * along, -4.0)
-    sine_z, cosine_z, specular = sines[0], cosines[0], torch.zeros_like(possible)
+    sine_z = sines[0]
+    cosine_z = cosines[0]
+    specular = torch.zeros_like(possible)
     for sine_k, cosine_k in zip(sines[1:], cosines[1:], strict=True):
         other = sine_k * specular_side.abs() - cosine_k * along
         nearer = other > score
-        score, specular = torch.maximum(score, other), specular | nearer
-        sine_z, cosine_z = torch.where(nearer, sine_k, sine_z), torch.where(nearer, cosine_k, cosine_z)
+        score = torch.maximum(score, other)
+        specular = specular | nearer
+        sine_z = torch.where(nearer, sine_k, sine_z)
+        cosine_z = torch.where(nearer, cosine_k, cosine_z)
     sign = torch.where(torch.where(specular, specular_side, diffuse_side) < 0, -sine_z, sine_z)
     x = torch.where(specular, -sine, cosine) * sign
     y = torch.where(specular, cosine, sine) * sign

@@ -53,7 +53,8 @@ def place(degrees: float, middle: float, radius: float) -> tuple[float, float]:
 def _mark(step: int, middle: float, inner: float) -> list[str]:
     """A line from the hole outward, and its number where it has one."""
     long = step % LABELED == 0
-    (x1, y1), (x2, y2) = place(step, middle, inner), place(step, middle, inner + (5.0 if long else 3.0))
+    x1, y1 = place(step, middle, inner)
+    x2, y2 = place(step, middle, inner + (5.0 if long else 3.0))
     line = f'<line x1="{x1:.3f}" y1="{y1:.3f}" x2="{x2:.3f}" y2="{y2:.3f}" {_INK}/>'
     if not long:
         return [line]
@@ -80,7 +81,8 @@ def _top(middle: float, inner: float) -> list[str]:
 
 def _foot(middle: float, width: float, diameter: float) -> list[str]:
     """A ruler that shows whether the print has the right size, and what to do."""
-    y, left = width + 2.0, middle - RULER / 2
+    y = width + 2.0
+    left = middle - RULER / 2
     ticks = [
         f'<line x1="{left + x:.3f}" y1="{y - 1.5:.3f}" x2="{left + x:.3f}" y2="{y + 1.5:.3f}" {_INK}/>'
         for x in (0.0, RULER)

@@ -89,7 +89,8 @@ def _gathered(name: str, where: Path, count: int, pictures: Iterator[Shots]) -> 
     remedy = "Make the pictures smaller, all by the same factor."
     require_memory(where, needed, f"{count} pictures of {name}", remedy=remedy)
     values = np.empty((count, *first.dark.shape, colors), np.uint16)
-    lost, dark = np.empty(values.shape[:3], bool), np.ones(values.shape[1:3], bool)
+    lost = np.empty(values.shape[:3], bool)
+    dark = np.ones(values.shape[1:3], bool)
     for place, shot in enumerate(itertools.chain([first], pictures)):
         if values.shape[3] == 1 and not _is_gray(shot):
             values = np.repeat(values, 3, axis=3)
@@ -117,11 +118,16 @@ def _samples(
 
     ``files``: of the pictures; ``film``: the video that they are frames of.
     """
-    values, lost, dark, code = read.pictures, read.clipped, read.dark, read.orientation
+    values = read.pictures
+    lost = read.clipped
+    dark = read.dark
+    code = read.orientation
     levels, notes = levels_of_shot(values, 8 * kind.itemsize, options)
-    every, step = np.arange(np.iinfo(kind).max + 1, dtype=kind), 1 / float(np.iinfo(kind).max)
+    every = np.arange(np.iinfo(kind).max + 1, dtype=kind)
+    step = 1 / float(np.iinfo(kind).max)
     if levels is not None:
-        every, step = rescaled(every, levels.white), 1 / levels.white
+        every = rescaled(every, levels.white)
+        step = 1 / levels.white
     decision = transfer_of_pictures(
         files, options.transfer, lambda: [(_judged(read, every), angles)], video=film
     )
@@ -152,7 +158,8 @@ def _samples(
 def _judged(read: Shots, every: NDArray[Any]) -> Shots:
     """A sample of pictures with full scale that of the type of ``every``, which has what each stored value becomes."""
     usable = ~(read.clipped.any(axis=0) | read.dark)
-    pictures, sample = checks.sampled(read.pictures), checks.sampled(usable[None])
+    pictures = checks.sampled(read.pictures)
+    sample = checks.sampled(usable[None])
     return Shots(every[pictures], 1, ~sample, np.zeros(sample.shape[1:], bool))
 
 
@@ -172,7 +179,8 @@ def levels_of_shot(
     pile, notes = piled_up(values, container, options)
     if pile is None and options.bits is None and options.saturation is None:
         return None, []
-    bits, top = options.bits or container, options.saturation or pile
+    bits = options.bits or container
+    top = options.saturation or pile
     return estimate_levels(int(values.max()), 1, container, bits=bits, black=0.0, saturation=top), notes
 
 
@@ -286,7 +294,8 @@ def behind_lens(view: View, intensities: Tensor, exposures: Sequence[Exposure]) 
 def state_of(view: View) -> tuple[Mask, Mask, float]:
     """Dark and saturated pixels of a view, and one stored value as a share of full scale."""
     codes = view.codes.numpy()
-    peak, lost = codes.max(axis=(0, 3)), view.saturated.numpy()
+    peak = codes.max(axis=(0, 3))
+    lost = view.saturated.numpy()
     # Of pixels without polarization information, those nearer to black than to the brightest of the view are dark.
     dark = (lost & (peak < peak.max() / 2)) | (peak == 0)
     # Codes are multiples of what one stored value is, unless they were decoded or averaged.

@@ -47,14 +47,16 @@ def neighbor_noise(samples: SetSamples) -> NoiseModel:
     least = samples.step**2 / 12 / samples.values.shape[-1]
     height, width = samples.dark.shape
     step = max(1, height // max(1, 20 * MOST_PIXELS // max(width, 1)))
-    levels, differences = [], []
+    levels = []
+    differences = []
     for k, picture in enumerate(samples.gray(np.s_[::step]).astype(np.float64)):
         bad = samples.lost[k, ::step] | samples.dark[::step] | samples.masked[::step]
         good = ~(bad[:, :-2] | bad[:, 1:-1] | bad[:, 2:])
         gain = float(samples.gains[k])
         levels.append(gain * picture[:, 1:-1][good])
         differences.append(gain * (picture[:, 1:-1] - (picture[:, :-2] + picture[:, 2:]) / 2)[good])
-    level, apart = np.concatenate(levels), np.concatenate(differences)
+    level = np.concatenate(levels)
+    apart = np.concatenate(differences)
     if len(level) < FEWEST_PIXELS:
         return NoiseModel(least, 0.0, "estimated")
     return binned_noise(level, lambda part: typical_variance(apart[part] ** 2, 1) / 1.5, least)

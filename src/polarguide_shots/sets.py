@@ -226,7 +226,8 @@ def by_folder(root: Path) -> list[ExposureSet]:
 
 def _any_angles(folder: Path, views: dict[str, list[SetPicture]]) -> tuple[list[ExposureSet], list[Path]]:
     """The sets of a folder; and the files of views at 0, 45, 90 and 135 degrees, or some of them."""
-    sets, four = [], []
+    sets = []
+    four = []
     for view, mine in sorted(views.items()):
         paths = [picture.path for picture in mine]
         # Of these angles, names with a mark such as cup_a45 are known here alone.

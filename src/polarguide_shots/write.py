@@ -264,7 +264,8 @@ def shot_page(maps: ShotMaps, surface: SurfaceMaps) -> str:
     """
     step = max(1, math.ceil(max(maps.size) / SIDE))
     kinds = [kind for kind in kinds_of(maps) if kind.key not in _HIDDEN]
-    layers, stretches = [], []
+    layers = []
+    stretches = []
     for kind in kinds:
         values = kind.values(maps, surface)
         stretch = stretch_of(kind, values, maps)

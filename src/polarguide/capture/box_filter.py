@@ -61,12 +61,14 @@ def _strided(values: NDArray[Any], factor: int) -> list[NDArray[Any]]:
 
     For work element by element: NumPy reduces over short axes an order of magnitude slower.
     """
-    height, width = values.shape[0] // factor * factor, values.shape[1] // factor * factor
+    height = values.shape[0] // factor * factor
+    width = values.shape[1] // factor * factor
     return [values[i:height:factor, j:width:factor] for i in range(factor) for j in range(factor)]
 
 
 def _boxed(values: NDArray[Any], factor: int) -> NDArray[Any]:
     """[H, W, ...] -> [H // K, K, W // K, K, ...]."""
-    rows, columns = values.shape[0] // factor, values.shape[1] // factor
+    rows = values.shape[0] // factor
+    columns = values.shape[1] // factor
     cut = values[: rows * factor, : columns * factor]
     return cut.reshape(rows, factor, columns, factor, *values.shape[2:])

@@ -100,7 +100,8 @@ def combined(first: Calibration, second: Calibration) -> Calibration | None:
         Order, sense and zero, without gains; None where no calibration says the same (pictures that ``first`` turned
         by a part of 45 degrees, and ``second`` pairs otherwise).
     """
-    (named, turn), (renamed, more) = first.true_angles(), second.true_angles()
+    named, turn = first.true_angles()
+    renamed, more = second.true_angles()
     angles = tuple(renamed[ANGLES.index(angle)] for angle in named)
     senses: tuple[tuple[Sense, int], ...] = (("ccw", 1), ("cw", -1))
     sign = next((sign for _, sign in senses if renamed == _count(sign, renamed[0])), None)
@@ -160,7 +161,8 @@ def pair_ratio(angles: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> 
         The ratio, or None where fewer than 32 samples are bright enough to tell.
     """
     i0, i45, i90, i135 = angles[:, usable].astype(np.float64)
-    first, second = i0 + i90, i45 + i135
+    first = i0 + i90
+    second = i45 + i135
     bright = np.minimum(first, second) > 0.02
     if bright.sum() < _FEWEST:
         return None

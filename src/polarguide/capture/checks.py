@@ -265,7 +265,8 @@ def pair_slopes(
     tile = (rows[:, None] * _TILES + columns)[usable]
     first, second = (gray[:, usable][[pair[side] for pair in pairs]] for side in (0, 1))
     s0 = (first + second).mean(axis=0)
-    sums, polarized = (first + second) / s0, (first - second) / s0
+    sums = (first + second) / s0
+    polarized = (first - second) / s0
     tiles = np.zeros((_TILES**2, 5))
     for one, other in itertools.combinations(range(len(pairs)), 2):
         taken_off = np.stack([np.ones_like(s0), polarized[one], polarized[other]], axis=1)
@@ -355,7 +356,8 @@ def pair_moments(gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> 
         gray: linear intensities [4, H, W]. usable: [H, W].
     """
     step = max(1, math.ceil(math.sqrt(usable.size / _MOMENT_SAMPLES)))
-    gray, usable = gray[:, ::step, ::step].astype(np.float64), usable[::step, ::step]
+    gray = gray[:, ::step, ::step].astype(np.float64)
+    usable = usable[::step, ::step]
     total = gray.sum(axis=0)
     usable = usable & (total > 4 * _HIDDEN * float(gray.max(initial=0)))
     rows = np.where(usable, gray / np.where(usable, total, 1.0), 0.0)

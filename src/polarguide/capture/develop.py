@@ -117,7 +117,8 @@ class MosaicFiles:
         return values
 
     def _require_memory(self, path: Path) -> None:
-        worked, raw = WORKED[self._options.demosaic], self._raw
+        worked = WORKED[self._options.demosaic]
+        raw = self._raw
         remedy = "Give a region of the sensor, or choose --demosaic half or quarter."
         if path.suffix.lower() != ".raw":
             require_memory_of_each([path], worked, "a mosaic", remedy=remedy)
@@ -194,7 +195,8 @@ class MosaicFiles:
             dark: the dark frame, or None.
             shape: rows and columns of a mosaic, cut.
         """
-        values, period = np.concatenate(samples), self.pattern.period
+        values = np.concatenate(samples)
+        period = self.pattern.period
         floor = None if dark is None else np.tile(sample_blocks(dark, 2 * period), (len(samples), 1, 1))
         linear = levels.linear(values, floor).astype(np.float64)
         if self.analyzers is not None:
@@ -280,7 +282,8 @@ _BLOCKS = 1024
 
 def sample_blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
     """A regular subset of a mosaic's blocks, [N, size, size]."""
-    rows, columns = values.shape[0] // size, values.shape[1] // size
+    rows = values.shape[0] // size
+    columns = values.shape[1] // size
     grid = values[: rows * size, : columns * size].reshape(rows, size, columns, size)
     row, column = np.divmod(np.arange(0, rows * columns, max(1, rows * columns // _BLOCKS)), max(columns, 1))
     return grid.swapaxes(1, 2)[row, column]
@@ -303,7 +306,8 @@ def gains_of(ratio: float | None, options: RawOptions, notes: Mapping[str, str])
         return UNIT_GAINS, imbalance_notes(ratio)
     if options.calibration.gains is not None:
         return options.calibration.gains, []
-    gains, outcome = balancing_gains(ratio), "dark" if ratio is None else "off"
+    gains = balancing_gains(ratio)
+    outcome = "dark" if ratio is None else "off"
     deviation = 0.0 if ratio is None else ratio - 1
     if gains is not None:
         outcome = "corrected" if options.gains == "auto" else "left"
@@ -456,7 +460,8 @@ def levels_of_shots(
     wide = [path for path in paths if not is_camera_raw(path) and may_use_fewer_bits(path)]
     if not wide and options.bits is None and options.saturation is None:
         return None, []
-    counts, container = np.zeros(FULL_16 + 1, np.int64), 8
+    counts = np.zeros(FULL_16 + 1, np.int64)
+    container = 8
     for path in wide or paths:
         values = read_stack([path], white).pictures
         container = 8 * values.dtype.itemsize

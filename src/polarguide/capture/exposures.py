@@ -392,7 +392,8 @@ def covers_turn(angles: Sequence[float]) -> bool:
     if len(different) < FEWEST:
         return False
     steps = [b - a for a, b in itertools.pairwise(different)]
-    step, count = steps[0], len(different)
+    step = steps[0]
+    count = len(different)
     even = step >= _SMALLEST_STEP and all(abs(other - step) < _ALIKE for other in steps)
     return even and any(abs(span - turn) < _ALIKE for span in (step * count, step * (count - 1))
                         for turn in (180.0, 360.0))  # fmt: skip

@@ -65,7 +65,8 @@ def codes_of_floats(values: NDArray[Any], where: str) -> NDArray[np.uint16]:
     Raises:
         PolarguideError: one is outside 0 to 1, or not a number.
     """
-    low, high = float(values.min()), float(values.max())
+    low = float(values.min())
+    high = float(values.max())
     if not (low >= 0 and high <= 1):
         raise PolarguideError(
             where,

@@ -390,9 +390,11 @@ def require_memory(where: Path, needed: int, what: str, *, remedy: str, limit: f
         PolarguideError: that is less.
     """
     if limit is not None:
-        allowed, whose = int(limit * GIBIBYTE), "as --memory allows"
+        allowed = int(limit * GIBIBYTE)
+        whose = "as --memory allows"
     else:
-        allowed, whose = int(SHARE * free_memory()), f"{SHARE:.0%} of what is free"
+        allowed = int(SHARE * free_memory())
+        whose = f"{SHARE:.0%} of what is free"
     if needed > allowed:
         raise PolarguideError(
             where,

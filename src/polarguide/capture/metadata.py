@@ -16,7 +16,8 @@ from polarguide.core.text import canonical
 from polarguide.geometry.polarizer import ANGLES
 from polarguide.optics import Mount
 
-LEAST_INDEX, LARGEST_INDEX = 1.0, 4.0
+LEAST_INDEX = 1.0
+LARGEST_INDEX = 4.0
 # Of the numbers in materials/, the first that the table of scene.json explains.
 FIRST_LISTED = 3
 Index = Annotated[float, msgspec.Meta(gt=LEAST_INDEX, lt=LARGEST_INDEX)]

@@ -156,7 +156,8 @@ def judge(samples: SetSamples, gray: Floats) -> SetJudgment:
     Args:
         samples: the set. gray: [K, N], its luminance at some pixels that are good in every picture.
     """
-    rows, count = samples.rows.astype(np.float64), len(samples.labels)
+    rows = samples.rows.astype(np.float64)
+    count = len(samples.labels)
     used = np.ones(count, bool)
     reasons: dict[int, str] = {}
     while gray.shape[1] >= FEWEST_PIXELS:
@@ -169,7 +170,8 @@ def judge(samples: SetSamples, gray: Floats) -> SetJudgment:
         worst = next((k for k in doubtful if _contradicts(samples, gray, used, k, predicted)), None)
         if worst is None:
             break
-        used[worst], reasons[worst] = False, _reason(samples, worst, predicted[worst])
+        used[worst] = False
+        reasons[worst] = _reason(samples, worst, predicted[worst])
     fits = tuple(_picture(samples, k, _predicted(rows, gray, used, k), bool(used[k])) for k in range(count))
     notes = [reasons[k] for k in sorted(reasons)]
     off_by = [abs(_apart(f.looks_like, f.angle)) for f in fits if f.looks_like is not None and not f.left_out]
@@ -197,7 +199,8 @@ def _contradicts(
     samples: SetSamples, gray: Floats, used: NDArray[np.bool_], worst: int, predicted: dict[int, _Angle]
 ) -> bool:
     """Whether the others agree with one another far better than a picture does with them, by angle or residual."""
-    rows, rest = samples.rows.astype(np.float64), used.copy()
+    rows = samples.rows.astype(np.float64)
+    rest = used.copy()
     rest[worst] = False
     if rest.sum() < 4 or conditioning(torch.from_numpy(2 * rows[rest, 1:])) < WELL_CONDITIONED:
         return False
@@ -232,7 +235,8 @@ def _predicted(rows: Floats, gray: Floats, used: NDArray[np.bool_], k: int) -> _
     others = used.copy()
     others[k] = False
     inverse = np.linalg.pinv(rows[others])
-    stokes, picture = inverse @ gray[others], gray[k]
+    stokes = inverse @ gray[others]
+    picture = gray[k]
     pixels = picture.size
     left = gray[others] - rows[others] @ stokes
     freedom = int(others.sum()) - 3

@@ -22,11 +22,13 @@ FEWEST = 20
 MOST_POINTS = 20_000
 """Points that are compared, those with the longest tracks."""
 _LEAST_TRACK = 3
-_ROUNDS, _SETTLED = 40, 1e-4
+_ROUNDS = 40
+_SETTLED = 1e-4
 # Residuals of logarithms that are no smaller than noise and rounding.
 _SMALLEST = 0.03
 # Times that space is halved, as far as pictures keep FEWEST points in most parts.
-_LEAST_DIVISIONS, _MOST_DIVISIONS = 2, 4
+_LEAST_DIVISIONS = 2
+_MOST_DIVISIONS = 4
 # Probability that exposures which are all equal are called different.
 _FALSE_ALARM = 0.01
 _ERRORS = 2.0
@@ -102,7 +104,9 @@ def exposures_of_points(values: Array, places: Array) -> PointExposures:
     valid = _measured(values)
     chosen_points = np.argsort(-valid.sum(axis=1), kind="stable")[:MOST_POINTS]
     chosen_points = chosen_points[valid[chosen_points].sum(axis=1) >= min(_LEAST_TRACK, count)]
-    values, valid, places = values[chosen_points], valid[chosen_points], places[chosen_points]
+    values = values[chosen_points]
+    valid = valid[chosen_points]
+    places = places[chosen_points]
     numbers = valid.sum(axis=0)
     chosen = _connected(valid, FEWEST)
     if len(chosen) < 2:
@@ -146,7 +150,8 @@ def _solved_channel(
     """The exposures of one channel from logarithms of intensities at pairs of point and picture."""
     rows, columns = size
     tracks = np.bincount(point, minlength=rows)
-    weights, solution = np.ones(len(log)), np.zeros(columns)
+    weights = np.ones(len(log))
+    solution = np.zeros(columns)
     for _ in range(_ROUNDS):
         before = solution
         total = np.bincount(point, weights, rows)
@@ -184,7 +189,8 @@ def _parts(places: Array, divisions: int) -> NDArray[np.int64]:
 def _errors(values: Array, parts: NDArray[np.int64], logs: Array) -> Array:
     """Standard deviations over parts of space, weighted by their numbers of points: of brightness and color, [2, V]."""
     squares = np.zeros((2, len(logs)))
-    total, used = np.zeros(len(logs)), np.zeros(len(logs), np.int64)
+    total = np.zeros(len(logs))
+    used = np.zeros(len(logs), np.int64)
     for part in np.unique(parts):
         mine = values[parts == part]
         seen = _measured(mine)

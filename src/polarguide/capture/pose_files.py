@@ -187,7 +187,8 @@ def read_metashape(path: Path, views: Collection[str]) -> dict[str, PosedCamera]
     world_cameras: dict[str, PosedCamera] = {}
     for camera in posed:
         label = camera.get("label") or ""
-        where, view = f"{path} (camera {label})", view_of_name(label, views)
+        where = f"{path} (camera {label})"
+        view = view_of_name(label, views)
         sensor = sensors.get(camera.get("sensor_id"))
         if sensor is None:
             raise wrong_camera(where, "the sensor it names", "none")

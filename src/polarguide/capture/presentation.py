@@ -183,7 +183,8 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
     def over(self, other: Presentation) -> Presentation:
         """This, with another's fields where this one has none; those of ``EITHER`` are one of them."""
-        own, above = _given(self), _given(other)
+        own = _given(self)
+        above = _given(other)
         for names in EITHER:
             if not own.keys().isdisjoint(names):
                 above = {name: value for name, value in above.items() if name not in names}

@@ -158,7 +158,8 @@ def _held_out(
 ) -> tuple[tuple[str, ...], list[str]]:
     """The names of the test views, and a warning where some are far from what is trained on, or a ring of them is."""
     check_choice("split", split, get_args(Split))
-    data, posed = files.read_if_there(path, None), frozenset(model.names)
+    data = files.read_if_there(path, None)
+    posed = frozenset(model.names)
     cameras = {name: model.camera(name) for name in layout.names if name in posed}
     if test_views is not None:  # whoever asks has been told
         return tuple(name for name in sorted(test_views) if name in layout.names), []
@@ -245,7 +246,8 @@ def _content_warnings(layout: Layout, stored: StoredViews, invalid: list[str]) -
     def is_gray(picture: NDArray[np.uint16]) -> bool:
         return bool(picture.any()) and bool((picture == picture[..., :1]).all())
 
-    count, same_file = len(stored.data), []
+    count = len(stored.data)
+    same_file = []
     views: dict[tuple[str, ...], list[str]] = {}
     for item in stored.data:
         digests = tuple(item.digests[path] for path in layout.files(item.name))

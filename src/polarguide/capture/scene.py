@@ -335,10 +335,8 @@ def _view_of(
     floats = np.issubdtype(as_numpy(pictures).dtype, np.floating)
     if floats and transfer != "linear":
         raise _unlike(where, f"whole numbers, which transfer {transfer} decodes", "floats, which are linear")
-    stored, exposures = (
-        stored_pictures(pictures, where),
-        exposures_of(angles, len(pictures), f"angles ({name})"),
-    )
+    stored = stored_pictures(pictures, where)
+    exposures = exposures_of(angles, len(pictures), f"angles ({name})")
     stored, exposures = in_order(stored, exposures)
     height, width = stored.shape[1:3]
     require_factor(factor, height, width)

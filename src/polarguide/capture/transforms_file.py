@@ -300,7 +300,8 @@ def _stated_size(where: str, lens: Mapping[str, Any]) -> tuple[int, int] | None:
     Raises:
         PolarguideError: the file has one of the two, or a size that no picture has.
     """
-    width, height = lens["w"], lens["h"]
+    width = lens["w"]
+    height = lens["h"]
     if width is None and height is None:
         return None
     if not width or not height or not 0 < width < 1e5 or not 0 < height < 1e5:
@@ -318,7 +319,9 @@ def _focal_lengths(
     """
     lengths: list[float | None] = []
     for axis, side in zip("xy", size, strict=True):
-        length, angle, degrees = lens[f"fl_{axis}"], lens[f"camera_angle_{axis}"], lens[f"{axis}_fov"]
+        length = lens[f"fl_{axis}"]
+        angle = lens[f"camera_angle_{axis}"]
+        degrees = lens[f"{axis}_fov"]
         angles = [*([angle] if angle else []), *([math.radians(degrees)] if degrees else [])]
         by_angle = [side / 2 / math.tan(view / 2) for view in angles if 0 < view < math.pi]
         if len(by_angle) < len(angles) or (length is not None and not length > 0):

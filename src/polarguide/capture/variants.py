@@ -100,7 +100,8 @@ def mask_background(scene: Scene) -> Scene:
 
 def _in_masks(points: Tensor, views: Sequence[View]) -> Tensor:
     """Which points [M, 3] lie in the grown masks of most of the pictures that they fall into, [M] bool."""
-    counts, inside = torch.zeros(len(points)), torch.zeros(len(points))
+    counts = torch.zeros(len(points))
+    inside = torch.zeros(len(points))
     for view in views:
         assert view.mask is not None
         mask = torch.from_numpy(_grown(view.mask.cpu().numpy(), GROWN))
@@ -179,7 +180,8 @@ def _computed(view: View, pictures: Callable[[View], list[Tensor]], exposures: t
 
 def _three(view: View, _place: int) -> View:
     def pictures(view: View) -> list[Tensor]:
-        stokes, rays = view.stokes(), view.camera.rays()
+        stokes = view.stokes()
+        rays = view.camera.rays()
         intensities = []
         for angle in THREE:
             cosine, sine = optics.analyzer(math.radians(angle), rays, view.mount)[..., None].unbind(0)
@@ -241,7 +243,8 @@ class SmallerViews(Sequence[View]):
     """Views averaged over boxes of pixels, each made at its first use."""
 
     def __init__(self, views: Sequence[View], factor: int) -> None:
-        self._views, self._factor = views, factor
+        self._views = views
+        self._factor = factor
         self._made: dict[int, View] = {}
         self._latest = Latest()
 

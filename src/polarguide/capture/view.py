@@ -83,7 +83,9 @@ class Loader(Generic[T]):
     """
 
     def __init__(self, make: Callable[[], T], latest: Latest, *, derived: bool = False) -> None:
-        self._make, self._latest, self._derived = make, latest, derived
+        self._make = make
+        self._latest = latest
+        self._derived = derived
 
     def __call__(self) -> T:
         """The value."""
@@ -169,7 +171,8 @@ class View:
         return self.truth() if isinstance(self.truth, Loader) else self.truth
 
     def __repr__(self) -> str:
-        size, angles = f"{self.camera.width}x{self.camera.height}", ", ".join(e.words for e in self.exposures)
+        size = f"{self.camera.width}x{self.camera.height}"
+        angles = ", ".join(e.words for e in self.exposures)
         beside = {"mask": self.mask, "materials": self.materials, "ground truth": self.truth}
         more = ", ".join(name for name, there in beside.items() if there is not None) or "no mask"
         return (

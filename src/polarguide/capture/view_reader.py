@@ -122,7 +122,8 @@ class ViewData:
             files: load codes and ground truth when they are read; None: those that are here stay in memory.
             gains: as in ``View``.
         """
-        invalid, saturated = torch.from_numpy(self.invalid), torch.from_numpy(self.saturated(scale))
+        invalid = torch.from_numpy(self.invalid)
+        saturated = torch.from_numpy(self.saturated(scale))
         return View(
             name=self.name,
             camera=camera,
@@ -146,8 +147,12 @@ class ViewFiles:
     """
 
     def __init__(self, layout: Layout, factor: int, transfer: str, digests: Mapping[Path, str]) -> None:
-        self._layout, self._factor, self._transfer, self._digests = layout, factor, transfer, digests
-        self._pictures, self._truths = Latest(), Latest()
+        self._layout = layout
+        self._factor = factor
+        self._transfer = transfer
+        self._digests = digests
+        self._pictures = Latest()
+        self._truths = Latest()
 
     def codes(self, name: str) -> Loader[Tensor]:
         """Loader of ``View.codes``, which raises an error if a file was changed or deleted."""
@@ -432,7 +437,8 @@ class StoredViews:
 
     def picture_warnings(self, transfer: str) -> list[str]:
         """Warnings about the exposure, encoding and order of the pictures."""
-        names, scale = [item.name for item in self.data], self.full_scale
+        names = [item.name for item in self.data]
+        scale = self.full_scale
         blown = [0.0 if scale is None else float((item.peak >= scale).mean()) for item in self.data]
         largest = max(int(item.peak.max()) for item in self.data)
         warnings = checks.exposure_warnings(names, self.measures, blown, largest, self.largest_value)

@@ -99,7 +99,8 @@ def requirements() -> list[Requirement]:
     listed = []
     for line in lines:
         text, _, condition = (part.strip() for part in line.partition(";"))
-        extra, name = _EXTRA.search(condition), _NAME.match(text)
+        extra = _EXTRA.search(condition)
+        name = _NAME.match(text)
         conditional = bool(_EXTRA.sub("", condition).strip(" ()"))
         listed.append(Requirement(name[0] if name else text, text, extra[1] if extra else "", conditional))
     return listed

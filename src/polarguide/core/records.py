@@ -170,7 +170,8 @@ def _fault(message: str, value: Any, kind: Any) -> tuple[str, str, str]:
         value = _at(value, name, index)
         form = _form_at(form, name, index)
     field = path.lstrip(".")
-    expected, value_found = _plain(what.removeprefix("Expected ")), shortened(value)
+    expected = _plain(what.removeprefix("Expected "))
+    value_found = shortened(value)
     if value is _UNKNOWN:
         value_found = _plain(got) or "another"
     if what.startswith("Object contains unknown field"):

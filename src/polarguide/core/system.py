@@ -24,7 +24,9 @@ from polarguide.core.options import MOST_THREADS
 MEBIBYTE = 1 << 20
 LAST_WORDS_SECONDS = 5.0
 MOST_PROCESSES = 65536
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
+# of glibc's malloc.h
+M_TRIM_THRESHOLD = -1
+M_MMAP_THRESHOLD = -3
 NEARLY = 0.9
 """Share of a memory limit from which on freed memory is given back."""
 GROWTH = 1.05
@@ -205,18 +207,23 @@ class MemoryBound:
     """
 
     def __init__(self, limit: float = math.inf) -> None:
-        self._limit, self._least = limit, NEARLY * limit
-        self._bound, self._most, self._waits = self._least, 0.0, 0
+        self._limit = limit
+        self._least = NEARLY * limit
+        self._bound = self._least
+        self._most = 0.0
+        self._waits = 0
 
     def keep(self) -> None:
         """Call once per step, when allocations of successive steps have similar sizes."""
         resident = resident_memory()
         if self._waits:  # steps take what they need again: under the most of it there is nothing to return
-            self._most, self._waits = max(self._most, resident), self._waits - 1
+            self._most = max(self._most, resident)
+            self._waits -= 1
             self._bound = min(max(self._least, GROWTH * self._most), self._limit)
         elif resident > self._bound:
             return_freed_memory()
-            self._most, self._waits = 0.0, SETTLED
+            self._most = 0.0
+            self._waits = SETTLED
 
     def clear(self) -> None:
         """Call between two operations whose allocations have different sizes, such as a view's targets and a step."""

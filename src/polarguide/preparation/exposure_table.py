@@ -164,11 +164,14 @@ def _estimate(root: Path, pictures: list[_Exposure], posed: bool, reporter: Repo
     files = np.log(np.array([math.nan if light is None else light for light in noted], np.float64))
     within = _within_views(pictures, files)
     rows = {view: [k for k, picture in enumerate(pictures) if picture.view == view] for view in views}
-    points, numbers = np.full(len(views), math.nan), np.zeros(len(views), np.int64)
+    points = np.full(len(views), math.nan)
+    numbers = np.zeros(len(views), np.int64)
     errors = np.full(len(views), math.inf)
     compared = _of_points(root, pictures, rows, within, reporter) if posed and len(views) > 1 else None
     if compared is not None:
-        points, numbers, errors = compared.logs[:, 0], compared.points, compared.errors
+        points = compared.logs[:, 0]
+        numbers = compared.points
+        errors = compared.errors
     of_view = np.array([float(np.mean((files - within)[rows[view]])) for view in views])
     # Views that were photographed both ways: whatever the shots are compared at, most of it passed the filter.
     bare = np.array([all(pictures[k].record["angle"] == "none" for k in rows[view]) for view in views])
@@ -178,7 +181,8 @@ def _estimate(root: Path, pictures: list[_Exposure], posed: bool, reporter: Repo
     for place, view in enumerate(views):
         log = estimate.logs[place] if math.isfinite(estimate.logs[place]) else middle
         for k in rows[view]:
-            pictures[k].log, pictures[k].points = float(log + within[k]), int(numbers[place])
+            pictures[k].log = float(log + within[k])
+            pictures[k].points = int(numbers[place])
     how = "" if compared is None else _significance(compared.significant[:, 0], errors)
     _say_how(views, points, of_view, estimate.scatter, lost, how, reporter)
     _warn([views[k] for k in estimate.contradicted], pictures, of_view, reporter)
@@ -245,7 +249,8 @@ def _say_how(
     reporter: Reporter,
 ) -> None:
     """Where the gains come from."""
-    by_points, by_files = int(np.isfinite(points).sum()), int(np.isfinite(files).sum())
+    by_points = int(np.isfinite(points).sum())
+    by_files = int(np.isfinite(files).sum())
     if scatter is not None:
         origin = f"Gains: exposures that the files state, and points in common ({by_points} of {len(views)} views); "
         reporter.say(f"{origin}the two differ by {scatter:.1%} (robust standard deviation).")

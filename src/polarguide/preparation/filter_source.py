@@ -97,8 +97,10 @@ class ShotsSource(Source):
         Raises:
             PolarguideError: white balance or transfer do not fit the files.
         """
-        self._settings, self._of_view = settings, views
-        self.paths, self.views = paths, sorted(views)
+        self._settings = settings
+        self._of_view = views
+        self.paths = paths
+        self.views = sorted(views)
         self._shots = [path for view in self.views for path in views[view]]
         self._white = development_of(self._shots, settings)
         self._as_stored: frozenset[str] = frozenset()
@@ -168,7 +170,8 @@ class ShotsSource(Source):
         shots = read_stack(self._of_view[view], self._white, levels)
         linear = linear_intensities(shots.pictures, measured["transfer"])
         bad = shots.clipped | shots.dark
-        shifts, notes = [Shift(0.0, 0.0, True)] * len(linear), []
+        shifts = [Shift(0.0, 0.0, True)] * len(linear)
+        notes = []
         if align:
             shifts = estimate_shifts(linear)
             linear, bad = align_shots(linear, bad, shifts)
@@ -269,9 +272,11 @@ class FilterSource(ShotsSource):
         """Read the four shots: validity, transfer, shifts, exposures, gains, the sense of the angles, then the turn."""
         settings = self._settings
         developed = self._linear(view, measured, align=settings.align)
-        usable, paths = ~developed.invalid, self._of_view[view]
+        usable = ~developed.invalid
+        paths = self._of_view[view]
         light = [measured["light"].get(self._name(path), 1.0) for path in paths]
-        exposed, warning = UNIT_GAINS, ""
+        exposed = UNIT_GAINS
+        warning = ""
         if settings.gains == "auto":
             exposed, warning = exposures_of_view(
                 [path.name for path in paths], developed.linear.mean(axis=3), usable, light
@@ -374,7 +379,8 @@ class SinglesSource(ShotsSource):
 
     def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
         """Read the shots of a view: validity, transfer, shifts of the usual four, the turn of pictures and angles."""
-        settings, mine = self._settings, self._singles[view]
+        settings = self._settings
+        mine = self._singles[view]
         usual = [shot.angle for shot in mine] == list(ANGLES)
         developed = self._linear(view, measured, align=settings.align and usual)
         code = developed.orientation
@@ -401,7 +407,8 @@ class SinglesSource(ShotsSource):
         for shot in itertools.chain(*self._singles.values()):
             angle = turned(shot.angle, self._settings.calibration)
             counts[angle if isinstance(angle, str) else round(angle, 1) % 180] += 1
-        unknown, bare = counts.pop("unknown", 0), counts.pop("none", 0)
+        unknown = counts.pop("unknown", 0)
+        bare = counts.pop("none", 0)
         angles = [angle_text(angle) for angle in sorted(a for a in counts if not isinstance(a, str))]
         parts = (
             (counts.total(), f"at known angles ({listed(angles, 12)})"),

@@ -137,7 +137,8 @@ class SceneFolder:
         self._finished_before: bytes | None = None
         self._there_before = root.exists()
         check_out(root)
-        whole, journal = root / SCENE, root / JOURNAL
+        whole = root / SCENE
+        journal = root / JOURNAL
         path = journal if journal.exists() else whole
         if path.exists():
             self._go_on(path)
@@ -166,7 +167,8 @@ class SceneFolder:
             if journal.prepare.request.format == "singles":
                 _require_exposures(path, view, record)
         state = content["prepare"]
-        before, now = json.loads(json.dumps(state["request"])), json.loads(json.dumps(self.request))
+        before = json.loads(json.dumps(state["request"]))
+        now = json.loads(json.dumps(self.request))
         if before["settings"].get("white_balance") == "grey":  # its name in earlier journals
             before["settings"]["white_balance"] = "gray"
         for name in ("analyzers", "angles"):  # earlier journals do not know them
@@ -400,7 +402,8 @@ class Workshop:
 
     def _photographs(self, views: list[str]) -> dict[str, Geometry]:
         """Tone-mapped pictures and object masks of views, and how they lie in the files."""
-        images, masks = self._root / "images", self._root / "masks"
+        images = self._root / "images"
+        masks = self._root / "masks"
         measured = self._folder.measured
         assert measured is not None
         known = measured.setdefault(PHOTOGRAPHS, {})

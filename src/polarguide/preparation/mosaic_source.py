@@ -83,7 +83,8 @@ class MosaicSource(Source):
         self.views = list(self._files)
         self.paths = list(self._files.values() if dataset is None else dataset.paths)
         self.paths += [path for path in (self._dark_path, settings.analyzers) if path is not None]
-        self._crop, self._pattern = self._mosaics.crop, self._mosaics.pattern
+        self._crop = self._mosaics.crop
+        self._pattern = self._mosaics.pattern
         self._white = white_gains(settings.white_balance)
         self._defective: NDArray[np.bool_] | None = None
         if self._pattern.colors is None and settings.white_balance != "none":
@@ -96,7 +97,8 @@ class MosaicSource(Source):
 
     def stored(self, view: str) -> Stored:
         """By the header of the mosaic, or as the settings say."""
-        width, height = self._settings.width, self._settings.height
+        width = self._settings.width
+        height = self._settings.height
         stated = None if width is None or height is None else (width, height)
         size = stated_size(self._files[view]) or stated
         if size is not None and self._settings.flip in QUARTER_TURNS:
@@ -110,7 +112,8 @@ class MosaicSource(Source):
     def measure(self, advance: Advance) -> dict[str, Any]:
         """Levels, gains of the angles and white balance of the capture; every file is read once."""
         counts = np.zeros(FULL_16 + 1, np.int64)
-        container, shape = 0, None
+        container = 0
+        shape = None
         stated: dict[Path, int | None] = {}
         samples: list[NDArray[Any]] = []
         blocks: list[NDArray[Any]] = []
@@ -126,7 +129,8 @@ class MosaicSource(Source):
             advance(count)
         assert shape is not None
         settings = self._settings
-        occurring, full = np.flatnonzero(counts), agreed_full_scale(stated)
+        occurring = np.flatnonzero(counts)
+        full = agreed_full_scale(stated)
         levels = estimate_levels(
             int(occurring[-1]), int(np.bitwise_or.reduce(occurring)), container,
             bits=settings.bits, black=settings.black_level, saturation=settings.saturation, counts=counts, stated=full,

@@ -361,7 +361,8 @@ def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto
     if path.is_dir() and not holds_model(path):
         parts = parts_of_poses(path)
     if parts:
-        known, assumed = set(pictures.views), set[str]()
+        known = set(pictures.views)
+        assumed = set[str]()
 
         def sizes(view: str) -> tuple[tuple[int, int], ...]:
             assumed.add(view)
@@ -416,7 +417,8 @@ def settle_pose_frames(pictures: Source, poses: Poses, frame_given: str) -> str:
             continue
         codes[view] = stored.orientation
         if stored.size is not None and stored.orientation in QUARTER_TURNS:
-            (width, height), camera = stored.size, poses.stated_size(view)
+            width, height = stored.size
+            camera = poses.stated_size(view)
             if camera is not None and width != height and camera[0] != camera[1]:
                 by_size[view] = (width > height) == (camera[0] > camera[1])
     if not codes:
@@ -435,7 +437,8 @@ def settle_pose_frames(pictures: Source, poses: Poses, frame_given: str) -> str:
         frame, other = ("stored", "displayed") if unturned else ("displayed", "stored")
         text = f"their poses are taken to be of the {frame} pixels, {reason}"
     else:
-        frame, other = "stored", "displayed"
+        frame = "stored"
+        other = "displayed"
         kind = f"the poses of {len(unturned)} are taken to be of the stored pixels"
         text = f"{kind}, {reason}, those of the others of the displayed ones"
     used = "Those views, their angles and masks are used as stored. " if unturned else ""

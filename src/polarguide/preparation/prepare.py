@@ -84,8 +84,10 @@ def prepare_scene(
         PolarguideError: the source or a setting cannot be used, ``out`` holds something else, or structure from motion
             does not connect the views; then nothing of this call is left in ``out``.
     """
-    settings, reporter = settings or PrepareSettings(), reporter or Reporter()
-    root, target = Path(source), Path(out)
+    settings = settings or PrepareSettings()
+    reporter = reporter or Reporter()
+    root = Path(source)
+    target = Path(out)
     settings = settings.checked()
     root, settings = frames_of_video(root, target, settings, reporter)
     pictures = open_source(root, settings)
@@ -264,7 +266,10 @@ def _write_view(
     """Write the pictures of a view; returns what makes it useless, and the notes about it."""
     assert folder.measured is not None
     done = developed(pictures, view, folder.measured)
-    intensities, invalid, mask, warped = done.intensities, done.invalid, done.mask, None
+    intensities = done.intensities
+    invalid = done.invalid
+    mask = done.mask
+    warped = None
     if poses is not None:
         warp = poses.warp(view, done.geometry)
         intensities, invalid = warp.apply(intensities, invalid)
@@ -312,7 +317,8 @@ def _turns(folder: SceneFolder) -> str:
 
 def _write_model(folder: SceneFolder, poses: Poses) -> None:
     """Put the model into place in one step, after reading it back."""
-    partial, final = folder.root / PARTIAL, folder.root / "sparse"
+    partial = folder.root / PARTIAL
+    final = folder.root / "sparse"
     for old in (partial, final):
         shutil.rmtree(old, ignore_errors=True)
     make_folder(partial / "sparse" / "0")

@@ -93,7 +93,8 @@ def _name(path: Path, root: Path) -> str:
 def _stamps(files: Mapping[str, Path], known: Mapping[str, FileStamp]) -> dict[str, Any]:
     stamps = {}
     for name, path in files.items():
-        status, before = path.stat(), known.get(name)
+        status = path.stat()
+        before = known.get(name)
         size = status.st_size
         time = status.st_mtime_ns
         unchanged = before is not None and before.digest and (before.size, before.time) == (size, time)
@@ -118,9 +119,11 @@ def _digest(path: Path) -> str:
 
 def first_difference(before: dict[str, Any], now: dict[str, Any]) -> tuple[str, str, str] | None:
     """Name, old and new value of the first thing that differs between two requests; None for equal ones."""
-    old, new = _compared(before), _compared(now)
+    old = _compared(before)
+    new = _compared(now)
     for part in _PARTS:
-        old_part, new_part = old.get(part, {}), new.get(part, {})
+        old_part = old.get(part, {})
+        new_part = new.get(part, {})
         if any(not digest for _, _, digest in _stamps_of(old_part)):
             old[part], new[part] = _by_time(old_part), _by_time(new_part)
         else:

@@ -160,21 +160,26 @@ def _fitted(path: Path, view: DevelopedView, code: int) -> NDArray[np.bool_]:
     """
     mask = read_mask(path)
     geometry = view.geometry
-    turned, size = mask.shape, mask.shape[::-1]
+    turned = mask.shape
+    size = mask.shape[::-1]
     fitting = (geometry.size, geometry.stored)
     if code in QUARTER_TURNS and size not in fitting and turned in fitting:
-        mask, size = apply_orientation(mask, code), turned
+        mask = apply_orientation(mask, code)
+        size = turned
     if size == geometry.size:
         return mask
     if size != geometry.stored:
-        (width, height), stored = geometry.size, geometry.stored
+        width, height = geometry.size
+        stored = geometry.stored
         raise PolarguideError(
             path,
             expected=f"the size of the picture, {width}x{height}, or of the file, {stored[0]}x{stored[1]}",
             found=f"{size[0]}x{size[1]}",
             remedy="Make the mask at one of these sizes.",
         )
-    (left, top), (width, height), step = geometry.crop, geometry.size, geometry.step
+    left, top = geometry.crop
+    width, height = geometry.size
+    step = geometry.step
     cut = mask[top : top + height * step, left : left + width * step].astype(np.float32)
     return np.asarray(cv2.resize(cut, geometry.size, interpolation=cv2.INTER_AREA) >= 0.5)
 
@@ -197,8 +202,10 @@ class StokesSource(Source):
 
     def __init__(self, dataset: Dataset, settings: PrepareSettings) -> None:
         """Use a dataset with ``read_stokes``; its sense of angles applies unless the settings name one."""
-        self.kind, self.cameras = dataset.name, dataset.cameras
-        self.views, self.paths = dataset.views, dataset.paths
+        self.kind = dataset.name
+        self.cameras = dataset.cameras
+        self.views = dataset.views
+        self.paths = dataset.paths
         self._dataset = dataset
         calibration = settings.calibration
         self._given_sense = calibration.sense
@@ -218,7 +225,10 @@ class StokesSource(Source):
         require_memory_of_each(self.paths, _WORKED, "Stokes vectors", remedy=remedy)
         peaks: list[NDArray[np.float32]] = []
         rims: list[RimAgreement | None] = []
-        largest, negative, broken, count = 0.0, 0, 0, 0
+        largest = 0.0
+        negative = 0
+        broken = 0
+        count = 0
         for number, view in enumerate(self.views, 1):
             stokes, finite, _ = self._stokes(view)
             intensities = np.stack(four_intensities(stokes))
@@ -297,7 +307,8 @@ class StokesSource(Source):
             if light_sense == assumed:
                 reason += f", and the light agrees ({figures})"
             elif self._given_sense is None and not known:
-                sense, reason = light_sense, f"as the light at the outlines of the masks has them ({figures})"
+                sense = light_sense
+                reason = f"as the light at the outlines of the masks has them ({figures})"
             else:
                 warnings.warn(
                     f"Angles are taken as {_WORDS[assumed]}, {reason}, but the light says "

@@ -89,7 +89,8 @@ def fit_pixels(
     for (values, clipped), stokes in zip(shots, light, strict=True):
         if moments is None:
             moments = np.zeros((3, *values.shape))
-            squares, saturated = np.zeros(values.shape), np.zeros(values.shape, bool)
+            squares = np.zeros(values.shape)
+            saturated = np.zeros(values.shape, bool)
         for component in range(3):
             moments[component] += stokes[component] * values
         squares += np.square(values, dtype=np.float64)
@@ -195,8 +196,10 @@ def _at_pixels(
     means: Array, offset: tuple[int, int], block: int, pattern: Pattern, shape: tuple[int, ...]
 ) -> Array:
     """The vectors of blocks at each pixel, [H, W, 3]."""
-    y, x = np.arange(shape[0]) + offset[1], np.arange(shape[1]) + offset[0]
-    rows, columns = y // block - offset[1] // block, x // block - offset[0] // block
+    y = np.arange(shape[0]) + offset[1]
+    x = np.arange(shape[1]) + offset[0]
+    rows = y // block - offset[1] // block
+    columns = x // block - offset[0] // block
     period = pattern.period
     return np.asarray(means[rows[:, None], columns, (y % period)[:, None], x % period])
 
@@ -248,13 +251,12 @@ def _smooth(values: NDArray[np.float64], side: int) -> NDArray[np.float64]:
         )
 
     count = box(np.ones_like(values))
-    right, below = box(x) / count - x, box(y) / count - y
+    right = box(x) / count - x
+    below = box(y) / count - y
     mean = box(values) / count
     # Squares are products of intervals: x and y are not correlated in them.
-    spread_x, spread_y = (
-        box(x * x) / count - (box(x) / count) ** 2,
-        box(y * y) / count - (box(y) / count) ** 2,
-    )
+    spread_x = box(x * x) / count - (box(x) / count) ** 2
+    spread_y = box(y * y) / count - (box(y) / count) ** 2
     slope_x = (box(values * x) / count - mean * (box(x) / count)) / np.maximum(spread_x, 1e-9)
     slope_y = (box(values * y) / count - mean * (box(y) / count)) / np.maximum(spread_y, 1e-9)
     return np.asarray(mean - slope_x * right - slope_y * below)

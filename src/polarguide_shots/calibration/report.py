@@ -80,7 +80,8 @@ def effect(calibration: AnalyzerCalibration) -> tuple[float, float]:
     pattern = calibration.pattern
     vectors = calibration.vectors.astype(np.float64)
     corners = range(0, pattern.period, 2)
-    zero, full = [], []
+    zero = []
+    full = []
     turns = np.radians(np.arange(0, 180, 15))
     light = np.stack([np.ones_like(turns), np.cos(2 * turns), np.sin(2 * turns)], axis=1)
     for top in corners:
@@ -126,7 +127,11 @@ def _cell(values: Array, form: str) -> str:
 
 
 _CURVES = {0: (204, 51, 51), 45: (46, 134, 46), 90: (51, 102, 204), 135: (190, 120, 20)}
-_HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 340, 70, 30, 78, 48
+_HEIGHT = 340
+_LEFT = 70
+_RIGHT = 30
+_TOP = 78
+_BOTTOM = 48
 _WIDTH = 1040
 _GRID = (222, 222, 222)
 
@@ -165,7 +170,8 @@ def _maps(analyzers: Sequence[Position]) -> Picture:
         ("angle error, degrees", "turbo", [p.angle_error for p in analyzers]),
     )
     rows: list[list[Picture | None]] = [[] for _ in ANGLES]
-    labels, footer = [], []
+    labels = []
+    footer = []
     for title, colormap, values in kinds:
         low, high = _range(np.stack(values), signed=title.startswith("angle"))
         for color in colors:
@@ -194,7 +200,8 @@ def _range(values: Array, *, signed: bool) -> tuple[float, float]:
         end = max(0.1, float(np.ceil(10 * max(abs(low), abs(high))) / 10))
         return -end, end
     step = 10.0 ** np.floor(np.log10(max(high - low, 1e-3 * high)))
-    low, high = float(np.floor(low / step) * step), float(np.ceil(high / step) * step)
+    low = float(np.floor(low / step) * step)
+    high = float(np.ceil(high / step) * step)
     return (float(f"{low:.6g}"), float(f"{high:.6g}")) if high > low else (low, low + float(step))
 
 
@@ -208,7 +215,8 @@ def _curves(
     """Mean intensity of the positions of an angle against the angle of the polarizer, with Malus's law through it."""
     drawn: Picture = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
     places = pattern.angles.ravel()
-    bottom, right = _HEIGHT - _BOTTOM, _WIDTH - _RIGHT - 330
+    bottom = _HEIGHT - _BOTTOM
+    right = _WIDTH - _RIGHT - 330
     turns = np.radians(np.linspace(0, 180, 181))
     light = np.stack([np.ones_like(turns), np.cos(2 * turns), np.sin(2 * turns)], axis=1)
     curves = {a: light @ fit.vectors[places == a].mean(axis=0) for a in ANGLES}

@@ -125,7 +125,8 @@ class CalibrateSettings(MosaicOptions):
 
 
 def _angle_of(path: Path) -> float:
-    name, number = path.stem, _NUMBER.fullmatch(path.stem)
+    name = path.stem
+    number = _NUMBER.fullmatch(path.stem)
     why = ""
     if _SIGNED.fullmatch(name):
         why = ", a sign or a hyphen before the number"

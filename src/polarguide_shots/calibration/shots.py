@@ -186,7 +186,8 @@ class Shots:
         largest = max(int(values[-1]) for values in used)
         bits = int(np.bitwise_or.reduce(np.concatenate(used)))
         assert self._first is not None
-        settings, (path, _, kind) = self._settings, self._first
+        settings = self._settings
+        path, _, kind = self._first
         container = self._raw.container(path, np.dtype(kind))
         black = 0.0 if self._dark else settings.black_level
         return estimate_levels(
@@ -225,7 +226,8 @@ class Shots:
             plane = cut[row::step, column::step]
             cells += plane / plane.mean(dtype=np.float64) / step**2
         side = _CELLS * 2 // step
-        rows, columns = cells.shape[0] // side, cells.shape[1] // side
+        rows = cells.shape[0] // side
+        columns = cells.shape[1] // side
         grid = cells[: rows * side, : columns * side].reshape(rows, side, columns, side).swapaxes(1, 2)
         blocks = grid.reshape(rows * columns, side * side)
         means = blocks.mean(axis=1)

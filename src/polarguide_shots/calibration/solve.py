@@ -141,7 +141,8 @@ def solve_shots(
         )
     zero = _mean_deviation(vectors, nominal)
     if to_mean:
-        angles, vectors = angles - zero, _turned(vectors, -zero)
+        angles = angles - zero
+        vectors = _turned(vectors, -zero)
     flat_dolp = None
     if flat is not None:
         s0, s1, s2 = np.linalg.lstsq(vectors, flat, rcond=None)[0]
@@ -202,7 +203,8 @@ def _refined(
     turns = count - 1 if known is None else 0
 
     def unpacked(free: Array) -> tuple[Array, Array]:
-        angles, levels = initial.copy(), np.ones(len(data))
+        angles = initial.copy()
+        levels = np.ones(len(data))
         angles[count - turns :] = free[:turns]
         if free_levels:
             levels[1:] = np.exp(free[turns:])
@@ -279,6 +281,7 @@ def _mean_deviation(vectors: Array, nominal: Array) -> float:
 
 
 def _turned(vectors: Array, angle: float) -> Array:
-    cosine, sine = np.cos(2 * angle), np.sin(2 * angle)
+    cosine = np.cos(2 * angle)
+    sine = np.sin(2 * angle)
     s0, s1, s2 = vectors.T
     return np.stack([s0, s1 * cosine - s2 * sine, s1 * sine + s2 * cosine], axis=1)

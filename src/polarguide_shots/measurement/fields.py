@@ -196,7 +196,8 @@ def faults(figures: Mapping[str, Value], bounds: Mapping[str, Bound]) -> list[st
         if not isinstance(value, int | float):
             beyond.append(f"{field} has no value")
             continue
-        low, high = bound.min, bound.max
+        low = bound.min
+        high = bound.max
         if field in AXIAL and low is not None and high is not None and low > high:
             # The allowed angles go through 180.
             if high < value < low:

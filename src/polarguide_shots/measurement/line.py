@@ -295,7 +295,8 @@ class Line:
 
     def _draw(self, shot: ExposureSet, measured: MeasuredShot) -> str:
         """Write pictures before the line of the table: where that is, they are. Their name, "" if there are none."""
-        maps, differences = measured.maps, measured.differences
+        maps = measured.maps
+        differences = measured.differences
         if not measured.beyond and differences is None:
             return ""
         name = self.table.picture_name(maps.name)

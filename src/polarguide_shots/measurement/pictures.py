@@ -30,8 +30,11 @@ DOLP_RANGE = 0.1
 """Difference of DoLP with the full color."""
 AOLP_RANGE = 20.0
 """Difference of AoLP with the full color, degrees."""
-_WIDEST, _NARROWEST = 1600, 640
-_WITHIN, _BEYOND, _DEFECT = (64, 200, 64), (255, 32, 32), (255, 224, 0)
+_WIDEST = 1600
+_NARROWEST = 640
+_WITHIN = (64, 200, 64)
+_BEYOND = (255, 32, 32)
+_DEFECT = (255, 224, 0)
 _NOT_COMPARED = 110
 _BAR = 256
 
@@ -122,7 +125,8 @@ def _pixels_beyond(
 ) -> NDArray[np.bool_]:
     """Pixels of a region that are beyond a limit themselves, [H, W]; none for a limit of no single pixel."""
     beyond = np.zeros(maps.reason.shape, bool)
-    at, inside = (region.rows, region.columns), region.inside
+    at = (region.rows, region.columns)
+    inside = region.inside
     low = -math.inf if bound.min is None else bound.min
     high = math.inf if bound.max is None else bound.max
     if field in _LOST:
@@ -154,8 +158,10 @@ def _boxes(panel: Picture, scale: float, regions: Beyond) -> None:
     """Draw regions and their names: red beyond their limits, green within."""
     thick = max(1, round(panel.shape[1] / 500))
     for region, beyond in sorted(regions, key=lambda pair: bool(pair[1])):
-        color, width = _BEYOND if beyond else _WITHIN, 2 * thick if beyond else thick
-        right, low = region.width, region.height
+        color = _BEYOND if beyond else _WITHIN
+        width = 2 * thick if beyond else thick
+        right = region.width
+        low = region.height
         corners = region.corners or ((0, 0), (right, 0), (right, low), (0, low))
         places = np.rint(scale * (np.array(corners) + (region.x, region.y))).astype(np.int32)
         # What lies beyond the last pixel is drawn on it.
@@ -198,7 +204,8 @@ def _name(picture: Picture, name: str, x: int, y: int, color: tuple[int, int, in
 
 def _wrapped(line: str, width: int) -> list[str]:
     """A line in pieces that fit."""
-    pieces, piece = [], ""
+    pieces = []
+    piece = ""
     for word in _ascii(line).split(" "):
         longer = f"{piece} {word}" if piece else word
         if piece and cv2.getTextSize(longer, FONT, 0.5, 1)[0][0] > width:

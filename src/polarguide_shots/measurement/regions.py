@@ -158,8 +158,10 @@ def box_of(regions: Sequence[Region]) -> tuple[int, int, int, int] | None:
     """The smallest rectangle around regions: x, y, width, height; None where there are none."""
     if not regions:
         return None
-    left, top = min(r.x for r in regions), min(r.y for r in regions)
-    right, bottom = max(r.x + r.width for r in regions), max(r.y + r.height for r in regions)
+    left = min(r.x for r in regions)
+    top = min(r.y for r in regions)
+    right = max(r.x + r.width for r in regions)
+    bottom = max(r.y + r.height for r in regions)
     return left, top, right - left, bottom - top
 
 
@@ -182,13 +184,16 @@ def region_figures(maps: ShotMaps, region: Region, threshold: float) -> dict[str
         By ``Field.key``, ``pixels`` to ``aolp_concentration``; angles in degrees.
     """
     at = region.rows, region.columns
-    reason, inside = maps.reason[at], region.inside
+    reason = maps.reason[at]
+    inside = region.inside
     if inside is not None:
         reason = np.where(inside, reason, np.uint8(_OUTSIDE))
     counts = [int(np.count_nonzero(reason == kind)) for kind in Reason]
     total = reason.size if inside is None else int(inside.sum())
-    measured, usable = reason <= Reason.NOISE, reason == Reason.USABLE
-    dolp, s0 = _chosen(maps.dolp_debiased[at], measured), _chosen(maps.s0[at], measured)
+    measured = reason <= Reason.NOISE
+    usable = reason == Reason.USABLE
+    dolp = _chosen(maps.dolp_debiased[at], measured)
+    s0 = _chosen(maps.s0[at], measured)
     noise_of_s0 = None
     if maps.mean_variance is not None and s0.size:
         variance = maps.noise.floor + maps.noise.slope * max(float(s0.mean(dtype=np.float64)) / 2, 0.0)
@@ -248,7 +253,8 @@ def _angles(aolp: Floats, error: float | None) -> dict[str, Value]:
 def axial_mean(angles: Floats) -> tuple[float, float]:
     """Circular mean of angles modulo pi, in [-pi/2, pi/2], and the mean resultant length of the doubled ones."""
     doubled = 2 * angles
-    cosine, sine = np.cos(doubled).mean(dtype=np.float64), np.sin(doubled).mean(dtype=np.float64)
+    cosine = np.cos(doubled).mean(dtype=np.float64)
+    sine = np.sin(doubled).mean(dtype=np.float64)
     return math.atan2(sine, cosine) / 2, min(1.0, math.hypot(cosine, sine))
 
 
@@ -276,8 +282,11 @@ class Reference:
         self.shot = shot
         self.name = maps.name
         self.size = maps.size
-        self._s0, self._dolp, self._aolp = maps.s0.copy(), maps.dolp_debiased, maps.aolp
-        self._measured, self._usable = maps.measured, maps.usable
+        self._s0 = maps.s0.copy()
+        self._dolp = maps.dolp_debiased
+        self._aolp = maps.aolp
+        self._measured = maps.measured
+        self._usable = maps.usable
 
     @classmethod
     def read(cls, path: Path, options: ShotOptions) -> Reference:
@@ -307,7 +316,8 @@ class Reference:
                 found=f"{maps.size[0]}x{maps.size[1]}",
                 remedy="Take both with one camera and one region, and develop them alike.",
             )
-        both, angles = maps.measured & self._measured, maps.usable & self._usable
+        both = maps.measured & self._measured
+        angles = maps.usable & self._usable
         turned = np.remainder(maps.aolp - self._aolp + math.pi / 2, math.pi) - math.pi / 2
         return Differences(
             _where(both, maps.s0 - self._s0),
@@ -346,7 +356,8 @@ def difference_figures(differences: Differences | None, region: Region) -> dict[
 
 
 def _figures(differences: Differences, region: Region) -> Iterator[tuple[str, Value]]:
-    at, inside = (region.rows, region.columns), region.inside
+    at = (region.rows, region.columns)
+    inside = region.inside
     s0, dolp, aolp = (
         values[np.isfinite(values) & (True if inside is None else inside)]
         for values in (differences.s0[at], differences.dolp[at], differences.aolp[at])

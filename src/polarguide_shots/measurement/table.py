@@ -36,7 +36,10 @@ from polarguide.core.system import only_writer
 from polarguide.core.text import csv_lines
 from polarguide_shots.measurement.fields import FORMAT, KEYS, Status, Value
 
-LINES, CSV, SETTINGS, LOCK = "table.jsonl", "table.csv", "measure.json", ".lock"
+LINES = "table.jsonl"
+CSV = "table.csv"
+SETTINGS = "measure.json"
+LOCK = ".lock"
 _LAST = 2**63 - 1
 """Of the nanoseconds that a time may lie from 1970, 292 years; some disks have later ones."""
 _ANEW = "Give another --out, or --overwrite to begin this table anew."
@@ -166,7 +169,8 @@ class Table:
 
     def picture_name(self, shot: str) -> str:
         """A name for the pictures of a shot that those of no other have, upper and lower case taken alike."""
-        name, number = shot, 1
+        name = shot
+        number = 1
         while name.casefold() in self._pictures:
             number += 1
             name = f"{shot}-{number}"
@@ -259,7 +263,8 @@ class Table:
 
     def _mend(self) -> None:
         """Cut off a torn last line, note what is done, and make the CSV table anew."""
-        path, whole = self.folder / LINES, 0
+        path = self.folder / LINES
+        whole = 0
         with atomic(self.folder / CSV) as temporary, open(temporary, "wb") as rows, open(path, "rb") as lines:
             rows.write(_csv([list(KEYS)]))
             for number, line in enumerate(lines, 1):
@@ -267,7 +272,8 @@ class Table:
                     break
                 entry = decode(line, Entry, f"{path} (line {number})", remedy=_ANEW)
                 if entry.format != FORMAT:
-                    place, found = f"{path} (line {number}, format)", str(entry.format)
+                    place = f"{path} (line {number}, format)"
+                    found = str(entry.format)
                     raise PolarguideError(place, expected=str(FORMAT), found=found, remedy=_ANEW)
                 self._note(entry)
                 rows.write(_csv(entry.rows()))

@@ -164,7 +164,9 @@ class _Watch:
     """Which shots of a folder are to be measured now."""
 
     def __init__(self, line: Line, options: WatchOptions, reporter: Reporter) -> None:
-        self._line, self._options, self._reporter = line, options, reporter
+        self._line = line
+        self._options = options
+        self._reporter = reporter
         self._coming: dict[str, _Coming] = {}
         self._news = time.monotonic()
 

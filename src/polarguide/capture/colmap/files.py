@@ -58,7 +58,8 @@ class PosedCamera:
 
 def colmap_camera(camera: PosedCamera, **more: Any) -> pycolmap.Camera:
     """The intrinsics of a camera as pycolmap's type."""
-    size, params = {"width": camera.width, "height": camera.height}, list(camera.parameters)
+    size = {"width": camera.width, "height": camera.height}
+    params = list(camera.parameters)
     return pycolmap.Camera(model=camera.model, params=params, **size, **more)
 
 

@@ -259,7 +259,8 @@ def _differing(model: Any, other: Any) -> list[str]:
     reach = max((float(np.abs(pose.translation).max()) for pose, _ in placed.values()), default=0.0)
 
     def alike(name: str) -> bool:
-        (pose, camera), (pose_again, camera_again) = placed[name], again[name]
+        pose, camera = placed[name]
+        pose_again, camera_again = again[name]
         return (
             camera.model_name == camera_again.model_name
             and np.allclose(camera.params, camera_again.params, rtol=_DIGITS)
@@ -330,7 +331,8 @@ def is_sound(image: Any, camera: Any, tolerance: float) -> bool:
     The quaternion needs length 1 to a tolerance; NaN is refused, and so are numbers beyond ``FARTHEST``.
     """
     pose = image.cam_from_world()
-    quaternion, translation = np.asarray(pose.rotation.quat, np.float64), np.asarray(pose.translation)
+    quaternion = np.asarray(pose.rotation.quat, np.float64)
+    translation = np.asarray(pose.translation)
     turns = (np.abs(quaternion) <= 2).all() and abs(float(np.linalg.norm(quaternion)) - 1) <= tolerance
     bounded = (np.abs(translation) <= FARTHEST).all() and (np.abs(camera.params) <= FARTHEST).all()
     if not len(camera.focal_length_idxs()):  # a panorama
@@ -407,6 +409,7 @@ def _sees(camera: Camera, places: Tensor) -> bool:
     local = local[local[:, 2] > 0]
     x = camera.fx * local[:, 0] / local[:, 2] + camera.cx
     y = camera.fy * local[:, 1] / local[:, 2] + camera.cy
-    across, down = _MARGIN * camera.width, _MARGIN * camera.height
+    across = _MARGIN * camera.width
+    down = _MARGIN * camera.height
     inside = (x >= -across) & (x <= camera.width + across) & (y >= -down) & (y <= camera.height + down)
     return bool(inside.any())

@@ -102,11 +102,14 @@ def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
     width, height = geometry.size
     size = (camera.width, camera.height)
     if size == geometry.size:
-        crop, steps = (0.0, 0.0), (1.0, 1.0)
+        crop = (0.0, 0.0)
+        steps = (1.0, 1.0)
     elif size == geometry.stored:
-        crop, steps = (float(geometry.crop[0]), float(geometry.crop[1])), (float(geometry.step),) * 2
+        crop = (float(geometry.crop[0]), float(geometry.crop[1]))
+        steps = (float(geometry.step),) * 2
     elif _is_resized(size, geometry.size):
-        crop, steps = (0.0, 0.0), (size[0] / width, size[1] / height)
+        crop = (0.0, 0.0)
+        steps = (size[0] / width, size[1] / height)
     else:
         apart = geometry.stored != geometry.size
         files = f", or of the files, {geometry.stored[0]}x{geometry.stored[1]}" if apart else ""
@@ -122,7 +125,9 @@ def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
         params[index] /= step
     for index, cut, step in zip(camera.principal_point_idxs(), crop, steps, strict=True):
         params[index] = (params[index] - cut) / step
-    fitted.params, fitted.width, fitted.height = params, width, height
+    fitted.params = params
+    fitted.width = width
+    fitted.height = height
     return fitted
 
 
@@ -287,7 +292,8 @@ class Poses:
             PolarguideError: the camera is neither of the stored nor the developed size, nor a resized one.
         """
         number = self._images[view].camera_id
-        key, where = (number, geometry), f"{self.folder} (camera of view {view})"
+        key = (number, geometry)
+        where = f"{self.folder} (camera of view {view})"
         if key not in self._warps:
             self._warps[key] = undistortion(camera_for_picture(self._model.cameras[number], geometry, where))
         warp = self._warps[key]

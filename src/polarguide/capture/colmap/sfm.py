@@ -136,7 +136,8 @@ def _named_for_colmap(masks: Path, sizes: Mapping[str, tuple[int, int]]) -> Path
     named = masks.with_name("colmap_masks")
     make_folder(named)
     for view, (width, height) in sizes.items():
-        mask, wanted = masks / f"{view}.png", named / f"{view}.png.png"
+        mask = masks / f"{view}.png"
+        wanted = named / f"{view}.png.png"
         if mask.exists():
             with writing(wanted):
                 shutil.copyfile(mask, wanted)
@@ -342,7 +343,9 @@ def reconstruct(
     model = folder / "model"
     if model.is_dir():
         return model
-    database, images, trial = folder / "database.db", folder / "images", folder / "models"
+    database = folder / "database.db"
+    images = folder / "images"
+    trial = folder / "models"
     if lenses:
         reporter.say(
             _several_lenses(lenses, "each has its own" if intrinsics is None else "all are as given")

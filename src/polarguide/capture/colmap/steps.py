@@ -23,7 +23,9 @@ import pycolmap
 _FATAL = 3
 LEAST_VIEWS = 3
 """Views of the smallest model."""
-_WEAK_PAIR, _WEAK_START, _WEAK_POSE = 10, 50, 15
+_WEAK_PAIR = 10
+_WEAK_START = 50
+_WEAK_POSE = 15
 Report = Callable[[int], None]
 """Receives the number of finished units."""
 

@@ -55,7 +55,8 @@ def sample_visual_hull(
     used = {view: camera for view, camera in cameras.items() if not masks or view in masks}
     pixels = {view: colmap_camera(camera) for view, camera in used.items()}
     center, reach = _nearest_to_axes(list(used.values()))
-    low, high = center - reach, center + reach
+    low = center - reach
+    high = center + reach
 
     def samples_inside(batch: int) -> Points:
         places = rng.uniform(low, high, (batch, 3))
@@ -66,8 +67,10 @@ def sample_visual_hull(
         if len(inner) == 0:
             return inner
         margin = 0.05 * (inner.max(axis=0) - inner.min(axis=0)) + 0.01 * reach
-        low, high = np.maximum(low, inner.min(axis=0) - margin), np.minimum(high, inner.max(axis=0) + margin)
-    parts, total = [], 0
+        low = np.maximum(low, inner.min(axis=0) - margin)
+        high = np.minimum(high, inner.max(axis=0) + margin)
+    parts = []
+    total = 0
     for _ in range(_BATCHES):
         parts.append(samples_inside(_BATCH))
         total += len(parts[-1])
@@ -96,7 +99,8 @@ def _seen_by_most(
     masks: Mapping[str, NDArray[np.bool_]],
 ) -> NDArray[np.bool_]:
     """Which points [N, 3] enough cameras see, inside their masks: [N]."""
-    counts, inside = np.zeros(len(places)), np.zeros(len(places))
+    counts = np.zeros(len(places))
+    inside = np.zeros(len(places))
     for view, camera in cameras.items():
         local = places @ camera.rotation.T + camera.translation
         before = local[:, 2] > 1e-6
@@ -146,10 +150,12 @@ def add_points(
     Raises:
         PolarguideError: the cameras have no common field of view, or a file cannot be written.
     """
-    model, note = folder / "model", folder / NOTE_FILE
+    model = folder / "model"
+    note = folder / NOTE_FILE
     if model.is_dir() and note.exists():
         return model, read_record(note, dict[str, Any])
-    start, trial = folder / "start", folder / "triangulated"
+    start = folder / "start"
+    trial = folder / "triangulated"
     for path in (start, trial):
         shutil.rmtree(path, ignore_errors=True)
         make_folder(path)
@@ -182,7 +188,8 @@ def _triangulated(
     reporter: Reporter,
 ) -> tuple[int, float | None]:
     """Triangulate into ``trial``; returns the number of points and their mean reprojection error."""
-    database, images = folder / "database.db", folder / "images"
+    database = folder / "database.db"
+    images = folder / "images"
     sizes = {view: (camera.width, camera.height) for view, camera in cameras.items()}
     try:
         numbers = match_features(
@@ -242,7 +249,8 @@ def _colors(
     folder: Path, cameras: Mapping[str, PosedCamera], places: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
     """Mean color of the photographs at the projections of points [N, 3], [N, 3] RGB."""
-    total, counts = np.zeros((len(places), 3)), np.zeros(len(places))
+    total = np.zeros((len(places), 3))
+    counts = np.zeros(len(places))
     views = sorted(cameras)
     for view in views[:: max(1, len(views) // 8)]:
         path = folder / "images" / f"{view}.png"

@@ -34,7 +34,8 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     data = read_picture(path)
     pixels = decode_stored(path, data)
     if pixels.ndim == 3 and pixels.shape[2] in (2, 4) and pixels.dtype.kind == "u":
-        alpha, full = pixels[..., -1], int(np.iinfo(pixels.dtype).max)
+        alpha = pixels[..., -1]
+        full = int(np.iinfo(pixels.dtype).max)
         if (alpha < full).any():
             return np.asarray(2 * alpha.astype(np.int64) >= full)
     return decode_mask(path, data, any_value=False)
@@ -291,7 +292,8 @@ def read_projections(path: Path) -> Projections:
                 path, f"one camera of the number {number}", "two, with and without zeros before it"
             )
         padded |= match[1] != str(number)
-        scale_key, inner_key = f"scale_mat_{match[1]}", f"camera_mat_{match[1]}"
+        scale_key = f"scale_mat_{match[1]}"
+        inner_key = f"camera_mat_{match[1]}"
         if inner_key in arrays and not _is_identity(arrays[inner_key]):
             found_matrix = f"{inner_key}, which scales them to a picture from -1 to 1"
             raise wrong_camera(path, "world_mat that projects to pixels", found_matrix)
@@ -334,10 +336,12 @@ def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Mat
     if not np.linalg.cond(left) < 1e10:
         raise wrong_camera(where, "a camera matrix that can be inverted", "a singular one")
     if np.linalg.det(left) < 0:  # a matrix means the same with the other sign; rotations have determinant 1
-        projection, left = -projection, -left
+        projection = -projection
+        left = -left
     inner, rotation = rq(left)
     signs = np.diag(np.sign(np.diag(inner)))
-    inner, rotation = inner @ signs, signs @ rotation
+    inner = inner @ signs
+    rotation = signs @ rotation
     translation = np.linalg.solve(inner, projection[:, 3])
     return checked_intrinsics(where, inner / inner[2, 2]), rotation, translation
 

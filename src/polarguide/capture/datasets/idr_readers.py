@@ -48,7 +48,8 @@ def open_pandora(root: Path) -> Dataset:
     Raises:
         PolarguideError: one is missing, or the cameras are invalid.
     """
-    folder, cameras_file = _folder(root, STOKES_FOLDERS), root / "cameras.npz"
+    folder = _folder(root, STOKES_FOLDERS)
+    cameras_file = root / "cameras.npz"
     matches = [_PANDORA_STEM.fullmatch(stem) for stem in index_files(folder, (".hdr",))]
     views = sorted({match["view"] for match in matches if match is not None})
     files = {view: [folder / f"{view}_{part}.hdr" for part in _PANDORA_PARTS] for view in views}
@@ -64,7 +65,8 @@ def open_pandora(root: Path) -> Dataset:
         light = files[views[0]][0] if views else None
         by_number = {view: int(view) for view in views}
         parts, numbers = _cameras(root, cameras_file, by_number, pictures, light, offsets)
-        cameras, posed_by = cameras_of_views(cameras_file, numbers, parts, "world_mat_"), cameras_file
+        cameras = cameras_of_views(cameras_file, numbers, parts, "world_mat_")
+        posed_by = cameras_file
         shift = next(iter(numbers.values())) - int(next(iter(numbers))) if numbers else 0
         notes = (f"Files count from {first}, cameras from {first + shift}.",)
     masks, read = _masks(root, {view: int(view) for view in views}, first)

@@ -93,7 +93,8 @@ def _reached(raw: Any) -> float:
     """
     if raw.raw_type.name != "Stack":
         return _FULL
-    black, white = raw.black_level_per_channel, raw.white_level
+    black = raw.black_level_per_channel
+    white = raw.white_level
     return float((white - max(black[:3])) / (white - min(black)) * _FULL)
 
 
@@ -246,13 +247,20 @@ def _block_of_tags(data: bytes) -> bytes:
     return block if block[:4] in TIFF else b""
 
 
-_MAKER, _MODEL, _DIRECTORY = 271, 272, 34665
-_TIME, _F_NUMBER, _ISO = 33434, 33437, 34855
+_MAKER = 271
+_MODEL = 272
+_DIRECTORY = 34665
+_TIME = 33434
+_F_NUMBER = 33437
+_ISO = 34855
 _ISO_TOO_LARGE = 65535
 """Value of the tag ISO where its 16 bits are too few."""
 _LARGER_ISO = (34866, 34865, 34867)
 """Tags with the ISO then: recommended exposure index, standard output sensitivity, ISO speed (EXIF 2.3)."""
-_FOCAL_LENGTH, _FOCAL_LENGTH_OF_FILM, _SERIAL_NUMBER, _LENS = 37386, 41989, 42033, 42036
+_FOCAL_LENGTH = 37386
+_FOCAL_LENGTH_OF_FILM = 41989
+_SERIAL_NUMBER = 42033
+_LENS = 42036
 _DIGITAL_ZOOM = 41988
 
 

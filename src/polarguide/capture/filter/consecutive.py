@@ -84,7 +84,8 @@ def _difference(first: NDArray[np.float32], second: NDArray[np.float32]) -> floa
 
 FRAMES_A_SECOND = 2.0
 """Frames that are taken of a video; walking around a subject within a minute, the camera turns by 3 degrees."""
-LEAST_FRAMES, MOST_FRAMES = 24, 120
+LEAST_FRAMES = 24
+MOST_FRAMES = 120
 _RECORD = "video.txt"
 
 

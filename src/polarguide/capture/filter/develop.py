@@ -85,7 +85,8 @@ def estimate_shifts(linear: NDArray[np.float32]) -> list[Shift]:
 def _disagreement(linear: NDArray[np.float32], bad: NDArray[np.bool_]) -> float:
     """Mean |I0 + I90 - I45 - I135| relative to S0, after removing a common gain."""
     i0, i45, i90, i135 = linear.mean(axis=3)[:, ~bad.any(axis=0)]
-    first, second = i0 + i90, i45 + i135
+    first = i0 + i90
+    second = i45 + i135
     if not second.sum() > 0:
         return 0.0
     return float(np.abs(first - second * (first.sum() / second.sum())).sum() / first.sum())
@@ -105,13 +106,15 @@ def align_shots(
         The moved intensities; and pixels for which an unusable one or one outside the picture was used, [4, H, W].
     """
     height, width = clipped.shape[1:]
-    moved, bad = linear.copy(), clipped.copy()
+    moved = linear.copy()
+    bad = clipped.copy()
     for index, shift in enumerate(shifts):
         if not shift.corrected:
             continue
         y, x = np.mgrid[:height, :width].astype(np.float32)
         if shift.warp is None:
-            x, y = x + np.float32(shift.x), y + np.float32(shift.y)
+            x = x + np.float32(shift.x)
+            y = y + np.float32(shift.y)
         else:
             places = np.stack([x.ravel(), y.ravel()], axis=-1)[:, None]
             matrix = np.array(shift.warp, np.float64).reshape(2, 3)
@@ -164,7 +167,8 @@ def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
     window = cv2.createHanningWindow((width, height), cv2.CV_32F)
     # Borders count less: what enters the picture there has no match. Done here, as phaseCorrelate does it in place, and
     # only to pictures of some sizes.
-    reference, other = reference * window, other * window
+    reference = reference * window
+    other = other * window
     (x, y), _ = cv2.phaseCorrelate(reference, other)
     limit = LARGEST_SHARE * width
     if max(abs(x), abs(y)) > limit:

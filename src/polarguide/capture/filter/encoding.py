@@ -38,8 +38,10 @@ _CHARACTERISTICS = {
 }
 """Exponents of transfer characteristics (ITU-T H.273). Those of television are shown as sRGB is."""
 _UNSPECIFIED = 2
-_TIFF_PROFILE, _TRANSFER_FUNCTION = 34675, 301
-_COLOR_SPACE, _GAMMA = 40961, 42240
+_TIFF_PROFILE = 34675
+_TRANSFER_FUNCTION = 301
+_COLOR_SPACE = 40961
+_GAMMA = 42240
 _CURVES = (b"rTRC", b"kTRC")
 _PARAMETERS = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}
 _MIDDLE = 0.5
@@ -161,7 +163,9 @@ def _decoded_middle(profile: bytes) -> float | None:
     return float(max(0.0, factor * _MIDDLE + shift) ** max(numbers[0], 0.1) + raised)
 
 
-LOSSY, PLAIN, CAMERA_RAW = "JPEG, WebP or HEIC", "PNG, TIFF or BMP", "camera raw"
+LOSSY = "JPEG, WebP or HEIC"
+PLAIN = "PNG, TIFF or BMP"
+CAMERA_RAW = "camera raw"
 VIDEO = "video"
 """Frames of a video: sRGB unless the file states another encoding."""
 ARRAY = "array"

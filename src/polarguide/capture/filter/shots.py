@@ -240,7 +240,8 @@ def stacked(
         full = min(full, levels.saturation)
     # By the largest of the three colors, written out: NumPy reduces a last axis of three slowly.
     top = np.maximum(np.maximum(stack[..., 0], stack[..., 1]), stack[..., 2])
-    clipped, lit = np.asarray(top >= full), np.asarray(top.any(axis=0))
+    clipped = np.asarray(top >= full)
+    lit = np.asarray(top.any(axis=0))
     if levels is not None and levels.white != np.iinfo(stack.dtype).max:
         stack = rescaled(stack, levels.white)
     return Shots(stack, orientation, clipped, ~lit)

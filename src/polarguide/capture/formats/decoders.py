@@ -157,7 +157,8 @@ def heif_head(data: bytes) -> HeifHead | None:
         width, height = struct.unpack_from(">II", data, at[b"ispe"] + 4)
         if b"clap" in at:  # encoders fill blocks up, and cut what they added off again
             across, of_across, down, of_down = struct.unpack_from(">4I", data, at[b"clap"])
-            width, height = across // of_across, down // of_down
+            width = across // of_across
+            height = down // of_down
         turns = data[at[b"irot"]] & 3 if b"irot" in at else 0
     except (KeyError, IndexError, ZeroDivisionError, struct.error):
         return None
@@ -181,13 +182,15 @@ def _boxes(data: bytes, start: int, end: int) -> Iterator[tuple[bytes, int, int]
 
 def _associated(data: bytes, start: int, item: int) -> list[int]:
     """Numbers, from 1, of the properties of an item, by the box of associations at ``start``."""
-    version, wide = data[start], data[start + 3] & 1
+    version = data[start]
+    wide = data[start + 3] & 1
     (count,) = struct.unpack_from(">I", data, start + 4)
     start += 8
     for _ in range(count):
         (number,) = struct.unpack_from(">I" if version else ">H", data, start)
         start += 4 if version else 2
-        length, start = data[start], start + 1
+        length = data[start]
+        start = start + 1
         if number == item:
             values = struct.unpack_from(f">{length}{'H' if wide else 'B'}", data, start)
             return [value & (0x7FFF if wide else 0x7F) for value in values]
@@ -241,7 +244,8 @@ def heif_pixels(path: Path, data: bytes) -> NDArray[Any]:
         ValueError: the file is of a kind that is not read; the text is a noun phrase that says why.
         Exception: of several kinds, where the file is damaged.
     """
-    library, head = optional_import("pillow_heif", str(path)), heif_head(data)
+    library = optional_import("pillow_heif", str(path))
+    head = heif_head(data)
     assert head is not None
     opened = library.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False, bgr_mode=True)
     if len(opened) > 1:
@@ -249,7 +253,8 @@ def heif_pixels(path: Path, data: bytes) -> NDArray[Any]:
     transfer = (opened.info.get("nclx_profile") or {}).get("transfer_characteristics")
     if transfer in HIGH_RANGE:
         raise ValueError(f"a HEIC file of high dynamic range ({HIGH_RANGE[transfer]})")
-    bits, pixels = int(opened.info["bit_depth"]), np.asarray(opened)
+    bits = int(opened.info["bit_depth"])
+    pixels = np.asarray(opened)
     pixels = np.rot90(pixels, -head.turns)
     if pixels.shape[1::-1] != head.size:
         raise ValueError("a HEIC file whose picture has another size than its header states")
@@ -269,7 +274,10 @@ def rescaled(pixels: NDArray[Any], full: int) -> NDArray[Any]:
 # It logs what it finds odd in a file; what matters of it is an error here.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
-_GRAY, _RGB, _PALETTE, _YCBCR = 1, 2, 3, 6
+_GRAY = 1
+_RGB = 2
+_PALETTE = 3
+_YCBCR = 6
 _WHITE_IS_ZERO = 0
 _SAMPLES = {_GRAY: 1, _RGB: 3, _PALETTE: 1, _YCBCR: 3}
 JPEG_IN_TIFF = (6, 7)
@@ -303,7 +311,8 @@ def decode_tiff(data: bytes) -> NDArray[Any]:
         page = _only_page(file)
         samples, transparent = _judged(page)
         pixels = np.asarray(page.asarray(maxworkers=1))
-        size, bits = (page.imagelength, page.imagewidth), int(page.bitspersample)
+        size = (page.imagelength, page.imagewidth)
+        bits = int(page.bitspersample)
         colors = page.colormap if page.photometric == _PALETTE else None
     if pixels.ndim == 3 and page.planarconfig == 2:
         pixels = np.moveaxis(pixels, 0, -1)
@@ -412,7 +421,8 @@ def _judged(page: tifffile.TiffPage) -> tuple[int, bool]:
     Raises:
         UnreadableTiffError: the samples are not those of a gray or a color picture.
     """
-    meaning, samples = int(page.photometric), int(page.samplesperpixel)
+    meaning = int(page.photometric)
+    samples = int(page.samplesperpixel)
     if meaning == _WHITE_IS_ZERO:
         raise UnreadableTiffError("a TIFF file whose white is 0")
     if meaning not in _SAMPLES or (meaning == _YCBCR and int(page.compression) not in JPEG_IN_TIFF):

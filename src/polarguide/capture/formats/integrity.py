@@ -115,7 +115,8 @@ def _jpeg_marks(data: bytes) -> Iterator[tuple[int, int, int]]:
     """Kinds of the segments and scans of a JPEG file up to its end-of-image mark, and where their contents lie."""
     at = 2
     while at + 2 <= len(data) and data[at] == 0xFF:
-        kind, end = data[at + 1], at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        kind = data[at + 1]
+        end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
         if kind == 0xFF:  # fill byte
             at += 1
         elif kind in _JPEG_ALONE:

@@ -153,7 +153,8 @@ def _require_two_levels(path: Path, gray: NDArray[Any]) -> None:
     Raises:
         PolarguideError: the picture is one.
     """
-    levels, around = gray.astype(np.float32), np.ones((3, 3), np.uint8)
+    levels = gray.astype(np.float32)
+    around = np.ones((3, 3), np.uint8)
     flat = cv2.erode(levels, around) == cv2.dilate(levels, around)
     largest = float(levels.max())
     labels = flat & (levels > _BLACK * largest) & (2 * levels < largest)

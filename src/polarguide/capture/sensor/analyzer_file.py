@@ -25,11 +25,13 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import in_utf8, require_file, write_whole
 from polarguide.core.records import decode
 
-FORMAT, VERSION = "polarguide-analyzers", 1
+FORMAT = "polarguide-analyzers"
+VERSION = 1
 SUFFIX = ".safetensors"
 MOST_THROUGHPUT = 1e3
 _LONGEST_HEADER = 100_000_000  # bytes, by safetensors' format; text in their place is a larger number
-_ENTRY, _TENSOR = "polarguide", "vectors"
+_ENTRY = "polarguide"
+_TENSOR = "vectors"
 _REMEDY = "Calibrate again (polarguide calibrate), or copy the file again."
 
 _Positive = Annotated[int, msgspec.Meta(ge=1, le=1 << 20)]
@@ -98,7 +100,8 @@ def read_analyzers(path: Path) -> AnalyzerCalibration:
     require_file(path, expected="a calibration of polarguide calibrate", remedy=_REMEDY)
     try:
         with in_utf8(path) as name, safe_open(name, framework="numpy") as file:
-            entries, names = file.metadata() or {}, list(file.keys())
+            entries = file.metadata() or {}
+            names = list(file.keys())
             vectors = file.get_tensor(_TENSOR) if names == [_TENSOR] else None
     except (SafetensorError, ValueError, OSError, RuntimeError, TypeError) as error:
         raise _damaged(path, f"damaged or foreign data ({str(error)[:200]})") from None

@@ -38,10 +38,19 @@ def correction_matrices(analyzers: list[Array], nominal: NDArray[Any]) -> Array:
     def dot(x: list[Any], y: list[Any]) -> Any:
         return x[0] * y[0] + x[1] * y[1] + x[2] * y[2] + x[3] * y[3]
 
-    uu, uv, uw, vv, vw, ww = dot(u, u), dot(u, v), dot(u, w), dot(v, v), dot(v, w), dot(w, w)
+    uu = dot(u, u)
+    uv = dot(u, v)
+    uw = dot(u, w)
+    vv = dot(v, v)
+    vw = dot(v, w)
+    ww = dot(w, w)
     # The inverse of A^T A by its adjugate: millions of 3x3 matrices, for which LAPACK's calls would take seconds.
-    a00, a01, a02 = vv * ww - vw * vw, uw * vw - uv * ww, uv * vw - uw * vv
-    a11, a12, a22 = uu * ww - uw * uw, uv * uw - uu * vw, uu * vv - uv * uv
+    a00 = vv * ww - vw * vw
+    a01 = uw * vw - uv * ww
+    a02 = uv * vw - uw * vv
+    a11 = uu * ww - uw * uw
+    a12 = uv * uw - uu * vw
+    a22 = uu * vv - uv * uv
     scale = 1 / (uu * a00 + uv * a01 + uw * a02)
     inverse = [
         [(r[0] * u[j] + r[1] * v[j] + r[2] * w[j]) * scale for j in range(4)]
@@ -220,13 +229,15 @@ class AnalyzerCalibration:
         height, width = mosaic.shape
         self.require_region(offset, (width, height), "calibration")
         left, top = self.pattern.shifted(*offset).cell_corner()
-        height, width = (height - top) // 2 * 2, (width - left) // 2 * 2
+        height = (height - top) // 2 * 2
+        width = (width - left) // 2 * 2
         matrices, rows, columns = self._coarse((offset[0] + left, offset[1] + top), (width, height))
         inside = (slice(top, top + height), slice(left, left + width))
         cells = mosaic[inside]
         samples = [np.ascontiguousarray(cells[row::2, column::2]) for row, column in np.ndindex(2, 2)]
         out = mosaic.copy()
-        part, product = np.empty_like(samples[0]), np.empty_like(samples[0])
+        part = np.empty_like(samples[0])
+        product = np.empty_like(samples[0])
         for index, (row, column) in enumerate(np.ndindex(2, 2)):
             part[:] = 0
             for other, sample in enumerate(samples):
@@ -290,7 +301,8 @@ class AnalyzerCalibration:
             [4, 4, h, w], or [4, 4, h, w, 3] for a color sensor, whose colors have analyzers of their own.
         """
         pattern = self.pattern.shifted(*offset)
-        height, width = size[1] // scale, size[0] // scale
+        height = size[1] // scale
+        width = size[0] // scale
         cells = self.correction(offset, (-(-size[0] // 4) * 4, -(-size[1] // 4) * 4))
         places = [int(angle) for angle in pattern.angles[:2, :2].ravel()]
         order = [places.index(angle) for angle in ANGLES]
@@ -315,7 +327,8 @@ class AnalyzerCalibration:
         grid = self._matrices.get(key)
         if grid is None:
             rows, columns = (self._places(axis, offset[1 - axis], size[1 - axis]) for axis in (0, 1))
-            (y, which_row), (x, which_column) = rows, columns
+            y, which_row = rows
+            x, which_column = columns
             nominal = self.pattern.shifted(*offset).angles[:2, :2].ravel()
             matrices = np.empty((4, 4, y.shape[1], x.shape[1]), np.float32)
             for first in range(0, y.shape[1], _AT_ONCE):
@@ -336,7 +349,8 @@ class AnalyzerCalibration:
         Returns:
             [4, R]: block and place in the pattern of a cell's first row, and of its second; and [length / 2].
         """
-        period, last = self.pattern.period, self.vectors.shape[axis] - 1
+        period = self.pattern.period
+        last = self.vectors.shape[axis] - 1
         first = start + 2 * np.arange(length // 2)
         described = []
         for place in (first, first + 1):

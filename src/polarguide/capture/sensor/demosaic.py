@@ -62,7 +62,8 @@ def guided_color(bayer: Array, colors: NDArray[np.int64]) -> Array:
     """Bayer picture [H, W] with ``colors`` 0, 1, 2 (R, G, B) at its pixels -> [H, W, 3]."""
     at = _Neighbors(bayer)
     center = 2 * bayer
-    bend_x, bend_y = center - at(0, -2) - at(0, 2), center - at(-2, 0) - at(2, 0)
+    bend_x = center - at(0, -2) - at(0, 2)
+    bend_y = center - at(-2, 0) - at(2, 0)
     weight_x = 1 / ((np.abs(at(0, -1) - at(0, 1)) + np.abs(bend_x)) ** 2 + _SOFT_SQUARE)
     weight_y = 1 / ((np.abs(at(-1, 0) - at(1, 0)) + np.abs(bend_y)) ** 2 + _SOFT_SQUARE)
     along_x = (at(0, -1) + at(0, 1)) / 2 + bend_x / 8
@@ -83,7 +84,8 @@ def guided_polarization(mosaic: Array, places: NDArray[np.int64]) -> Array:
 def _half_s0(mosaic: Array) -> Array:
     """S0/2 at each pixel: mean of the four 2x2 windows it belongs to, weighted against gradients toward them."""
     at = _Neighbors(mosaic)
-    total, weights = np.zeros_like(mosaic), np.zeros_like(mosaic)
+    total = np.zeros_like(mosaic)
+    weights = np.zeros_like(mosaic)
     for down in (-1, 1):
         for right in (-1, 1):
             window = (mosaic + at(down, 0) + at(0, right) + at(down, right)) / 4
@@ -203,7 +205,8 @@ def spoiled(bad: Mask, pattern: Pattern, *, mode: str, interpolation: str, regis
 
 def _spoiled_colors(bad: Mask, pattern: Pattern, place: tuple[int, int], interpolation: str) -> Mask:
     """At one place of the cells, where colors use an unusable sample."""
-    (row, column), mask = place, bad[place[0] :: 2, place[1] :: 2]
+    row, column = place
+    mask = bad[place[0] :: 2, place[1] :: 2]
     if pattern.colors is None:
         return mask
     if interpolation != "bilinear":
@@ -272,7 +275,8 @@ def _superpixels(values: Array, pattern: Pattern) -> Array:
     repeat = 4 // pattern.period
     angles = np.tile(pattern.angles, (repeat, repeat))
     colors = None if pattern.colors is None else np.tile(pattern.colors, (repeat, repeat))
-    rows, columns = values.shape[0] // 4, values.shape[1] // 4
+    rows = values.shape[0] // 4
+    columns = values.shape[1] // 4
     blocks = values.reshape(rows, 4, columns, 4)
     picture = np.empty((4, rows, columns, 1 if colors is None else 3), np.float32)
     for index, angle in enumerate(ANGLES):
@@ -319,7 +323,8 @@ def outliers(values: NDArray[Any], period: int) -> tuple[NDArray[np.bool_], NDAr
         (y, x) for y in (0, period, 2 * period) for x in (0, period, 2 * period) if (y, x) != (period, period)
     ]
     around = _sorted([padded[y : y + height, x : x + width] for y, x in places])
-    least, most = around[0].astype(np.float32), around[7].astype(np.float32)
+    least = around[0].astype(np.float32)
+    most = around[7].astype(np.float32)
     middle = (around[3].astype(np.float32) + around[4]) / 2
     del around
     spread = most - least
@@ -341,7 +346,8 @@ pixel."""
 def _sorted(eight: list[NDArray[Any]]) -> list[NDArray[Any]]:
     """Eight pictures, sorted at every pixel."""
     for low, high in _NETWORK:
-        a, b = eight[low], eight[high]
+        a = eight[low]
+        b = eight[high]
         eight[low], eight[high] = np.minimum(a, b), np.maximum(a, b)
     return eight
 
@@ -349,7 +355,8 @@ def _sorted(eight: list[NDArray[Any]]) -> list[NDArray[Any]]:
 def _noise(rise: NDArray[np.float32], middle: NDArray[np.float32]) -> NDArray[np.float32]:
     """Standard deviation of the noise of each sample, by brightness."""
     step = max(1, rise.size >> 20)
-    level, deviation = middle.ravel()[::step], np.abs(rise).ravel()[::step]
+    level = middle.ravel()[::step]
+    deviation = np.abs(rise).ravel()[::step]
     edges = np.quantile(level, np.linspace(0, 1, _BINS + 1)).astype(np.float32)
     # One brightness of many samples, such as black, is a bin of its own: it says nothing of the noise of others.
     common = edges[1:][np.diff(edges) == 0]

@@ -286,7 +286,8 @@ def _stl(
     reporter: Reporter,
 ) -> list[Path]:
     """For 3D printing: closed, in millimeters where the scale is known, and with up along z, as slicers have it."""
-    view, options = presented.surface_view(run), replace(options, close_bottom=True)
+    view = presented.surface_view(run)
+    options = replace(options, close_bottom=True)
     inside = presented.subject.inside
     surface, _, _ = subject_surface(run, view, inside, options, resolution, reporter)
     right, up, back = run.frame.panorama_axes().numpy().T
@@ -335,8 +336,11 @@ def _all(
 
 
 def _points(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
-    path, model, placement = folder / "points.ply", run.model, presented.placement
-    views, rasterize = run.scene.views, model.backend.rasterize
+    path = folder / "points.ply"
+    model = run.model
+    placement = presented.placement
+    views = run.scene.views
+    rasterize = model.backend.rasterize
     places, normals, linear = surface_points(presented.gaussians, model.shading, views, rasterize)
     colors = srgb_encode(colored(linear, presented.presentation.color).clamp(0, 1))
     write_points(path, placement.points(places), placement.directions(normals), colors, presented.comments)

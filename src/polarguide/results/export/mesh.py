@@ -57,7 +57,8 @@ def write_mesh(
     if binary:
         vertices = placement.scale * vertices
     else:
-        vertices, normals = placement.points(vertices), placement.directions(normals)
+        vertices = placement.points(vertices)
+        normals = placement.directions(normals)
     solid = trimesh.Trimesh(
         vertices=vertices.numpy(),
         faces=mesh.surface.faces,
@@ -125,7 +126,8 @@ def surface_points(
             found="none",
             remedy="Train for more steps.",
         )
-    means, side = gaussians["means"][indices], outward[indices]
+    means = gaussians["means"][indices]
+    side = outward[indices]
     normals = shortest_axis_normals(
         means, gaussians["quaternions"][indices], gaussians["log_scales"][indices], torch.zeros(3)
     )

@@ -56,7 +56,8 @@ class Placement:
         Args:
             presentation: of the run. around: the scene's frame with its up axis; None: the scene's own axes.
         """
-        scale, rotation = presentation.meters_per_unit, torch.eye(3, dtype=torch.float64)
+        scale = presentation.meters_per_unit
+        rotation = torch.eye(3, dtype=torch.float64)
         if around is not None:
             right, up, back = around.panorama_axes().unbind(1)
             rotation = torch.stack((right, -up, -back))
@@ -108,7 +109,8 @@ class Placement:
         turned = Rotation.from_matrix(self.rotation.numpy()) * Rotation.from_quat(own[:, [1, 2, 3, 0]])
         for k, column in enumerate(turned.as_quat().T[[3, 0, 1, 2]]):
             table[f"rot_{k}"] = column
-        matrix, names = self.harmonics(), table.dtype.names or ()
+        matrix = self.harmonics()
+        names = table.dtype.names or ()
         for field in HARMONICS:
             if f"{field}_{3 * REST_COUNT - 1}" not in names:
                 continue

@@ -109,7 +109,8 @@ def records(
     for name, value in fields.items():
         data[name] = _quantized(value, data.dtype[name].base)
     for name, (steps, scale) in harmonics.items():
-        data[name], data[f"{name}_scale"] = steps, scale
+        data[name] = steps
+        data[f"{name}_scale"] = scale
     return data
 
 
@@ -144,7 +145,8 @@ def harmonics_steps(rest: Tensor) -> tuple[NDArray[np.int8], NDArray[np.float16]
 
 def _axes(gaussians: Parameters, mask: Tensor) -> tuple[Tensor, Tensor]:
     """Normal axes [K, 3], and 1 [K] where they are turned outward, 0 where the camera alone decides."""
-    means, origin = gaussians["means"][mask], torch.zeros(3)
+    means = gaussians["means"][mask]
+    origin = torch.zeros(3)
     axes = shortest_axis_normals(means, gaussians["quaternions"][mask], gaussians["log_scales"][mask], origin)
     outward = gaussians.get("outward")
     if outward is None:
@@ -165,7 +167,8 @@ def curve_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
     """Order [N] of points [N, 3] along a Z curve (Morton 1966) with 1,024 cells each way."""
     if not len(means):
         return np.zeros(0, dtype=np.int64)
-    low, high = np.quantile(means, 0.01, axis=0), np.quantile(means, 0.99, axis=0)
+    low = np.quantile(means, 0.01, axis=0)
+    high = np.quantile(means, 0.99, axis=0)
     cells = np.clip((means - low) / np.maximum(high - low, 1e-12) * 1023, 0, 1023).astype(np.int64)
     return curve_places(torch.from_numpy(cells)).argsort(stable=True).numpy()
 
@@ -263,7 +266,8 @@ def share_page(
     shaded = shading.page(gaussians, light)
     layers: Sequence[str] = shading.layers
     if shaded is None:
-        shaded, layers = baked_page(gaussians, light, shading), PLAIN_LAYERS
+        shaded = baked_page(gaussians, light, shading)
+        layers = PLAIN_LAYERS
     quantized = records(gaussians, shaded.values, footprints)
     shown = [
         name for name in LAYERS if name in layers and shaded.values.keys() >= _SHOWN_WITH.get(name, set())

@@ -134,7 +134,8 @@ def _bytes(values: Tensor) -> Tensor:
 
 def _means(means: Tensor, width: int, pictures: dict[str, Pixels]) -> dict[str, Any]:
     logs = means.double().sign() * torch.log1p(means.double().abs())
-    low, high = logs.min(dim=0).values, logs.max(dim=0).values
+    low = logs.min(dim=0).values
+    high = logs.max(dim=0).values
     codes = ((logs - low) / (high - low).clamp(min=1e-12) * 65535).round().to(torch.int32)
     files = ["means_l.webp", "means_u.webp"]
     for name, part in zip(files, (codes & 255, codes >> 8), strict=True):

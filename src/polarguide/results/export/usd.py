@@ -27,7 +27,9 @@ def write_usdz(path: Path, model: Textured, about: dict[str, Any], *, jpeg: bool
     Raises:
         PolarguideError: usd-core is not installed, or the file cannot be written.
     """
-    vt, geom, sdf = _module("Vt"), _module("UsdGeom"), _module("Sdf")
+    vt = _module("Vt")
+    geom = _module("UsdGeom")
+    sdf = _module("Sdf")
 
     def fill(stage: Any, folder: Path) -> None:
         mesh = geom.Mesh.Define(stage, f"{ROOT}/mesh")
@@ -50,7 +52,8 @@ def write_usdz(path: Path, model: Textured, about: dict[str, Any], *, jpeg: bool
 
 def _bind(stage: Any, mesh: Any, model: Textured, folder: Path, *, jpeg: bool) -> None:
     """The material of a mesh, with its textures as files in the folder."""
-    shade, types = _module("UsdShade"), _module("Sdf").ValueTypeNames
+    shade = _module("UsdShade")
+    types = _module("Sdf").ValueTypeNames
     material = shade.Material.Define(stage, f"{ROOT}/material")
 
     def shader(name: str, kind: str, **inputs: tuple[Any, Any]) -> Any:
@@ -95,7 +98,8 @@ def write_splat_usdz(path: Path, ply: Path, about: dict[str, Any]) -> None:
     Raises:
         PolarguideError: usd-core is not installed or knows no splats, or the file cannot be written.
     """
-    vt, kind = _module("Vt"), getattr(_module("UsdVol"), "ParticleField3DGaussianSplat", None)
+    vt = _module("Vt")
+    kind = getattr(_module("UsdVol"), "ParticleField3DGaussianSplat", None)
     if kind is None:
         raise PolarguideError(
             "usd-core",

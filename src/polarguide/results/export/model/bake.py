@@ -100,7 +100,8 @@ def bake(
         reporter: receives progress.
     """
     model = run.model
-    points, facing = torch.from_numpy(places), torch.from_numpy(normals)
+    points = torch.from_numpy(places)
+    facing = torch.from_numpy(normals)
     total = torch.zeros(len(points), sum(CHANNELS.values()))
     weights = torch.zeros(len(points))
     with reporter.track("baking textures", len(views)) as progress:
@@ -182,11 +183,15 @@ def _visible(
     cosine = -dot(unit(offsets), normals)
     rows = (cosine > STEEPEST).nonzero()[:, 0]
     x, y, z = camera.to_camera(offsets[rows]).unbind(-1)
-    column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    column = camera.fx * x / z + camera.cx
+    row = camera.fy * y / z + camera.cy
     inside = (
         (z > 0) & (column > 0.5) & (column < camera.width - 0.5) & (row > 0.5) & (row < camera.height - 0.5)
     )
-    rows, z, column, row = rows[inside], z[inside], column[inside], row[inside]
+    rows = rows[inside]
+    z = z[inside]
+    column = column[inside]
+    row = row[inside]
     surface = depth[row.long(), column.long()]
     cosine = cosine[rows]
     # Half a pixel beside it, an inclined surface has another depth, too.
@@ -198,7 +203,8 @@ def _visible(
 
 def _nearest_seen(places: NDArray[np.float32], visible: NDArray[np.bool_]) -> NDArray[np.int64]:
     """For each texel that no view shows the nearest that one does, about; itself where none is."""
-    known, unseen = visible.nonzero()[0], (~visible).nonzero()[0]
+    known = visible.nonzero()[0]
+    unseen = (~visible).nonzero()[0]
     if not len(known) or not len(unseen):
         return unseen
     known = known[:: -(-len(known) // _FILLED_FROM)]

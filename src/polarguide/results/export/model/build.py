@@ -60,7 +60,8 @@ def require_room(texture: int) -> None:
     Raises:
         PolarguideError: the texture does not fit.
     """
-    needed, free = BYTES_PER_TEXEL * texture**2, free_memory()
+    needed = BYTES_PER_TEXEL * texture**2
+    free = free_memory()
     if needed > free:
         raise PolarguideError(
             "--texture",
@@ -132,7 +133,9 @@ def textured_model(
         run: of Gaussians; its scene is read. subject: its surface. presentation, placement: how it is presented.
         options: options of the model. reporter: receives progress and counts.
     """
-    mesh, unwrapped, texels = subject.mesh, subject.unwrapped, subject.texels
+    mesh = subject.mesh
+    unwrapped = subject.unwrapped
+    texels = subject.texels
     kind = options.resolved_base_color
     vertices, normals = (values[unwrapped.source] for values in (mesh.surface.vertices, mesh.surface.normals))
     facing = texels.interpolated(unwrapped.faces, normals)
@@ -257,7 +260,8 @@ def _outside(run: OpenedRun, inside: Inside) -> ColoredMesh:
 
 
 def _joined(first: ColoredMesh, second: ColoredMesh) -> ColoredMesh:
-    a, b = first.surface, second.surface
+    a = first.surface
+    b = second.surface
     surface = Surface(
         np.concatenate([a.vertices, b.vertices]),
         np.concatenate([a.faces, b.faces + len(a.vertices)]),
@@ -275,7 +279,8 @@ def _textures(
     metal = baked.metalness[:, None]
     mixed = (1 - metal) * color + metal * baked.reflectance
     surface = np.stack([np.zeros_like(baked.roughness), baked.roughness, baked.metalness], axis=1)
-    shading, specular = run.model.shading, None
+    shading = run.model.shading
+    specular = None
     if isinstance(shading, DeferredShading) and shading.blend == "fresnel":
         # The file has one index: others reflect as much at normal incidence by a factor, as far as it reaches.
         ratio = _normal_reflectance(baked.index) / _normal_reflectance(np.float32(_index(run)))

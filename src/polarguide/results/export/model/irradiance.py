@@ -87,7 +87,8 @@ def arriving_light(points: Places, normals: Places, around: Surroundings, advanc
 def irradiance(light: NDArray[Any], normals: NDArray[Any], index: float) -> NDArray[np.float32]:
     """E [M, 3] on surfaces of a refractive index with unit normals [M, 3], of light in harmonics [M, K, 3]."""
     cosines, weights = np.polynomial.legendre.leggauss(64)
-    cosines, weights = (cosines + 1) / 2, weights / 2
+    cosines = (cosines + 1) / 2
+    weights = weights / 2
     passed = 2 * weights * cosines * (1 - _reflectance(cosines, index))
     lobe = [
         (passed * legendre(cosines)).sum()
@@ -123,7 +124,8 @@ class _Rays:
     def __init__(self, mesh: ColoredMesh) -> None:
         scenes: Any = optional_import("embreex.rtcore_scene", WHAT)
         meshes: Any = optional_import("embreex.mesh_construction", WHAT)
-        self._faces, self._colors = mesh.surface.faces, mesh.colors
+        self._faces = mesh.surface.faces
+        self._colors = mesh.colors
         corners = np.ascontiguousarray(mesh.surface.vertices[self._faces], np.float32)
         self._scene = scenes.EmbreeScene()
         self._geometry = meshes.TriangleMesh(self._scene, corners)  # the scene keeps no reference to it
@@ -132,9 +134,11 @@ class _Rays:
         """Radiance [N, 3] at origins from unit directions [N, 3]: the mesh's colors, or from afar past it."""
         starts, rays = (np.ascontiguousarray(values, np.float32) for values in (origins, directions))
         hits = self._scene.run(starts, rays, output=True)
-        light, hit = radiance(directions), hits["primID"] >= 0
+        light = radiance(directions)
+        hit = hits["primID"] >= 0
         corners = self._faces[hits["primID"][hit]]
-        second, third = hits["u"][hit][:, None], hits["v"][hit][:, None]
+        second = hits["u"][hit][:, None]
+        third = hits["v"][hit][:, None]
         a, b, c = (self._colors[corners[:, k]] for k in range(3))
         light[hit] = (1 - second - third) * a + second * b + third * c
         return light

@@ -41,7 +41,8 @@ class Texels:
         """A whole texture [size, size, C] of values [M, C]: beside the charts that of the nearest texel."""
         picture = np.zeros((self.size * self.size, values.shape[1]), np.float32)
         empty = np.ones(self.size * self.size, bool)
-        picture[self.index], empty[self.index] = values, False
+        picture[self.index] = values
+        empty[self.index] = False
         row, column = distance_transform_edt(
             empty.reshape(self.size, self.size), return_distances=False, return_indices=True
         )
@@ -59,7 +60,8 @@ def texels_of(mesh: Unwrapped, size: int) -> Texels:
     high = np.clip(np.floor(corners.max(axis=1)), -1, size - 1).astype(np.int64)
     extent = np.maximum(high - low + 1, 0)
     counts = extent.prod(axis=1)
-    parts, begin = [], 0
+    parts = []
+    begin = 0
     ends = np.cumsum(counts)
     while begin < len(counts):
         reached = ends[begin - 1] if begin else 0
@@ -91,7 +93,8 @@ def _inside(
     place = np.stack([column, row], axis=1)
     area = _cross(b - a, c - a)
     with np.errstate(divide="ignore", invalid="ignore"):
-        second, third = _cross(place - a, c - a) / area, _cross(b - a, place - a) / area
+        second = _cross(place - a, c - a) / area
+        third = _cross(b - a, place - a) / area
     weights = np.stack([1 - second - third, second, third], axis=1)
     inside = (weights >= -1e-9).all(axis=1)  # NaN, of triangles without area, is not
     return column[inside], row[inside], face[inside], weights[inside].astype(np.float32)

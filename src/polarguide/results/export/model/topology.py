@@ -123,7 +123,8 @@ def consistent(vertices: Places, faces: Faces) -> Faces:
     # An edge fits where it has one face on each side.
     misfits = ((count[edge] != 1) | (both[either] != 2)).reshape(-1, 3).sum(axis=1)
     rival = (count[edge] > 1).reshape(-1, 3).any(axis=1)
-    oriented, taken = [faces[~rival]], set(_keys(_directed(faces[~rival])).tolist())
+    oriented = [faces[~rival]]
+    taken = set(_keys(_directed(faces[~rival])).tolist())
     contested = faces[rival][np.lexsort((-area[rival], misfits[rival]))]
     for face, keys in zip(contested, _keys(_directed(contested)).reshape(-1, 3).tolist(), strict=True):
         if taken.isdisjoint(keys):
@@ -161,7 +162,8 @@ def _loops(edges: list[list[int]]) -> list[list[int]]:
         following.setdefault(begin, []).append(end)
     loops = []
     for start in following:
-        path, place = [start], {start: 0}
+        path = [start]
+        place = {start: 0}
         while following[path[-1]]:
             at = following[path[-1]].pop()
             if at in place:

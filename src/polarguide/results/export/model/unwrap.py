@@ -56,7 +56,8 @@ def unwrap(
         reporter.warn(
             f"xatlas may take an hour and more for {len(faces):,} triangles; --triangles {SLOW} or fewer is faster."
         )
-    task, answer = folder / "mesh.npz", folder / "atlas.npz"
+    task = folder / "mesh.npz"
+    answer = folder / "atlas.npz"
     np.savez(task, vertices=vertices.astype(np.float32), faces=faces.astype(np.uint32), texture=texture)
     with reporter.track(f"unwrapping {len(faces):,} triangles (xatlas)"):
         command = [sys.executable, "-c", _ENTRY, str(task), str(answer)]
