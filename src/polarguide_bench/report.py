@@ -449,9 +449,9 @@ def _facts(results: Results) -> dict[str, str]:
 
 
 def recorded_health(run: Path) -> tuple[str | None, tuple[str, ...]]:
-    """What ``health.json`` says of a run's polarization, None where it says nothing, and its warnings.
+    """The polarization and the warnings in a run's ``health.json``; None and no warnings without the file.
 
-    A damaged file is a warning: other runs are not concerned.
+    A damaged file becomes a warning, so that other runs are still reported.
     """
     try:
         health = Health.load(run)

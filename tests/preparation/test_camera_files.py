@@ -324,7 +324,7 @@ def test_damaged_profiles_state_nothing():
 
 
 def decided(pictures, kind=LOSSY):
-    """What is decided of four gray pictures [4, H, W] in [0, 1] that state nothing."""
+    """The transfer that is decided for four gray pictures [4, H, W] in [0, 1] without a statement."""
     codes = np.rint(np.clip(pictures, 0, 1) * 65535).astype(np.uint16)
     stack, none = np.repeat(codes[..., None], 3, axis=3), np.zeros(codes.shape, bool)
     slope = slope_of_shots([Shots(stack, 1, none, none[0])], [(0, 45, 90, 135)])

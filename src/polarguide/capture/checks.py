@@ -238,11 +238,11 @@ class Curvature:
     error: float = 0.0
 
     def surely_below(self, limit: float) -> bool:
-        """Whether it lies below a limit by three standard errors."""
+        """True where the slope is below a limit by more than three standard errors."""
         return self.value + _SURE * self.error < limit
 
     def surely_above(self, limit: float) -> bool:
-        """Whether it lies above a limit by three standard errors."""
+        """True where the slope is above a limit by more than three standard errors."""
         return self.value - _SURE * self.error > limit
 
 

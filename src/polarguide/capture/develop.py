@@ -55,7 +55,7 @@ from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES
 
 QUARTER_TURNS = ("90", "270")
-"""Of ``flip``: degrees counter-clockwise by which mosaics were turned."""
+"""Values of ``flip`` for mosaics that were turned: degrees, counter-clockwise."""
 SMALLEST = 16
 """Pixels of the shorter side of a mosaic."""
 WORKED = {"quarter": 16, "half": 60, "full": 240}
@@ -422,7 +422,7 @@ def _gains(logs: NDArray[np.float64]) -> Gains:
 
 
 COMPARABLE = "Keep one kind: their brightness cannot be compared."
-"""What to do about several kinds of files in one capture or set."""
+"""The remedy for several kinds of files in one capture or set."""
 
 
 def require_one(where: Path, found: Iterable[tuple[str, Path]], expected: str, remedy: str) -> None:

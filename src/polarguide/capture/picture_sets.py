@@ -66,7 +66,7 @@ class SetSamples:
 
     @property
     def gains(self) -> NDArray[np.float32]:
-        """By what the samples of each picture are divided, [K]."""
+        """Divisor of the samples of each picture, [K]."""
         return np.array([exposure.gain for exposure in self.exposures], np.float32)
 
     def intensities(self, at: Any) -> NDArray[np.float32]:
@@ -162,7 +162,7 @@ def judge(samples: SetSamples, gray: Floats) -> SetJudgment:
     reasons: dict[int, str] = {}
     while gray.shape[1] >= FEWEST_PIXELS:
         predicted = {k: _predicted(rows, gray, used, k) for k in np.flatnonzero(used).tolist()}
-        # The picture without which least is left of the rest, and the one whose angle is off most.
+        # Candidates: the picture with the largest residual, and the one with the largest error of its angle.
         doubtful = (
             max(predicted, key=lambda k: predicted[k].residual),
             max(predicted, key=lambda k: _off(samples, k, predicted[k])),
@@ -198,7 +198,7 @@ def _off(samples: SetSamples, k: int, predicted: _Angle) -> float:
 def _contradicts(
     samples: SetSamples, gray: Floats, used: NDArray[np.bool_], worst: int, predicted: dict[int, _Angle]
 ) -> bool:
-    """Whether the others agree with one another far better than a picture does with them, by angle or residual."""
+    """True where a picture is far further from the others, by angle or residual, than they are from one another."""
     rows = samples.rows.astype(np.float64)
     rest = used.copy()
     rest[worst] = False
@@ -263,7 +263,7 @@ def _predicted(rows: Floats, gray: Floats, used: NDArray[np.bool_], k: int) -> _
 
 
 def typical_variance(squares: Floats, freedom: int) -> float:
-    """The variance of which sums of ``freedom`` squares are, by their median."""
+    """Robust variance, from the median of sums of ``freedom`` squares each."""
     return float(np.median(squares)) / float(2 * gammaincinv(freedom / 2, 0.5))
 
 

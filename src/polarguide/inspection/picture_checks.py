@@ -28,7 +28,7 @@ VERY_UNEQUAL = 0.04
 """The same for the verdict "wrong"; a picture that is exposed 5 % longer gives 0.025."""
 OTHERWISE = 0.08
 """Largest difference of the logarithms of the gains of two angles for a warning; angles marked to two degrees leave
-0.07."""
+0.07, real sensors 0.04."""
 VERY_OTHERWISE = 0.17
 """The same for the verdict "wrong". An exposure that differs by a third of a stop gives 0.23."""
 UNSTEADY = 0.01
@@ -40,7 +40,7 @@ BLOWN = 0.3
 LITTLE = 0.05
 """Share of polarized pixels below which a capture gets a warning."""
 ALMOST_NONE = 0.005
-"""Share of polarized pixels below which polarization tells nothing."""
+"""Share of polarized pixels below which a capture is wrong."""
 NOISY = 0.03
 """Noise of one intensity as a share of S0 / 2: three times its DoLP noise is then 0.13."""
 

@@ -216,7 +216,7 @@ def _require_photographs(root: Path) -> None:
 
 
 def _may_be_mosaic(path: Path) -> bool:
-    """Whether a picture may be a raw mosaic: it has no colors, and its kind of file holds mosaics."""
+    """True where a picture may be a raw mosaic: it is gray, and its file format can hold mosaics."""
     if path.suffix.lower() not in RAW_SUFFIXES:
         return False
     pixels = decode_picture(path, read_picture(path))

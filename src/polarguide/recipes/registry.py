@@ -9,7 +9,7 @@ built in, never on import; a run's folder records the recipe's name, and never w
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
@@ -173,13 +173,9 @@ def variations_offered(name: str) -> tuple[Recipe, ...]:
 
 def _ablations() -> dict[str, Recipe]:
     """The ablations by name; none where their package is not installed."""
-    try:
-        module = importlib.import_module(NEIGHBOR)
-    except ModuleNotFoundError as error:
-        if error.name != NEIGHBOR.partition(".")[0]:
-            raise
+    if importlib.util.find_spec(NEIGHBOR.partition(".")[0]) is None:
         return {}
-    ablations: dict[str, Recipe] = module.VARIATIONS
+    ablations: dict[str, Recipe] = importlib.import_module(NEIGHBOR).VARIATIONS
     return ablations
 
 

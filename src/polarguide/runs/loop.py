@@ -20,9 +20,9 @@ from polarguide.training.settings import ResolvedSettings, StepReport
 
 LOG_EVERY = 10
 Ends = Callable[[], bool]
-"""Whether training should end."""
+"""Returns true to end the training."""
 Look = Callable[[Ends], None]
-"""Lets others look between two steps; asks what it is given whether training should end."""
+"""Runs between two steps, such as a viewer; its argument tells when the training should end."""
 
 
 class LoopTrainer(Protocol):

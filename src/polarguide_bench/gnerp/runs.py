@@ -133,6 +133,8 @@ def train_field(
             if os.path.lexists(out / CHECKPOINT):
                 state = load_field(out, recipe, backend.device)
                 check_step(state.step, resolved, out)
+            else:
+                reporter.say(f"{out} has no checkpoint: the training begins at step 0")
         trainer = FieldTrainer(loaded, recipe, resolved, backend.device, state, store)
         configuration.save(out)
         loop = TrainingLoop(trainer, out, session, reporter, should_stop, None, MemoryBound(plan.peak))

@@ -336,13 +336,16 @@ BIG_TIFF = (b"II+\0", b"MM\0+")
 _LARGEST = 281
 _SIDES = [256, 257]
 _PLAIN_TYPES = (3, 4)
-"""Of width and height: unsigned numbers of 16 and 32 bits."""
+"""Usual types of width and height: unsigned integers of 16 and 32 bits."""
 _LONG8 = 16
 
 
 def tiff_size(file: BinaryIO) -> tuple[int, int] | None:
     """Width and height in the header of a TIFF or BigTIFF file, of which no more is read; see ``_plain_size``."""
-    with contextlib.suppress(Exception), tifffile.TiffFile(file) as opened:  # it raises what it pleases
+    with (
+        contextlib.suppress(Exception),
+        tifffile.TiffFile(file) as opened,
+    ):  # tifffile raises many kinds of errors
         return _plain_size(opened)
     return None
 

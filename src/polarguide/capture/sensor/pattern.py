@@ -387,9 +387,9 @@ SIDE = 8
 """Pixels along a block that is looked at: 4 x 4 cells of polarizers."""
 _FEWEST = 100
 _DIFFERENT = 0.02
-"""Median second difference of cells, as a share of their mean, that filters make."""
+"""Median second difference of cells, as a share of their mean, above which there are color filters."""
 _EQUAL = 0.006
-"""The same that chance makes."""
+"""The same, below which there are none."""
 _STRONGER = 1.5
 """Ratio of typical differences across filters to those within one, from which on there are filters."""
 _ALIKE = 1.35
