@@ -55,7 +55,7 @@ from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES
 
 QUARTER_TURNS = ("90", "270")
-"""Values of ``flip`` for mosaics that were turned: degrees, counter-clockwise."""
+"""Values of ``flip`` for mosaics that were turned, in degrees counter-clockwise."""
 SMALLEST = 16
 """Pixels of the shorter side of a mosaic."""
 WORKED = {"quarter": 16, "half": 60, "full": 240}
