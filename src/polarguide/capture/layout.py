@@ -322,8 +322,9 @@ def ambiguous(folder: Path, expected: str, first: Path, second: Path) -> Polargu
     """The error that two files of a folder have the same meaning."""
     apart = first.name == second.name
     names = [f"{path.parent.name}/{path.name}" if apart else path.name for path in (first, second)]
-    found = " and ".join(names)
-    return PolarguideError(folder, expected=expected, found=found, remedy="Remove or rename one of them.")
+    return PolarguideError(
+        folder, expected=expected, found=" and ".join(names), remedy="Remove or rename one of them."
+    )
 
 
 def describe_contents(root: Path) -> str:

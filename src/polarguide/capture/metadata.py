@@ -162,8 +162,12 @@ def mount_of(path: Path, data: bytes) -> Mount:
     Raises:
         PolarguideError: ``polarizer`` is something else than "sensor" or "filter".
     """
-    remedy = 'Write "sensor" for polarizers behind the lens, "filter" for a sheet before it.'
-    return decode(data, _Polarizer, path, remedy=remedy).polarizer
+    return decode(
+        data,
+        _Polarizer,
+        path,
+        remedy='Write "sensor" for polarizers behind the lens, "filter" for a sheet before it.',
+    ).polarizer
 
 
 def keeps_gains(path: Path, data: bytes) -> bool:

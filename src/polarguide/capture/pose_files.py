@@ -242,11 +242,12 @@ def _require_one_component(
         counts[number] = counts.get(number, 0) + 1
     if len(counts) > 1:
         labels = {component.get("id"): component.get("label") for component in chunk.iter("component")}
-        parts = [f"{labels.get(number) or number} with {count}" for number, count in counts.items()]
         raise PolarguideError(
             path,
             expected="cameras of one component, which are in one frame",
-            found=listed(parts),
+            found=listed(
+                [f"{labels.get(number) or number} with {count}" for number, count in counts.items()]
+            ),
             remedy="Align the components with one another in Metashape, or reset those that are not wanted.",
         )
 
@@ -260,8 +261,11 @@ def _require_known(path: Path, camera: ElementTree.Element, sensor: ElementTree.
     for element in (camera, sensor):
         for shutter in element.iter("rolling_shutter"):
             if (shutter.text or "").strip().lower() not in _OFF or len(shutter):
-                where = f"{path} ({element.tag} {element.get('label')})"
-                raise wrong_camera(where, "a shutter that opens for all rows at once", "rolling_shutter")
+                raise wrong_camera(
+                    f"{path} ({element.tag} {element.get('label')})",
+                    "a shutter that opens for all rows at once",
+                    "rolling_shutter",
+                )
     for kind, elements in (
         ("camera", [camera]),
         ("sensor", [sensor]),

@@ -343,8 +343,11 @@ def _view_of(
     if not isinstance(camera, Camera):
         raise _unlike(f"cameras ({name})", "a polarguide.Camera", type(camera).__name__)
     if (camera.width, camera.height) != (width, height):
-        found = f"{camera.width}x{camera.height}"
-        raise _unlike(f"cameras ({name})", f"the size of the pictures, {width}x{height}", found)
+        raise _unlike(
+            f"cameras ({name})",
+            f"the size of the pictures, {width}x{height}",
+            f"{camera.width}x{camera.height}",
+        )
     masks = {
         what: _mask(of_view.get(name), f"{what} ({name})", (height, width))
         for what, of_view in beside.items()

@@ -164,8 +164,11 @@ def read_transforms(path: Path, views: Collection[str], sizes: Sizes) -> dict[st
     for number, frame in enumerate((*record.frames, *record.test_frames)):
         where = f"{path} (frame {number}, {frame.file_path})"
         if not frame.file_path:
-            named = listed(sorted(listed_frames[number]))
-            raise wrong_camera(where, "file_path and transform_matrix, as nerfstudio writes them", named)
+            raise wrong_camera(
+                where,
+                "file_path and transform_matrix, as nerfstudio writes them",
+                listed(sorted(listed_frames[number])),
+            )
         view = view_of_name(frame.file_path, views)
         if view in cameras:
             raise wrong_camera(where, f"one frame called {view}", "two")
@@ -219,8 +222,9 @@ def _pose_of(where: str, frame: _Frame) -> Any:
     ]
     numbers = [finite_numbers(where, matrix, _SQUARE)[:3] for matrix in matrices or [[]]]
     if any(not np.allclose(numbers[0], other) for other in numbers[1:]):
-        found = "transform_matrix_start and transform_matrix_end that differ"
-        raise wrong_camera(where, "a camera that stands still", found)
+        raise wrong_camera(
+            where, "a camera that stands still", "transform_matrix_start and transform_matrix_end that differ"
+        )
     return np.vstack([numbers[0], [0, 0, 0, 1]])
 
 
@@ -259,8 +263,11 @@ def _is_fisheye(where: str, lens: Mapping[str, Any]) -> bool:
     if model is not None and model not in (*_PERSPECTIVE, _FISHEYE):
         raise wrong_camera(where, expected, model)
     if lens["is_fisheye"] is not None and model is not None and lens["is_fisheye"] != (model == _FISHEYE):
-        found = f"{model} with is_fisheye {str(lens['is_fisheye']).lower()}"
-        raise wrong_camera(where, "camera_model and is_fisheye that agree", found)
+        raise wrong_camera(
+            where,
+            "camera_model and is_fisheye that agree",
+            f"{model} with is_fisheye {str(lens['is_fisheye']).lower()}",
+        )
     return bool(lens["is_fisheye"]) or model == _FISHEYE
 
 
@@ -279,8 +286,11 @@ def _distortion(where: str, lens: Mapping[str, Any], fisheye: bool) -> list[floa
                 where, "six distortion_params: k1, k2, k3, k4, p1, p2", f"{len(params)} numbers"
             )
         if any(own is not None and own != other for own, other in zip(coefficients, params, strict=True)):
-            found = f"{params} beside {dict(zip(_COEFFICIENTS, coefficients, strict=True))}"
-            raise wrong_camera(where, "distortion_params that agree with k1 to p2", found)
+            raise wrong_camera(
+                where,
+                "distortion_params that agree with k1 to p2",
+                f"{params} beside {dict(zip(_COEFFICIENTS, coefficients, strict=True))}",
+            )
         value = [float(number) for number in params]
     k1, k2, k3, k4, p1, p2 = value
     if fisheye:
@@ -331,8 +341,11 @@ def _focal_lengths(
         stated = [*([float(length)] if length is not None else []), *([] if fisheye else by_angle)]
         if stated and max(stated) > (1 + _SAME_FOCAL) * min(stated):
             others = " and ".join(f"{one:.6g}" for one in stated)
-            expected = f"fl_{axis} that agrees with camera_angle_{axis} and the width or height of {side}"
-            raise wrong_camera(where, expected, f"focal lengths of {others} pixels")
+            raise wrong_camera(
+                where,
+                f"fl_{axis} that agrees with camera_angle_{axis} and the width or height of {side}",
+                f"focal lengths of {others} pixels",
+            )
         lengths.append(stated[0] if stated else None)
     x, y = lengths
     if x is None and y is None:

@@ -191,8 +191,12 @@ class Camera:
 
 
 def _no_matrices(expected: str, found: str) -> PolarguideError:
-    remedy = "Correct the matrices; a pose that is camera to world has to be inverted."
-    return PolarguideError("camera", expected=expected, found=found, remedy=remedy)
+    return PolarguideError(
+        "camera",
+        expected=expected,
+        found=found,
+        remedy="Correct the matrices; a pose that is camera to world has to be inverted.",
+    )
 
 
 def seen_at(offsets: Tensor, camera: Camera) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:

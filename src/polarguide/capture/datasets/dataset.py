@@ -100,8 +100,12 @@ def masks_beside(root: Path, views: Mapping[str, int]) -> dict[str, Path]:
 
 def not_as_published(where: object, expected: str, found: str) -> PolarguideError:
     """The error that a file of a dataset is not what its authors published."""
-    remedy = "Take the files from the dataset as they were published."
-    return PolarguideError(where, expected=expected, found=found, remedy=remedy)
+    return PolarguideError(
+        where,
+        expected=expected,
+        found=found,
+        remedy="Take the files from the dataset as they were published.",
+    )
 
 
 def stokes_dataset(
@@ -206,8 +210,9 @@ def require_same_shape(path: Path, shape: tuple[int, ...], first: tuple[int, ...
         PolarguideError: the sizes differ.
     """
     if shape[:2] != first[:2]:
-        expected = f"{first[1]}x{first[0]} pixels like {like.name}"
-        raise not_as_published(path, expected, f"{shape[1]}x{shape[0]}")
+        raise not_as_published(
+            path, f"{first[1]}x{first[0]} pixels like {like.name}", f"{shape[1]}x{shape[0]}"
+        )
 
 
 def numbered_views(stems: set[str]) -> dict[str, int]:
@@ -243,8 +248,9 @@ def resized_mask(dataset: Dataset, view: str, size: tuple[int, int]) -> NDArray[
         return mask
     height, width = mask.shape
     if abs(height * size[1] - width * size[0]) > max(height, width):
-        expected = f"the aspect of the pictures, {size[1]}x{size[0]}"
-        raise not_as_published(f"mask of view {view}", expected, f"{width}x{height}")
+        raise not_as_published(
+            f"mask of view {view}", f"the aspect of the pictures, {size[1]}x{size[0]}", f"{width}x{height}"
+        )
     way = cv2.INTER_AREA if height > size[0] else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(mask.astype(np.float32), (size[1], size[0]), interpolation=way) >= 0.5)
 
@@ -295,8 +301,11 @@ def read_projections(path: Path) -> Projections:
         scale_key = f"scale_mat_{match[1]}"
         inner_key = f"camera_mat_{match[1]}"
         if inner_key in arrays and not _is_identity(arrays[inner_key]):
-            found_matrix = f"{inner_key}, which scales them to a picture from -1 to 1"
-            raise wrong_camera(path, "world_mat that projects to pixels", found_matrix)
+            raise wrong_camera(
+                path,
+                "world_mat that projects to pixels",
+                f"{inner_key}, which scales them to a picture from -1 to 1",
+            )
         if scale_key not in arrays:
             raise missing_entry(path, scale_key, arrays)
         world = finite_numbers(f"{path} ({key})", arrays[key], _SQUARE)
@@ -355,8 +364,11 @@ def checked_intrinsics(where: object, inner: Matrix) -> Matrix:
     lower = np.abs([inner[1, 0], inner[2, 0], inner[2, 1], inner[2, 2] - 1]).max()
     skew = abs(inner[0, 1]) / max(abs(inner[0, 0]), 1e-12)
     if not (inner[0, 0] > 0 and inner[1, 1] > 0 and lower < 1e-6 and skew < _LARGEST_SKEW):
-        expected = "an intrinsic matrix with positive focal lengths and without skew"
-        raise wrong_camera(where, expected, str(np.round(inner, 4).tolist()))
+        raise wrong_camera(
+            where,
+            "an intrinsic matrix with positive focal lengths and without skew",
+            str(np.round(inner, 4).tolist()),
+        )
     return inner
 
 

@@ -159,8 +159,9 @@ def _read_archive(path: Path) -> NDArray[np.float32]:
             raise missing_entry(path, key, arrays)
         plane = arrays[key]
         if plane.ndim != 3 or plane.shape[2] != 3 or plane.dtype.kind != "f":
-            expected = "floating-point numbers of three channels"
-            raise not_as_published(f"{path} ({key})", expected, array_kind(plane))
+            raise not_as_published(
+                f"{path} ({key})", "floating-point numbers of three channels", array_kind(plane)
+            )
         require_same_shape(path, plane.shape, arrays["S0"].shape, path)
     return np.stack([arrays[key] for key in _NERSP_ENTRIES]).astype(np.float32)
 

@@ -84,8 +84,9 @@ def _llff_cameras(path: Path) -> dict[int, PosedCamera]:
         down, right, back, center, inner = finite_numbers(where, row[:15], ((15,),)).reshape(3, 5).T
         height, width, focal = inner
         if not (1 <= height <= 1e5 and 1 <= width <= 1e5 and focal > 0):
-            found = f"{height:g}, {width:g} and {focal:g}"
-            raise not_as_published(where, "height, width and focal length in pixels", found)
+            raise not_as_published(
+                where, "height, width and focal length in pixels", f"{height:g}, {width:g} and {focal:g}"
+            )
         # OpenCV's axes: right, down, forward.
         axes = np.column_stack([np.stack([right, down, -back]), np.zeros(3)])
         rotation, _ = checked_pose(where, axes)
@@ -213,8 +214,11 @@ def open_phygap(root: Path) -> Dataset:
         raise not_as_published(f"{path} (extrinsics)", "matrices N x 4 x 4", array_size(poses))
     sides = [finite_numbers(f"{path} ({key})", arrays[key], ((),)) for key in ("image_width", "image_height")]
     if not all(1 <= side <= 1e5 for side in sides):
-        found = " and ".join(f"{float(side):g}" for side in sides)
-        raise not_as_published(f"{path} (image_width, image_height)", "a size in pixels", found)
+        raise not_as_published(
+            f"{path} (image_width, image_height)",
+            "a size in pixels",
+            " and ".join(f"{float(side):g}" for side in sides),
+        )
     size = (int(sides[0]), int(sides[1]))
     cameras = {}
     for number, pose in enumerate(poses):
@@ -303,8 +307,11 @@ def _gamma(root: Path) -> float:
     except ValueError:
         gamma = math.nan
     if len(files) > 1 or not 0.2 <= gamma <= 5:
-        expected = "one file called gamma<number>.txt with a number from 0.2 to 5"
-        raise not_as_published(root, expected, ", ".join(path.name for path in files))
+        raise not_as_published(
+            root,
+            "one file called gamma<number>.txt with a number from 0.2 to 5",
+            ", ".join(path.name for path in files),
+        )
     return gamma
 
 

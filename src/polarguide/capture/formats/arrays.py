@@ -56,8 +56,11 @@ def read_array(path: Path) -> NDArray[Any]:
     try:
         return _array(data)
     except BROKEN as error:
-        found = "an empty file" if not data else f"{len(data)} bytes of another kind"
-        raise damaged(path, "a complete .npy file of numbers", found) from error
+        raise damaged(
+            path,
+            "a complete .npy file of numbers",
+            "an empty file" if not data else f"{len(data)} bytes of another kind",
+        ) from error
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -183,9 +186,11 @@ def read_radiance(path: Path) -> NDArray[np.float32]:
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     if pixels.ndim != 3 or pixels.shape[2] not in (1, 3) or 0 in pixels.shape or pixels.dtype.kind != "f":
-        expected = "a picture of floating-point numbers with one or three channels"
         raise PolarguideError(
-            path, expected=expected, found=array_kind(pixels), remedy="Export the file again."
+            path,
+            expected="a picture of floating-point numbers with one or three channels",
+            found=array_kind(pixels),
+            remedy="Export the file again.",
         )
     with np.errstate(over="ignore"):
         return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3)), dtype=np.float32)

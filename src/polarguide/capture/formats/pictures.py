@@ -101,15 +101,12 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
 def _codes_of_floats(path: Path, pixels: NDArray[Any]) -> NDArray[np.uint16]:
     """16-bit codes of intensities from 0 to 1."""
     if not np.isfinite(pixels).all() or float(np.median(pixels)) > 1.0:
-        found = (
-            "values that are not finite"
-            if not np.isfinite(pixels).all()
-            else f"up to {float(pixels.max()):g}"
-        )
         raise PolarguideError(
             path,
             expected="floating-point values from 0 to 1, where 1 is full scale",
-            found=found,
+            found="values that are not finite"
+            if not np.isfinite(pixels).all()
+            else f"up to {float(pixels.max()):g}",
             remedy="Divide by the value at which the camera saturates, or save 16-bit whole numbers.",
         )
     # Half precision ends at 65504, below the largest code.
