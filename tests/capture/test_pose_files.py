@@ -11,7 +11,7 @@ import pytest
 from dataset_files import HEIGHT, INNER, WIDTH, idr_cameras, poses
 from faults import Fault
 
-from polarguide.capture.colmap.files import colmap_camera
+from polarguide.capture.colmap.model import colmap_camera
 from polarguide.capture.pose_files import read_pose_file
 from polarguide.core.errors import PolarguideWarning
 from polarguide.geometry.camera import Camera

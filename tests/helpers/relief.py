@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from camera_files import behind, write_shots
 
-from polarguide.capture.colmap.files import PosedCamera
+from polarguide.capture.colmap.model import PosedCamera
 
 DEPTHS = (0.0, 0.25)
 """World z of ground and step is minus these."""

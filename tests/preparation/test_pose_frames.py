@@ -23,7 +23,7 @@ from heard import Heard
 from test_prepare_filter import with_orientation
 
 from polarguide.capture import load_scene
-from polarguide.capture.colmap.files import PosedCamera
+from polarguide.capture.colmap.model import PosedCamera
 from polarguide.capture.colmap.poses import Geometry, Poses
 from polarguide.capture.filter.camera_files import apply_orientation
 from polarguide.preparation.open_source import known_poses, settle_pose_frames

@@ -33,7 +33,7 @@ from relief import DEPTHS, write_relief
 
 from polarguide.capture import load_scene
 from polarguide.capture.colmap import triangulate as points_module
-from polarguide.capture.colmap.files import PosedCamera, write_cameras
+from polarguide.capture.colmap.model import PosedCamera, write_cameras
 from polarguide.capture.colmap.sfm import match_features, tone_mapped
 from polarguide.capture.colmap.triangulate import sample_visual_hull
 from polarguide.capture.write import write_png

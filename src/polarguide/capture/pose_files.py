@@ -12,8 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from polarguide.capture.colmap.files import PosedCamera
-from polarguide.capture.colmap.model import view_of_name
+from polarguide.capture.colmap.model import PosedCamera, view_of_name
 from polarguide.capture.datasets.dataset import pinhole_camera, read_projections, require_known_names
 from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
 from polarguide.capture.transforms_file import (
@@ -131,20 +130,20 @@ def _idr(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, PosedCamer
 
 
 _LARGEST_XML = 1 << 24
-_LENS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+_METASHAPE_LENS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 # Pixels by which skew may move those at the edge of the picture: less than what two ways to count pixels differ by.
 _LARGEST_SKEW = 0.25
 # Fisheyes are equidistant, under their name since version 2.3.
 _EQUIDISTANT = ("fisheye", "equidistant_fisheye")
 _OFF = ("", "0", "false", "none", "disabled")
-_READ = {
+_METASHAPE_FIELDS = {
     "sensor": {"resolution", "calibration", "rolling_shutter"},
-    "calibration": {"resolution", *_LENS},
+    "calibration": {"resolution", *_METASHAPE_LENS},
     "camera": {"transform", "rolling_shutter"},
 }
 # What these say changes no camera that is read: bands, exposures, accuracies, GPS, and what the chunk's frame is to the
 # world. ``orientation`` is how Metashape displays a picture; pose and calibration are of the stored pixels.
-_IRRELEVANT = {
+_METASHAPE_IRRELEVANT = {
     "sensor": {
         "property", "bands", "data_type", "covariance", "meta", "fixed", "fixed_params", "fixed_calibration",
         "black_level", "sensitivity", "normalize_sensitivity", "normalize_to_float", "vignetting",
@@ -197,7 +196,7 @@ def read_metashape(path: Path, views: Collection[str]) -> dict[str, PosedCamera]
         _require_known(path, camera, sensor)
         text = camera.findtext("transform") or ""
         numbers = finite_numbers(where, [number_or_nan(part) for part in text.split()], ((16,),))
-        size, lens = _lens_of(where, sensor)
+        size, lens = _metashape_lens(where, sensor)
         world_cameras[view] = camera_to_world(where, size, lens, numbers.reshape(4, 4))
     return world_cameras
 
@@ -272,10 +271,10 @@ def _require_known(path: Path, camera: ElementTree.Element, sensor: ElementTree.
         ("calibration", sensor.findall("calibration")),
     ):
         names = {child.tag for element in elements for child in element}
-        require_known_names(path, names - _READ[kind] - _IRRELEVANT[kind])
+        require_known_names(path, names - _METASHAPE_FIELDS[kind] - _METASHAPE_IRRELEVANT[kind])
 
 
-def _lens_of(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[str, tuple[float, ...]]]:
+def _metashape_lens(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[str, tuple[float, ...]]]:
     """Size of a sensor, and COLMAP's model of its lens with parameters; the adjusted calibration goes first.
 
     Metashape's p1 bends along x, and so does p2 of OpenCV and COLMAP. Its fisheye distorts the angle from the axis by
@@ -296,8 +295,8 @@ def _lens_of(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[str, tuple
     resolution = sensor.find("resolution") if resolution is None else resolution
     if best is None or resolution is None or best.findtext("f") is None:
         raise wrong_camera(where, "a calibrated sensor with a resolution and a focal length f", "none")
-    numbers = finite_numbers(where, [number_or_nan(best.findtext(n, "0")) for n in _LENS], ((len(_LENS),),))
-    value = {name: float(number) for name, number in zip(_LENS, numbers, strict=True)}
+    numbers = finite_numbers(where, [number_or_nan(best.findtext(n, "0")) for n in _METASHAPE_LENS], ((len(_METASHAPE_LENS),),))
+    value = {name: float(number) for name, number in zip(_METASHAPE_LENS, numbers, strict=True)}
     width, height = (number_or_nan(resolution.get(side, "0")) for side in ("width", "height"))
     if not (1 <= width < 1e5 and 1 <= height < 1e5 and value["f"] > 0):
         found = f"{width:g}x{height:g}, f = {value['f']:g}"
@@ -320,7 +319,7 @@ def _require_terms(where: str, value: Mapping[str, float], height: float, others
     skew = abs(value["b2"]) * height / 2 / value["f"]
     named = [name for name in others if value[name]] + ["b2"] * (skew > _LARGEST_SKEW)
     if named:
-        terms = [name for name in _LENS if name not in (*others, "b2")]
+        terms = [name for name in _METASHAPE_LENS if name not in (*others, "b2")]
         raise PolarguideError(
             where,
             expected=f"a lens with {listed(terms, len(terms))}",

@@ -16,8 +16,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from polarguide.capture.colmap.files import PosedCamera
-from polarguide.capture.colmap.model import view_of_name
+from polarguide.capture.colmap.model import PosedCamera, view_of_name
 from polarguide.capture.datasets.dataset import checked_intrinsics, checked_pose, require_known_names
 from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
 from polarguide.capture.view import listed

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from polarguide import __version__
 from polarguide.capture import checks
 from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented
-from polarguide.capture.colmap.files import MODELS
+from polarguide.capture.colmap.model import MODELS
 from polarguide.capture.colmap.poses import Geometry, undistortion
 from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.layout import describe_contents, index_files

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.calibration import Sense, oriented
-from polarguide.capture.colmap.files import PosedCamera
+from polarguide.capture.colmap.model import PosedCamera
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.datasets.dataset import Dataset, not_as_published, read_mask, resized_mask
 from polarguide.capture.exposures import Angle

@@ -16,15 +16,16 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.files import PosedCamera, write_cameras
 from polarguide.capture.colmap.model import (
     MODEL_FILES,
+    PosedCamera,
     find_model,
     is_pinhole,
     is_sound,
     load_model,
     other_text_model,
     posed_images,
+    write_cameras,
 )
 from polarguide.capture.filter.develop import remapped_mask
 from polarguide.capture.view import listed

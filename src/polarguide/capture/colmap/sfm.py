@@ -22,8 +22,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from polarguide.capture.colmap import steps
-from polarguide.capture.colmap.files import PosedCamera, colmap_camera
-from polarguide.capture.colmap.model import load_model
+from polarguide.capture.colmap.model import PosedCamera, colmap_camera, load_model
 from polarguide.capture.filter.camera_files import Lens
 from polarguide.capture.view import listed
 from polarguide.capture.write import write_png

@@ -13,8 +13,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.files import PosedCamera, colmap_camera, write_cameras
-from polarguide.capture.colmap.model import load_model
+from polarguide.capture.colmap.model import PosedCamera, colmap_camera, load_model, write_cameras
 from polarguide.capture.colmap.sfm import match_features, run_step
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_picture
 from polarguide.core.errors import PolarguideError

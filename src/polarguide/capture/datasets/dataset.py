@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import rq
 
 from polarguide.capture.calibration import Sense
-from polarguide.capture.colmap.files import PosedCamera
+from polarguide.capture.colmap.model import PosedCamera
 from polarguide.capture.formats.arrays import finite_numbers, read_arrays, read_radiance, wrong_camera
 from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, decode_stored, read_picture
 from polarguide.capture.layout import index_files

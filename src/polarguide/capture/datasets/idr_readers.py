@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.files import PosedCamera
+from polarguide.capture.colmap.model import PosedCamera
 from polarguide.capture.datasets.dataset import (
     Dataset,
     StokesImage,

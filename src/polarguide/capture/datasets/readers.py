@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.files import PosedCamera
+from polarguide.capture.colmap.model import PosedCamera
 from polarguide.capture.datasets.dataset import (
     Dataset,
     StokesImage,
