@@ -1,31 +1,397 @@
-"""Cameras from files of other programs: nerfstudio's ``transforms.json``, Metashape's ``cameras.xml``, IDR's .npz.
+"""Cameras of ``transforms.json``: nerfstudio's, instant-ngp's and Blender's.
 
-Metashape's poses are in the frame of a chunk, its calibrations count from the middle of the picture; elements and their
-meaning: docs/reference/formats.md has each.
+Fields and their meaning: docs/reference/formats.md has each. A field that changes the meaning of numbers is used or
+refused; one that is not known is warned of by name.
 """
 
 from __future__ import annotations
 
+import functools
+import math
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from msgspec import Meta
 
 from polarguide.capture.colmap.model import PosedCamera, view_of_name
-from polarguide.capture.datasets.dataset import pinhole_camera, read_projections, require_known_names
-from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
-from polarguide.capture.transforms_file import (
-    Sizes,
-    brown_camera,
-    camera_to_world,
-    read_transforms,
-    settled_size,
+from polarguide.capture.datasets.dataset import (
+    checked_intrinsics,
+    checked_pose,
+    pinhole_camera,
+    read_projections,
+    require_known_names,
 )
+from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
 from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import read_file
+from polarguide.core.records import LARGEST_RECORD, decode, parse
 from polarguide.core.text import number_or_nan
+
+Size = tuple[int, int]
+Sizes = Callable[[str], tuple[Size, ...]]
+"""View -> sizes (width, height) that its camera may have been made for, the likeliest first; none where unknown."""
+# Share of a side by which principal points lie off the middle: lenses miss it by some percent, while those of pictures
+# of half the size lie a quarter off.
+_OFF_CENTER = 0.125
+
+
+def is_centered(size: Size, center: tuple[float | None, float | None]) -> bool:
+    """Whether a principal point, as far as it is known, lies near the middle of a picture."""
+    return all(
+        place is None or abs(place - side / 2) <= _OFF_CENTER * side
+        for place, side in zip(center, size, strict=True)
+    )
+
+
+def settled_size(
+    where: object, sizes: Sequence[Size], center: tuple[float | None, float | None], *, in_pixels: bool
+) -> Size:
+    """The size whose middle the principal point lies near.
+
+    Args:
+        where: for messages.
+        sizes: that it may be, the likeliest first.
+        center: the principal point, as far as it is known.
+        in_pixels: whether other numbers of the camera are in pixels, too, and mean nothing without the right size.
+
+    Raises:
+        PolarguideError: no size is known, the principal point fits none, or several fit.
+    """
+    expected = "width and height of the pictures that the camera was made for, w and h"
+    if not sizes:
+        raise wrong_camera(where, expected, "none")
+    fitting = [size for size in sizes if is_centered(size, center)]
+    named = " or ".join(f"{width}x{height}" for width, height in sizes)
+    if not fitting:
+        raise wrong_camera(
+            where, f"a principal point near the middle of {named}", f"{center[0]}, {center[1]}"
+        )
+    areas = {width * height for width, height in fitting}
+    if len(areas) > 1 and in_pixels:
+        raise wrong_camera(where, expected, f"none, for pictures of {named}")
+    return fitting[0]
+
+
+_SQUARE = ((3, 4), (4, 4))
+# The cameras look along -z with y up.
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_FISHEYE = "OPENCV_FISHEYE"
+MOST_FRAMES = 20_000
+# Two statements of one focal length differ by rounding; a file of pictures that were resized later by far more.
+_SAME_FOCAL = 0.01
+
+
+class _Lens(msgspec.Struct):
+    """Fields that describe a lens, for all frames or for one."""
+
+    camera_model: str | None = None
+    fl_x: float | None = None
+    fl_y: float | None = None
+    intrinsic_matrix: list[list[float]] | None = None
+    cx: float | None = None
+    cy: float | None = None
+    w: float | None = None
+    h: float | None = None
+    camera_angle_x: float | None = None
+    camera_angle_y: float | None = None
+    x_fov: float | None = None
+    y_fov: float | None = None
+    is_fisheye: bool | None = None
+    distortion_params: list[float] | None = None
+    k1: float | None = None
+    k2: float | None = None
+    k3: float | None = None
+    k4: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+    k5: float | None = None
+    k6: float | None = None
+    rolling_shutter: list[float] | None = None
+    rolling_shutter_time: float | None = None
+    ftheta_p0: float | None = None
+    latlong: Any = None
+    equirectangular: Any = None
+    fisheye_crop_radius: float | None = None
+
+
+class _Frame(_Lens):
+    file_path: str = ""
+    transform_matrix: list[list[float]] | None = None
+    transform_matrix_start: list[list[float]] | None = None
+    transform_matrix_end: list[list[float]] | None = None
+
+
+class _Transforms(_Lens):
+    frames: Annotated[list[_Frame], Meta(max_length=MOST_FRAMES)] = []
+    test_frames: Annotated[list[_Frame], Meta(max_length=MOST_FRAMES)] = []
+    camera: Any = None
+    normal_mts_args: Any = None
+    from_na: bool | None = None
+
+
+# What these say changes no camera: where a program puts the scene, what it trains on, depth, masks and points.
+_IRRELEVANT = {
+    "aabb", "aabb_scale", "render_aabb", "scale", "offset", "up", "applied_transform", "applied_scale",
+    "orientation_override", "auto_scale_poses_override", "centered", "ply_file_path", "n_frames",
+    "n_extra_learnable_dims", "importance_sampling", "sharpen", "envmap", "white_transparent",
+    "black_transparent", "mask_color", "fix_premult", "enable_ray_loading", "enable_depth_loading",
+    "integer_depth_scale", "depth_unit_scale_factor", "sharpness_discard_threshold", "train_filenames",
+    "val_filenames", "test_filenames", "ftheta_p1", "ftheta_p2", "ftheta_p3", "ftheta_p4", "rotation",
+    "sharpness", "time", "mask_path", "depth_file_path", "depth_path", "normal_file_path", "semantics_path",
+    "segmentation_path", "colmap_im_id", "camera_id", "driver_parameters", "bg_color", "has_mask", "is_bad",
+    "camera_linear_velocity", "camera_angular_velocity", "exposure_time", "motion_blur_score",
+}  # fmt: skip
+
+
+def read_transforms(path: Path, views: Collection[str], sizes: Sizes) -> dict[str, PosedCamera]:
+    """Cameras by the views that the names of the frames' files mean.
+
+    Args:
+        path: the file.
+        views: names of the capture's views.
+        sizes: what a view's camera may have been made for, where the file does not say.
+
+    Raises:
+        PolarguideError: the file cannot be read, or a field names a camera that is not read.
+    """
+    remedy = "Export transforms.json again."
+    content = parse(read_file(path, largest=LARGEST_RECORD, remedy=remedy), path, remedy=remedy)
+    record = decode(content, _Transforms, path, remedy=remedy)
+    listed_frames = [frame for key in ("frames", "test_frames") for frame in content.get(key, ())]
+    names = set(content).union(*listed_frames)
+    if record.camera is not None or record.normal_mts_args is not None:
+        name = "camera" if record.camera is not None else "normal_mts_args"
+        raise wrong_camera(path, "cameras that look along -z with y up (OpenGL)", f"{name}, of other axes")
+    cameras: dict[str, PosedCamera] = {}
+    for number, frame in enumerate((*record.frames, *record.test_frames)):
+        where = f"{path} (frame {number}, {frame.file_path})"
+        if not frame.file_path:
+            raise wrong_camera(
+                where,
+                "file_path and transform_matrix, as nerfstudio writes them",
+                listed(sorted(listed_frames[number])),
+            )
+        view = view_of_name(frame.file_path, views)
+        if view in cameras:
+            raise wrong_camera(where, f"one frame called {view}", "two")
+        lens = _lens_of(where, frame, record)
+        # NeuS2 says by ``from_na`` that its axes are right, down, forward.
+        to_world = _pose_of(where, frame) @ (np.eye(4) if record.from_na else _OPENGL)
+        cameras[view] = _camera_of(where, lens, to_world, functools.partial(sizes, view))
+    known = {*_Transforms.__struct_fields__, *_Frame.__struct_fields__, *_IRRELEVANT}
+    require_known_names(path, names - known)
+    return cameras
+
+
+_MATRIX = ("fl_x", "fl_y", "cx", "cy")
+_FOCAL = ("fl_x", "fl_y", "intrinsic_matrix", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
+_COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+
+def _lens_of(where: str, frame: _Lens, record: _Lens) -> dict[str, Any]:
+    """The fields of a frame's lens: its own, else those of the file; ``intrinsic_matrix`` as the four numbers it holds.
+
+    Focal lengths and coefficients are statements as a whole: a frame that makes one takes nothing of the file's.
+
+    Raises:
+        PolarguideError: the matrix is no camera matrix, or stands beside other numbers.
+    """
+    lens = {name: getattr(frame, name) for name in _Lens.__struct_fields__}
+    whole = (_FOCAL, (*_COEFFICIENTS, "distortion_params"))
+    stated = {name for names in whole if any(lens[n] is not None for n in names) for name in names}
+    used = {
+        name: getattr(record, name) if own is None and name not in stated else own
+        for name, own in lens.items()
+    }
+    if used["intrinsic_matrix"] is None:
+        return used
+    beside = {name: used[name] for name in (*_FOCAL, *_MATRIX) if name != "intrinsic_matrix"}
+    named = [name for name, number in beside.items() if number is not None]
+    if named:
+        raise wrong_camera(where, "intrinsic_matrix alone", f"{', '.join(named)} beside it")
+    matrix = finite_numbers(where, used["intrinsic_matrix"], ((3, 3), *_SQUARE))[:3, :3]
+    inner = checked_intrinsics(where, matrix)
+    numbers = (inner[0, 0], inner[1, 1], inner[0, 2], inner[1, 2])
+    return used | dict(zip(_MATRIX, map(float, numbers), strict=True))
+
+
+def _pose_of(where: str, frame: _Frame) -> Any:
+    """The matrix from the camera to the world, [4, 4], with the axes of the file."""
+    matrices = [
+        matrix
+        for matrix in (frame.transform_matrix, frame.transform_matrix_start, frame.transform_matrix_end)
+        if matrix is not None
+    ]
+    numbers = [finite_numbers(where, matrix, _SQUARE)[:3] for matrix in matrices or [[]]]
+    if any(not np.allclose(numbers[0], other) for other in numbers[1:]):
+        raise wrong_camera(
+            where, "a camera that stands still", "transform_matrix_start and transform_matrix_end that differ"
+        )
+    return np.vstack([numbers[0], [0, 0, 0, 1]])
+
+
+def _camera_of(
+    where: str, lens: Mapping[str, Any], to_world: Any, sizes: Callable[[], Sequence[Size]]
+) -> PosedCamera:
+    """The camera of a frame."""
+    fisheye = _is_fisheye(where, lens)
+    coefficients = _distortion(where, lens, fisheye)
+    center = (lens["cx"], lens["cy"])
+    size = _stated_size(where, lens)
+    if size is None:
+        in_pixels = lens["fl_x"] is not None or lens["fl_y"] is not None
+        size = settled_size(where, sizes(), center, in_pixels=in_pixels)
+    focal = _focal_lengths(where, lens, size, fisheye)
+    middle = [size[k] / 2 if center[k] is None else float(center[k]) for k in range(2)]
+    inner = (*focal, *middle)
+    lens_model = (_FISHEYE, (*inner, *coefficients)) if fisheye else brown_camera(inner, coefficients)
+    return camera_to_world(where, size, lens_model, to_world)
+
+
+def _is_fisheye(where: str, lens: Mapping[str, Any]) -> bool:
+    """Whether the lens is a fisheye of OpenCV.
+
+    Raises:
+        PolarguideError: the lens is a panorama or another lens that is not read, or fields contradict one another.
+    """
+    model = lens["camera_model"]
+    expected = f"a camera of {', '.join(_PERSPECTIVE)} or {_FISHEYE}"
+    others = ("latlong", "equirectangular", "ftheta_p0", "fisheye_crop_radius", "k5", "k6")
+    named = next((name for name in others if lens[name]), None)
+    if named is not None:
+        raise wrong_camera(where, expected, f"{named} {lens[named]}")
+    if any(lens["rolling_shutter"] or ()) or lens["rolling_shutter_time"]:
+        raise wrong_camera(where, "a shutter that opens for all rows at once", "rolling_shutter")
+    if model is not None and model not in (*_PERSPECTIVE, _FISHEYE):
+        raise wrong_camera(where, expected, model)
+    if lens["is_fisheye"] is not None and model is not None and lens["is_fisheye"] != (model == _FISHEYE):
+        raise wrong_camera(
+            where,
+            "camera_model and is_fisheye that agree",
+            f"{model} with is_fisheye {str(lens['is_fisheye']).lower()}",
+        )
+    return bool(lens["is_fisheye"]) or model == _FISHEYE
+
+
+def _distortion(where: str, lens: Mapping[str, Any], fisheye: bool) -> list[float]:
+    """k1, k2, p1, p2 and k3 of a perspective camera, k1 to k4 of a fisheye.
+
+    Raises:
+        PolarguideError: there are others, or two statements differ.
+    """
+    coefficients = [lens[name] for name in _COEFFICIENTS]
+    value = [float(number or 0.0) for number in coefficients]
+    params = lens["distortion_params"]
+    if params is not None:
+        if len(params) != len(_COEFFICIENTS):
+            raise wrong_camera(
+                where, "six distortion_params: k1, k2, k3, k4, p1, p2", f"{len(params)} numbers"
+            )
+        if any(own is not None and own != other for own, other in zip(coefficients, params, strict=True)):
+            raise wrong_camera(
+                where,
+                "distortion_params that agree with k1 to p2",
+                f"{params} beside {dict(zip(_COEFFICIENTS, coefficients, strict=True))}",
+            )
+        value = [float(number) for number in params]
+    k1, k2, k3, k4, p1, p2 = value
+    if fisheye:
+        if p1 or p2:
+            raise wrong_camera(where, "a fisheye with k1 to k4 alone", f"p1 = {p1:g}, p2 = {p2:g}")
+        return [k1, k2, k3, k4]
+    if k4:
+        raise wrong_camera(
+            where, "a perspective camera with at most three radial coefficients", f"k4 = {k4:g}"
+        )
+    return [k1, k2, p1, p2, k3]
+
+
+def _stated_size(where: str, lens: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Width and height that the file states; None where it has neither.
+
+    Raises:
+        PolarguideError: the file has one of the two, or a size that no picture has.
+    """
+    width = lens["w"]
+    height = lens["h"]
+    if width is None and height is None:
+        return None
+    if not width or not height or not 0 < width < 1e5 or not 0 < height < 1e5:
+        raise wrong_camera(where, "width and height, w and h", f"{width} and {height}")
+    return round(width), round(height)
+
+
+def _focal_lengths(
+    where: str, lens: Mapping[str, Any], size: tuple[int, int], fisheye: bool
+) -> tuple[float, float]:
+    """Focal lengths in x and y: in pixels, by an angle of view in radians, or in degrees.
+
+    Raises:
+        PolarguideError: no value is positive, or two values differ.
+    """
+    lengths: list[float | None] = []
+    for axis, side in zip("xy", size, strict=True):
+        length = lens[f"fl_{axis}"]
+        angle = lens[f"camera_angle_{axis}"]
+        degrees = lens[f"{axis}_fov"]
+        angles = [*([angle] if angle else []), *([math.radians(degrees)] if degrees else [])]
+        by_angle = [side / 2 / math.tan(view / 2) for view in angles if 0 < view < math.pi]
+        if len(by_angle) < len(angles) or (length is not None and not length > 0):
+            raise wrong_camera(
+                where, f"a positive focal length fl_{axis}, or an angle below 180 degrees", str(length)
+            )
+        stated = [*([float(length)] if length is not None else []), *([] if fisheye else by_angle)]
+        if stated and max(stated) > (1 + _SAME_FOCAL) * min(stated):
+            others = " and ".join(f"{one:.6g}" for one in stated)
+            raise wrong_camera(
+                where,
+                f"fl_{axis} that agrees with camera_angle_{axis} and the width or height of {side}",
+                f"focal lengths of {others} pixels",
+            )
+        lengths.append(stated[0] if stated else None)
+    x, y = lengths
+    if x is None and y is None:
+        raise wrong_camera(where, "a focal length, fl_x or camera_angle_x", "none")
+    return float(x or y or 0.0), float(y or x or 0.0)
+
+
+def brown_camera(inner: Sequence[float], coefficients: Sequence[float]) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's model and parameters of a perspective camera with OpenCV's k1, k2, p1, p2 and k3.
+
+    ``inner``: focal lengths and principal point.
+    """
+    if not any(coefficients):
+        return "PINHOLE", tuple(inner)
+    return "FULL_OPENCV", (*inner, *coefficients, 0.0, 0.0, 0.0)
+
+
+def camera_to_world(
+    where: str, size: tuple[int, int], lens: tuple[str, tuple[float, ...]], to_world: Any
+) -> PosedCamera:
+    """A camera from its pose in the world.
+
+    Args:
+        where: for messages. size: width and height.
+        lens: COLMAP's model and its parameters; pixel centers at 0.5.
+        to_world: [4, 4], with axes right, down, forward; a scale is taken out.
+
+    Raises:
+        PolarguideError: the matrix is not a pose.
+    """
+    scale = abs(np.linalg.det(to_world[:3, :3])) ** (1 / 3)
+    if not 1e-6 < scale < 1e6:
+        raise wrong_camera(where, "a rotation and a translation", "a singular matrix")
+    axes, center = checked_pose(where, np.column_stack([to_world[:3, :3] / scale, to_world[:3, 3]]))
+    rotation = axes.T
+    return PosedCamera(*size, *lens, rotation, -rotation @ center)
+
 
 SUFFIXES = (".json", ".xml", ".npz")
 
@@ -295,7 +661,9 @@ def _metashape_lens(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[str
     resolution = sensor.find("resolution") if resolution is None else resolution
     if best is None or resolution is None or best.findtext("f") is None:
         raise wrong_camera(where, "a calibrated sensor with a resolution and a focal length f", "none")
-    numbers = finite_numbers(where, [number_or_nan(best.findtext(n, "0")) for n in _METASHAPE_LENS], ((len(_METASHAPE_LENS),),))
+    numbers = finite_numbers(
+        where, [number_or_nan(best.findtext(n, "0")) for n in _METASHAPE_LENS], ((len(_METASHAPE_LENS),),)
+    )
     value = {name: float(number) for name, number in zip(_METASHAPE_LENS, numbers, strict=True)}
     width, height = (number_or_nan(resolution.get(side, "0")) for side in ("width", "height"))
     if not (1 <= width < 1e5 and 1 <= height < 1e5 and value["f"] > 0):
