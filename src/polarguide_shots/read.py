@@ -16,8 +16,8 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.capture.colmap.model import fit_camera, read_model
 from polarguide.capture.exposures import FOUR, Angle, normalized
-from polarguide.capture.given_arrays import Array, as_numpy, exposures_of, kind_of, stored_pictures
 from polarguide.capture.view import ANGLES, View
+from polarguide.capture.view_reader import Array, as_numpy, exposures_of, kind_of, stored_pictures
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import check_finite, index_of
 from polarguide.core.text import decimals

@@ -83,7 +83,7 @@ def test_test_views_far_from_training_are_a_warning(capture: TinyCapture) -> Non
 def test_a_ring_that_is_held_out_as_a_whole_is_a_warning(
     capture: TinyCapture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("polarguide.capture.reader.held_out_band", lambda _, tests: list(tests))
+    monkeypatch.setattr("polarguide.capture.scene.held_out_band", lambda _, tests: list(tests))
     capture.write_json("split.json", {"test": list(NAMES[:2])})
     (warning,) = load_scene(capture.root).warnings
     assert "2 of 2 test views are all of a band of heights, such as a ring (v000, v001)" in warning

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from polarguide.capture.colmap.model import ColmapModel, read_model
     from polarguide.capture.ground_truth import GroundTruth
-    from polarguide.capture.reader import load_scene
-    from polarguide.capture.scene import Scene
+    from polarguide.capture.scene import Scene, load_scene
     from polarguide.capture.view import View
 
 # Where each name is defined. It is loaded when it is asked for: a calibration can be read without torch.
@@ -18,7 +17,7 @@ _MODULES = {
     "GroundTruth": "ground_truth",
     "Scene": "scene",
     "View": "view",
-    "load_scene": "reader",
+    "load_scene": "scene",
     "read_model": "colmap.model",
 }
 

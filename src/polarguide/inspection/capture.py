@@ -29,7 +29,7 @@ from polarguide.capture.metadata import (
     refractive_index_of,
 )
 from polarguide.capture.point_exposures import PointExposures
-from polarguide.capture.reader import read_views
+from polarguide.capture.scene import read_views
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.view_reader import StoredViews
 from polarguide.core.files import read_file

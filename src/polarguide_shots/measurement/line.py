@@ -13,8 +13,8 @@ from typing import Any
 import msgspec
 
 from polarguide.capture.exposures import Angle
-from polarguide.capture.given_arrays import Array
 from polarguide.capture.view import ANGLES
+from polarguide.capture.view_reader import Array
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, require_inside
 from polarguide.core.options import PathLike
