@@ -20,7 +20,7 @@ from polarguide.capture.exposures import Angle, Exposure, analyzers, turned
 from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
 from polarguide.capture.filter.encoding import VIDEO, kind_of_file, transfer_of_pictures
 from polarguide.capture.filter.shots import Shots, read_stack, stacked
-from polarguide.capture.formats.decoders import rescaled
+from polarguide.capture.formats.headers import rescaled
 from polarguide.capture.formats.pictures import linear_codes
 from polarguide.capture.layout import require_memory
 from polarguide.capture.picture_sets import Mask, SetSamples

@@ -16,7 +16,7 @@ from faults import Fault
 
 from polarguide.capture.datasets.readers import open_dataset
 from polarguide.capture.formats.arrays import BROKEN, read_array, read_arrays, read_radiance, unpacked
-from polarguide.capture.formats.integrity import declared_size, find_damage
+from polarguide.capture.formats.headers import declared_size, find_damage
 from polarguide.capture.formats.pictures import decode_stored
 from polarguide.capture.ground_truth import objects_of
 from polarguide.capture.pose_files import read_pose_file
@@ -35,7 +35,7 @@ HUGE, SMALL = 30_000, (24, 20)
          Fault(found="does not begin with its size")),
         (".png", lambda path: made.png(path, 64, 64, before=[(b"acTL", bytes(8))]),
          Fault(found="an animated PNG file")),
-        (".jpg", lambda path: made.two_sizes_jpeg(path, HUGE), Fault(found="more than any camera takes")),
+        (".jpg", lambda path: made.two_sizes_jpeg(path, HUGE), Fault(found="without a size")),
         (".jpg", lambda path: made.scans_jpeg(path, 64, 4000), Fault(found="4000 scans")),
     ],
 )  # fmt: skip

@@ -18,7 +18,7 @@ from tiny_capture import NAMES, TinyCapture, write_tiny_capture
 
 from polarguide.capture import load_scene, view_reader
 from polarguide.capture.develop import WORKED
-from polarguide.capture.formats.integrity import declared_size
+from polarguide.capture.formats.headers import declared_size
 from polarguide.capture.formats.pictures import decode_stored, read_picture, stated_size
 from polarguide.capture.layout import KEPT, READ, SHARE
 from polarguide.core.system import free_memory

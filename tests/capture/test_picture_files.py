@@ -22,7 +22,7 @@ from tiny_capture import TinyCapture, encode_srgb, ideal_intensities, write_pict
 from polarguide.capture import load_scene
 from polarguide.capture.filter.camera_files import exif_data, orientation
 from polarguide.capture.formats import pictures
-from polarguide.capture.formats.integrity import declared_size, find_damage
+from polarguide.capture.formats.headers import declared_size, find_damage
 from polarguide.capture.formats.pictures import decode_picture, linear_codes
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.write import intensity_codes, rounding_of, write_png

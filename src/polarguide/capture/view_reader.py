@@ -18,7 +18,7 @@ from torch import Tensor
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import checks
 from polarguide.capture.exposures import FOUR, LARGEST, Angle, Exposure, normalized
-from polarguide.capture.formats.integrity import declared_size
+from polarguide.capture.formats.headers import declared_size
 from polarguide.capture.formats.pictures import (
     MATERIAL_REMEDY,
     decode_mask,

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from polarguide.capture.formats.integrity import find_damage
+from polarguide.capture.formats.headers import find_damage
 from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES

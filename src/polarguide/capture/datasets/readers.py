@@ -43,7 +43,7 @@ from polarguide.capture.formats.arrays import (
     read_exr_channels,
     unpacked,
 )
-from polarguide.capture.formats.integrity import LARGEST_PIXELS, damaged
+from polarguide.capture.formats.headers import LARGEST_PIXELS, damaged
 from polarguide.capture.formats.pictures import (
     SUFFIXES,
     decode_picture,

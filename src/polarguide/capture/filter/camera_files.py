@@ -23,18 +23,13 @@ from PIL import Image
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.formats.arrays import array_kind
-from polarguide.capture.formats.decoders import (
-    TIFF,
-    heif_head,
-    heif_tags,
-    is_heif,
-    is_webp,
-    opened,
-)
-from polarguide.capture.formats.integrity import (
+from polarguide.capture.formats.headers import (
     LARGEST_PIXELS,
     ORIENTATION,
-    jpeg_segments,
+    heif_head,
+    heif_tags,
+    opened_picture,
+    picture_kind,
     png_chunk,
 )
 from polarguide.capture.formats.pictures import read_picture
@@ -192,7 +187,7 @@ def orientation(data: bytes) -> int:
 
     HEIC states its turn in the header; its tag is for information only.
     """
-    if is_heif(data):
+    if picture_kind(data) == "HEIF":
         head = heif_head(data)
         return 1 if head is None else head.orientation
     value = tags_of(data).get(ORIENTATION)
@@ -234,17 +229,15 @@ def tags_of(data: bytes) -> dict[int, Any]:
 def _block_of_tags(data: bytes) -> bytes:
     """The EXIF block of a picture file, which is built like a TIFF file; empty where it has none."""
     block = data
-    if data.startswith(b"\xff\xd8"):
-        contents = (content for kind, content in jpeg_segments(data) if kind == 0xE1)
-        block = next((content for content in contents if content.startswith(b"Exif\0\0")), b"")
-    elif data.startswith(b"\x89PNG"):
+    kind = picture_kind(data)
+    if kind in ("JPEG", "WebP"):
+        block = opened_picture(data).info.get("exif", b"")
+    elif kind == "PNG":
         block = png_chunk(data, b"eXIf") or b""
-    elif is_webp(data):
-        block = opened(data).info.get("exif", b"")
-    elif is_heif(data):
+    elif kind == "HEIF":
         block = heif_tags(data)
     block = block.removeprefix(b"Exif\0\0")
-    return block if block[:4] in TIFF else b""
+    return block if picture_kind(block) == "TIFF" else b""
 
 
 _MAKER = 271
@@ -327,7 +320,7 @@ def read_exposure_data(path: Path) -> ExposureData:
     raw = is_camera_raw(path)
     data = read_file(path) if raw else read_picture(path)
     exposure = exif_data(data)
-    if not raw or exposure.seconds is not None or data[:4] in TIFF:
+    if not raw or exposure.seconds is not None or picture_kind(data) == "TIFF":
         return exposure
     libraw = optional_import("rawpy", str(path))
     # LibRaw's errors: whoever develops the file says what is wrong with it.

@@ -23,8 +23,13 @@ from polarguide.capture import checks
 from polarguide.capture.exposures import Angle
 from polarguide.capture.filter.camera_files import is_camera_raw, number_of, tags_of
 from polarguide.capture.filter.shots import Shots
-from polarguide.capture.formats.decoders import BIG_TIFF, HIGH_RANGE, TIFF, heif_colors, is_heif
-from polarguide.capture.formats.integrity import PNG, png_chunk
+from polarguide.capture.formats.headers import (
+    HIGH_RANGE,
+    TIFFS,
+    heif_colors,
+    picture_kind,
+    png_chunk,
+)
 from polarguide.capture.formats.pictures import is_lossy, linear_codes, read_picture
 from polarguide.core.errors import PolarguideError, optional_import
 
@@ -74,15 +79,16 @@ def stated_encoding(data: bytes) -> Encoding | None:
     # A statement that cannot be read states nothing: Pillow, tifffile and pillow-heif raise what they please.
     with contextlib.suppress(Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        if data[:4] in (*TIFF, *BIG_TIFF):
+        kind = picture_kind(data)
+        if kind in TIFFS:
             profile, rest = _of_tiff(data)
-        elif is_heif(data):
+        elif kind == "HEIF":
             characteristics, profile = heif_colors(data)
         else:
             with Image.open(io.BytesIO(data)) as image:
                 profile = image.info.get("icc_profile")
                 rest = _of_png(image.info)
-            stated = png_chunk(data, b"cICP") if data.startswith(PNG) else None
+            stated = png_chunk(data, b"cICP") if kind == "PNG" else None
             if stated and not stated[3]:
                 return Encoding(None, "its cICP chunk (values of narrow range, from 16 to 235 of 255)")
             characteristics = stated[1] if stated else None

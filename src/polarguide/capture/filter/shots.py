@@ -25,7 +25,7 @@ from polarguide.capture.exposures import (
     read_table,
 )
 from polarguide.capture.filter.camera_files import CAMERA_RAW, is_camera_raw, orientation, read_camera_raw
-from polarguide.capture.formats.decoders import rescaled
+from polarguide.capture.formats.headers import rescaled
 from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, is_lossy, read_picture
 from polarguide.capture.layout import (
     ambiguous,

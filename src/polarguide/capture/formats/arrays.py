@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.integrity import LARGEST_PIXELS, damaged
+from polarguide.capture.formats.headers import LARGEST_PIXELS, damaged
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import in_utf8, read_file
 

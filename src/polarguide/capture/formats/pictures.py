@@ -15,28 +15,22 @@ import tifffile
 from numpy.typing import NDArray
 
 from polarguide.capture.formats.arrays import BROKEN, array_header, exr_size, hdr_size
-from polarguide.capture.formats.decoders import (
-    BIG_TIFF,
-    BMP,
+from polarguide.capture.formats.headers import (
     JPEG_IN_TIFF,
-    TIFF,
-    UnreadableTiffError,
-    decode_tiff,
-    heif_pixels,
-    is_heif,
-    is_webp,
-    pnm_head,
-    rescaled,
-    tiff_full_scale,
-    tiff_size,
-)
-from polarguide.capture.formats.integrity import (
     LARGEST_PIXELS,
-    PNG,
+    TIFFS,
+    UnreadableTiffError,
     damaged,
     declared_size,
+    decode_tiff,
     find_damage,
+    heif_pixels,
+    picture_kind,
+    pnm_head,
+    rescaled,
     significant_bits,
+    tiff_full_scale,
+    tiff_size,
 )
 from polarguide.capture.view import FULL_CODE
 from polarguide.core.errors import PolarguideError
@@ -244,38 +238,33 @@ def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
         damage = f"one of {size[0]}x{size[1]} pixels, more than any camera takes"
     if damage is not None:
         raise _unreadable(path, damage)
+    kind = picture_kind(data)
     pixels = None
-    if data[:4] in (*TIFF, *BIG_TIFF):
-        try:
+    try:
+        if kind in TIFFS:
             pixels = decode_tiff(data)
-        except UnreadableTiffError as error:
-            raise PolarguideError(
-                path,
-                expected="one ordinary gray or RGB picture in a TIFF file",
-                found=str(error),
-                remedy="Export one gray or RGB picture. Of four angles in one file, save each as a file of its own, "
-                f"such as {path.stem}_0.tif and {path.stem}_45.tif; or give the raw mosaic.",
-            ) from None
-        except Exception:  # tifffile and its codecs raise what they please for damaged files
-            pixels = None
-    elif is_heif(data):
-        try:
-            return heif_pixels(path, data)
-        except PolarguideError:
-            raise
-        except ValueError as error:
-            raise _unreadable(path, str(error)) from None
-        except Exception:  # pillow-heif raises what it pleases for damaged files
-            pixels = None
-    else:
-        with contextlib.suppress(cv2.error):
+        elif kind == "HEIF":
+            pixels = heif_pixels(path, data)
+        else:
             pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if pixels is not None and data[:2] == BMP and pixels.ndim == 3:
-            pixels = pixels[..., :3]  # the fourth byte is padding
+    except PolarguideError:
+        raise
+    except UnreadableTiffError as error:
+        raise PolarguideError(
+            path,
+            expected="one ordinary gray or RGB picture in a TIFF file",
+            found=str(error),
+            remedy="Export one gray or RGB picture. Of four angles in one file, save each as a file of its own, "
+            f"such as {path.stem}_0.tif and {path.stem}_45.tif; or give the raw mosaic.",
+        ) from None
+    except Exception as error:  # the libraries raise many kinds of errors for damaged files
+        if kind == "HEIF" and isinstance(error, ValueError):
+            raise _unreadable(path, str(error)) from None
     if pixels is None:
         _require_room(path, size)
         raise _unreadable(path, "one that cannot be decoded")
-    return np.asarray(pixels)
+    # The fourth byte of BMP is padding.
+    return np.asarray(pixels[..., :3] if kind == "BMP" and pixels.ndim == 3 else pixels)
 
 
 def _unreadable(path: Path, found: str) -> PolarguideError:
@@ -297,13 +286,14 @@ def is_lossy(path: Path) -> bool:
 
 def _loses_detail(data: bytes) -> bool:
     """True where the compression of a picture changes its values. The content decides, not the suffix."""
-    if is_webp(data):
-        kind = re.search(rb"VP8[ L]", data)  # the name of the first chunk that holds pixels
-        return kind is not None and kind[0] == b"VP8 "
-    if data[:4] in (*TIFF, *BIG_TIFF):
+    kind = picture_kind(data)
+    if kind == "WebP":
+        chunk = re.search(rb"VP8[ L]", data)  # the name of the first chunk that holds pixels
+        return chunk is not None and chunk[0] == b"VP8 "
+    if kind in TIFFS:
         with tifffile.TiffFile(io.BytesIO(data)) as tiff:
             return int(tiff.pages.first.compression) in JPEG_IN_TIFF
-    return data.startswith(b"\xff\xd8") or is_heif(data)
+    return kind in ("JPEG", "HEIF")
 
 
 def stated_full_scale(path: Path, file: BinaryIO, samples: NDArray[Any]) -> int | None:
@@ -321,13 +311,14 @@ def stated_full_scale(path: Path, file: BinaryIO, samples: NDArray[Any]) -> int 
     colors = samples[..., :3] if samples.ndim == 3 else samples
     if samples.dtype.kind != "u":
         return None
-    if head.startswith(PNG):
+    kind = picture_kind(head)
+    if kind == "PNG":
         return _full_of_significant(colors, significant_bits(head))
     full = None
     plain = pnm_head(head)
     if plain is not None:
         full = plain.full if plain.full < np.iinfo(samples.dtype).max else None
-    elif head[:4] in (*TIFF, *BIG_TIFF):
+    elif kind in TIFFS:
         file.seek(0)
         with tifffile.TiffFile(file) as tiff:
             full = tiff_full_scale(tiff)
@@ -364,9 +355,9 @@ def may_use_fewer_bits(path: Path) -> bool:
         return False
     with contextlib.suppress(Exception), open(path, "rb") as file:  # tifffile raises what it pleases
         head = file.read(HEAD)
-        if head.startswith(PNG):
+        if picture_kind(head) == "PNG":
             return head[24] == 16 and significant_bits(head) is None
-        if head[:4] in (*TIFF, *BIG_TIFF):
+        if picture_kind(head) in TIFFS:
             file.seek(0)
             with tifffile.TiffFile(file) as tiff:
                 return tiff.pages.first.dtype == np.uint16 and tiff_full_scale(tiff) is None
@@ -406,14 +397,14 @@ def stated_size(path: Path) -> tuple[int, int] | None:
     if not path.is_file():  # a pipe, a folder, a link to nowhere: whoever reads it says so
         return None
     with contextlib.suppress(*BROKEN), open(path, "rb") as file:
-        start = file.read(16)
-        if start[:4] in (*TIFF, *BIG_TIFF):
-            file.seek(0)
-            return tiff_size(file)
-        head = start + file.read(LARGEST_FILE if is_webp(start) else HEAD)
         suffix = path.suffix.lower()
         if suffix == ".exr":
             return exr_size(path)
+        kind = picture_kind(file.read(16))
+        file.seek(0)
+        if kind in TIFFS:
+            return tiff_size(file)
+        head = file.read(LARGEST_FILE if kind == "WebP" else HEAD)
         return {".hdr": hdr_size, ".npy": _array_size}.get(suffix, declared_size)(head)
     return None
 

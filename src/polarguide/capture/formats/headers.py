@@ -1,4 +1,8 @@
-"""Formats that OpenCV is not asked for: HEIC and TIFF, their samples and headers; headers of BMP, PGM, PPM and WebP."""
+"""Check that a picture file is complete, by its structure.
+
+Decoders differ in their treatment of truncated files: some refuse them, some return gray or stale rows for the missing
+part. Parsing the structure first gives the same answer with every decoder.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ import itertools
 import logging
 import re
 import struct
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +23,132 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 from PIL.BmpImagePlugin import BmpImageFile
+from PIL.JpegImagePlugin import JpegImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
-from polarguide.core.errors import optional_import
+from polarguide.core.errors import PolarguideError, optional_import
 
-BMP = b"BM"
-PNM = (b"P5", b"P6")
+_KINDS = re.compile(
+    rb"(?P<PNG>\x89PNG\r\n\x1a\n)|(?P<JPEG>\xff\xd8)|(?P<TIFF>II\*\0|MM\0\*)|(?P<BigTIFF>II\+\0|MM\0\+)"
+    rb"|(?P<BMP>BM)|(?P<PNM>P[56])|(?P<WebP>RIFF.{4}WEBP)"
+    rb"|(?P<HEIF>.{4}ftyp(?:heic|heix|hevc|heim|heis|mif1|msf1|avif|avis))",
+    re.DOTALL,
+)
+"""First bytes of the kinds of picture files."""
+TIFFS = ("TIFF", "BigTIFF")
+# Within JPEG scan data, 0xFF followed by 0 is a stuffed byte and by 0xD0-0xD7 a restart; all else ends it.
+_JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+ORIENTATION = 274
+# Marks without a length: one that nobody uses, and restarts.
+_JPEG_ALONE = (0x01, *range(0xD0, 0xD8))
+# Of a progressive JPEG file. Encoders write ten or so; each is decoded over the whole picture, be it empty or not.
+_MOST_SCANS = 200
+LARGEST_PIXELS = 150_000_000
+"""More pixels than any camera has: a file that claims more is refused before memory is taken for it."""
+
+
+def damaged(path: Path, expected: str, found: str) -> PolarguideError:
+    """The error that a file cannot be decoded."""
+    return PolarguideError(path, expected=expected, found=found, remedy="Copy or export the file again.")
+
+
+def picture_kind(data: bytes) -> str:
+    """The kind of a picture file by its first bytes: PNG, JPEG, TIFF, BigTIFF, BMP, PNM, WebP, HEIF; else empty."""
+    match = _KINDS.match(data)
+    return "" if match is None else str(match.lastgroup)
+
+
+def find_damage(data: bytes) -> str | None:
+    """The damage that the structure of a picture file shows, in words, or None.
+
+    Args:
+        data: the whole file.
+
+    Returns:
+        A noun phrase for the "found" part of a message: "an empty file", "a PNG file cut short", ...
+    """
+    kind = picture_kind(data)
+    if kind:
+        return _DAMAGE[kind](data)
+    return "a file of another kind" if data else "an empty file"
+
+
+def declared_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height in the header of a picture file; None where decoders might see others, or none."""
+    kind = picture_kind(data)
+    if kind == "PNG":
+        return struct.unpack_from(">II", data, 16) if data[12:16] == b"IHDR" and len(data) >= 24 else None
+    if kind in TIFFS:
+        return tiff_size(io.BytesIO(data))
+    head = {"PNM": pnm_head, "HEIF": heif_head}.get(kind, _pillow_head)(data)
+    return None if head is None else head.size
+
+
+def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, start and end of the chunks of a PNG file; the last may end beyond the file."""
+    at = 8
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        yield kind, at, at + 12 + length
+        at += 12 + length
+
+
+def png_chunk(data: bytes, kind: bytes) -> bytes | None:
+    """The content of the first chunk of a kind in a PNG file; None where there is none."""
+    return next((data[at + 8 : end - 4] for name, at, end in png_chunks(data) if name == kind), None)
+
+
+def significant_bits(data: bytes) -> int | None:
+    """The largest count of significant bits of gray or a color that a PNG file states (sBIT)."""
+    stated = png_chunk(data, b"sBIT")
+    return max(stated[:3] if len(stated) > 2 else stated[:1]) if stated else None
+
+
+def _jpeg_marks(data: bytes) -> Iterator[int]:
+    """Kinds of the segments and scans of a JPEG file up to its end-of-image mark."""
+    at = 2
+    while at + 2 <= len(data) and data[at] == 0xFF:
+        kind = data[at + 1]
+        if kind == 0xFF:  # fill byte
+            at += 1
+        elif kind in _JPEG_ALONE:
+            at += 2
+        else:
+            yield kind
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+            mark = _JPEG_SCAN_END.search(data, at) if kind == 0xDA else None
+            at = at if mark is None else mark.start()
+            if kind == 0xD9 or (kind == 0xDA and mark is None):
+                return
+
+
+def _png_damage(data: bytes) -> str | None:
+    """Walk the chunks of a PNG file and check their checksums."""
+    if declared_size(data) is None and len(data) >= 24:
+        return "a PNG file that does not begin with its size"
+    for kind, at, end in png_chunks(data):
+        if end > len(data):
+            break
+        (stored,) = struct.unpack_from(">I", data, end - 4)
+        if zlib.crc32(memoryview(data)[at + 4 : end - 4]) != stored:
+            return f"a damaged PNG file (wrong checksum at byte {at})"
+        if kind == b"acTL":  # decoders show any one of its pictures, or none
+            return "an animated PNG file"
+        if kind == b"IEND":
+            return None
+    return f"a PNG file cut short (it ends after {len(data)} bytes)"
+
+
+def _jpeg_damage(data: bytes) -> str | None:
+    """Whether a JPEG file ends with its end-of-image mark, has a size, and not too many scans."""
+    kinds = list(_jpeg_marks(data))
+    if 0xD9 not in kinds:
+        return f"a JPEG file cut short (it ends after {len(data)} bytes)"
+    if kinds.count(0xDA) > _MOST_SCANS:
+        return f"a JPEG file of {kinds.count(0xDA)} scans"
+    return "a JPEG file without a size" if _pillow_head(data) is None else None
+
+
 _PNM_HEAD = re.compile(
     rb"P[56](?:\s+|#[^\n]*\n)+?(\d{1,9})(?:\s+|#[^\n]*\n)+?(\d{1,9})(?:\s+|#[^\n]*\n)+?(\d{1,5})\s"
 )
@@ -62,33 +187,31 @@ def pnm_damage(data: bytes) -> str | None:
     return None if head.end <= len(data) else f"a PGM or PPM file cut short (it ends after {len(data)} bytes)"
 
 
-def is_webp(data: bytes) -> bool:
-    """Whether a file is a WebP picture, by its first twelve bytes."""
-    return data[:4] == b"RIFF" and data[8:12] == b"WEBP"
+_PILLOW = {"BMP": BmpImageFile, "JPEG": JpegImageFile, "WebP": WebPImageFile}
 
 
-def opened(data: bytes) -> BmpImageFile | WebPImageFile:
-    """A BMP or WebP file as Pillow opens it, which decodes nothing yet. It needs the whole of a WebP file.
+def opened_picture(data: bytes) -> Any:
+    """A BMP, JPEG or WebP file as Pillow opens it, which decodes nothing yet. It needs the whole of a WebP file.
 
     Raises:
         Exception: of several kinds, where the file is damaged.
     """
-    return (WebPImageFile if is_webp(data) else BmpImageFile)(io.BytesIO(data))
+    return _PILLOW[picture_kind(data)](io.BytesIO(data))
 
 
-def pillow_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height of a BMP or WebP file; None where there are none."""
+def _pillow_head(data: bytes) -> Any:
+    """``opened_picture``; None where the file is damaged or of another kind."""
     with contextlib.suppress(Exception):
-        return opened(data).size
+        return opened_picture(data)
     return None
 
 
 def pillow_damage(data: bytes) -> str | None:
     """The damage that the structure of a BMP or WebP file shows, in words, or None."""
-    name = "WebP" if is_webp(data) else "BMP"
+    name = picture_kind(data)
     end = 0
     try:
-        picture = opened(data)
+        picture = opened_picture(data)
         if isinstance(picture, BmpImageFile):
             tile: Any = picture.tile[0]
             _, (*_, height), start, (stored, row, _) = tile
@@ -110,7 +233,6 @@ def pillow_damage(data: bytes) -> str | None:
     )
 
 
-_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1", b"avif", b"avis")
 _AVIF = (b"avif", b"avis")
 _ORIENTATION_OF_TURNS = (1, 8, 3, 6)
 """EXIF's number for quarter turns counter-clockwise."""
@@ -135,11 +257,6 @@ class HeifHead:
     def orientation(self) -> int:
         """The turn as EXIF's number. The tag itself is for information only (ISO/IEC 23008-12)."""
         return _ORIENTATION_OF_TURNS[self.turns]
-
-
-def is_heif(data: bytes) -> bool:
-    """Whether a file is one of telephones, HEIC or AVIF, by its first twelve bytes."""
-    return data[4:8] == b"ftyp" and data[8:12] in _BRANDS
 
 
 def heif_head(data: bytes) -> HeifHead | None:
@@ -284,6 +401,7 @@ JPEG_IN_TIFF = (6, 7)
 """Compressions that decode to RGB what is stored as luminance and color differences."""
 _NO_PICTURE = 1 | 4
 """Bits of NewSubfileType for a smaller copy and for a mask of transparency."""
+_OLD_SUBFILE_TYPE = 255
 _OLD_REDUCED = 2
 """Value of the older tag SubfileType for a smaller copy."""
 _MOST_PICTURES = 1000
@@ -331,8 +449,6 @@ def decode_tiff(data: bytes) -> NDArray[Any]:
     return pixels
 
 
-TIFF = (b"II*\0", b"MM\0*")
-BIG_TIFF = (b"II+\0", b"MM\0+")
 _LARGEST = 281
 _SIDES = [256, 257]
 _PLAIN_TYPES = (3, 4)
@@ -362,7 +478,7 @@ def _plain_size(file: tifffile.TiffFile) -> tuple[int, int] | None:
 
 def tiff_damage(data: bytes) -> str | None:
     """The damage that the structure of a TIFF or BigTIFF file shows, in words, or None."""
-    name = "TIFF" if data[:4] in TIFF else "BigTIFF"
+    name = picture_kind(data)
     try:
         with tifffile.TiffFile(io.BytesIO(data)) as file:
             page = file.pages.first
@@ -403,19 +519,17 @@ def _only_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
         UnreadableTiffError: there are several, or it begins with another one.
     """
     pages = [page.aspage() for page in itertools.islice(file.pages, _MOST_PICTURES)]
-    whole = [page for page in pages if not _is_copy(page)]
+    whole = [
+        page
+        for page in pages
+        if not page.subfiletype & _NO_PICTURE and page.tags.valueof(_OLD_SUBFILE_TYPE) != _OLD_REDUCED
+    ]
     stacked = int((file.imagej_metadata or {}).get("images", 1))
     if len(whole) > 1 or stacked > 1:
         raise UnreadableTiffError(f"a TIFF file of {max(len(whole), stacked)} pictures")
     if not whole or whole[0] is not pages[0]:
         raise UnreadableTiffError("a TIFF file that begins with a smaller copy of its picture")
     return whole[0]
-
-
-def _is_copy(page: tifffile.TiffPage) -> bool:
-    """Whether a page is a smaller copy or a mask of another one."""
-    older = page.tags.get(255)
-    return bool(page.subfiletype & _NO_PICTURE) or (older is not None and older.value == _OLD_REDUCED)
 
 
 def _judged(page: tifffile.TiffPage) -> tuple[int, bool]:
@@ -442,3 +556,15 @@ def _judged(page: tifffile.TiffPage) -> tuple[int, bool]:
     if page.dtype is None or not (whole or page.dtype.kind == "f"):
         raise UnreadableTiffError(f"a TIFF file with values of type {page.dtype}")
     return samples, alpha
+
+
+_DAMAGE = {
+    "PNG": _png_damage,
+    "JPEG": _jpeg_damage,
+    "TIFF": tiff_damage,
+    "BigTIFF": tiff_damage,
+    "BMP": pillow_damage,
+    "WebP": pillow_damage,
+    "PNM": pnm_damage,
+    "HEIF": heif_damage,
+}
