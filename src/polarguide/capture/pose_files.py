@@ -88,37 +88,20 @@ MOST_FRAMES = 20_000
 _SAME_FOCAL = 0.01
 
 
-class _Lens(msgspec.Struct):
-    """Fields that describe a lens, for all frames or for one."""
-
-    camera_model: str | None = None
-    fl_x: float | None = None
-    fl_y: float | None = None
-    intrinsic_matrix: list[list[float]] | None = None
-    cx: float | None = None
-    cy: float | None = None
-    w: float | None = None
-    h: float | None = None
-    camera_angle_x: float | None = None
-    camera_angle_y: float | None = None
-    x_fov: float | None = None
-    y_fov: float | None = None
-    is_fisheye: bool | None = None
-    distortion_params: list[float] | None = None
-    k1: float | None = None
-    k2: float | None = None
-    k3: float | None = None
-    k4: float | None = None
-    p1: float | None = None
-    p2: float | None = None
-    k5: float | None = None
-    k6: float | None = None
-    rolling_shutter: list[float] | None = None
-    rolling_shutter_time: float | None = None
-    ftheta_p0: float | None = None
-    latlong: Any = None
-    equirectangular: Any = None
-    fisheye_crop_radius: float | None = None
+_NUMBERS = (
+    "fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", "k1", "k2", "k3",
+    "k4", "p1", "p2", "k5", "k6", "rolling_shutter_time", "ftheta_p0", "fisheye_crop_radius",
+)  # fmt: skip
+_LENS: dict[str, Any] = {
+    **dict.fromkeys(_NUMBERS, float | None),
+    **dict.fromkeys(("distortion_params", "rolling_shutter"), list[float] | None),
+    **dict.fromkeys(("latlong", "equirectangular"), Any),
+    "camera_model": str | None,
+    "is_fisheye": bool | None,
+    "intrinsic_matrix": list[list[float]] | None,
+}
+"""Fields that describe a lens, for all frames or for one, and their types."""
+_Lens: Any = msgspec.defstruct("_Lens", [(name, kind, None) for name, kind in _LENS.items()])
 
 
 class _Frame(_Lens):
@@ -129,8 +112,8 @@ class _Frame(_Lens):
 
 
 class _Transforms(_Lens):
-    frames: Annotated[list[_Frame], Meta(max_length=MOST_FRAMES)] = []
-    test_frames: Annotated[list[_Frame], Meta(max_length=MOST_FRAMES)] = []
+    frames: Annotated[tuple[_Frame, ...], Meta(max_length=MOST_FRAMES)] = ()
+    test_frames: Annotated[tuple[_Frame, ...], Meta(max_length=MOST_FRAMES)] = ()
     camera: Any = None
     normal_mts_args: Any = None
     from_na: bool | None = None
@@ -195,7 +178,7 @@ _FOCAL = ("fl_x", "fl_y", "intrinsic_matrix", "camera_angle_x", "camera_angle_y"
 _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
-def _lens_of(where: str, frame: _Lens, record: _Lens) -> dict[str, Any]:
+def _lens_of(where: str, frame: Any, record: Any) -> dict[str, Any]:
     """The fields of a frame's lens: its own, else those of the file; ``intrinsic_matrix`` as the four numbers it holds.
 
     Focal lengths and coefficients are statements as a whole: a frame that makes one takes nothing of the file's.
@@ -203,7 +186,7 @@ def _lens_of(where: str, frame: _Lens, record: _Lens) -> dict[str, Any]:
     Raises:
         PolarguideError: the matrix is no camera matrix, or stands beside other numbers.
     """
-    lens = {name: getattr(frame, name) for name in _Lens.__struct_fields__}
+    lens = {name: getattr(frame, name) for name in _LENS}
     whole = (_FOCAL, (*_COEFFICIENTS, "distortion_params"))
     stated = {name for names in whole if any(lens[n] is not None for n in names) for name in names}
     used = {

@@ -187,7 +187,7 @@ def pnm_damage(data: bytes) -> str | None:
     return None if head.end <= len(data) else f"a PGM or PPM file cut short (it ends after {len(data)} bytes)"
 
 
-_PILLOW = {"BMP": BmpImageFile, "JPEG": JpegImageFile, "WebP": WebPImageFile}
+_PILLOW: dict[str, Any] = {"BMP": BmpImageFile, "JPEG": JpegImageFile, "WebP": WebPImageFile}
 
 
 def opened_picture(data: bytes) -> Any:
