@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import require
 from polarguide.core.records import check_options, read_record
 from polarguide.geometry.polarizer import ANGLES, four_intensities, stokes_of_four
 
@@ -83,13 +83,13 @@ def checked(calibration: Calibration, where: object) -> Calibration:
         PolarguideError: gains are not positive, the order is no permutation, the zero is not finite, ...
     """
     check_options(calibration, lambda field: f"{where} ({field})")
-    if sorted(calibration.order) != sorted(ANGLES):
-        raise PolarguideError(
-            f"{where} (order)",
-            expected="0, 45, 90 and 135, each once",
-            found=str(calibration.order),
-            remedy="List the four angles in the order of the pictures.",
-        )
+    require(
+        sorted(calibration.order) == sorted(ANGLES),
+        f"{where} (order)",
+        expected="0, 45, 90 and 135, each once",
+        found=str(calibration.order),
+        remedy="List the four angles in the order of the pictures.",
+    )
     return calibration
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from polarguide.capture import box_filter as boxes
 from polarguide.capture.formats.arrays import BROKEN, unpacked
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.records import decode
 
 ROUGH = 0.15
@@ -89,13 +89,13 @@ def objects_of(path: Path, data: bytes) -> tuple[SceneObject, ...]:
     for field in ("id", "name"):
         counts = Counter(getattr(item, field) for item in objects)
         twice, times = next(iter(counts.most_common(1)), (None, 0))
-        if times > 1:
-            raise PolarguideError(
-                f"{path} (objects)",
-                expected=f"objects of which each has its own {field}",
-                found=f"two with the {field} {twice}",
-                remedy=_REMEDY,
-            )
+        require(
+            times <= 1,
+            f"{path} (objects)",
+            expected=f"objects of which each has its own {field}",
+            found=f"two with the {field} {twice}",
+            remedy=_REMEDY,
+        )
     return tuple(objects)
 
 

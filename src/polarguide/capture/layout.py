@@ -13,7 +13,7 @@ from pathlib import Path
 from polarguide.capture.exposures import FOUR, TABLE, Exposure, Line, read_table
 from polarguide.capture.formats.pictures import SUFFIXES, stated_size
 from polarguide.capture.view import ANGLES, listed, unknown_view
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import require_folder
 from polarguide.core.system import free_memory
 from polarguide.core.text import canonical, stem_of
@@ -91,8 +91,7 @@ def find_layout(root: Path) -> Layout:
     else:
         raise PolarguideError(root, expected="a capture folder", found=describe_contents(root), remedy=_HINT)
     names = pictures.keys() | others.keys()
-    if not names:
-        raise PolarguideError(root, expected="pictures of at least one view", found="none", remedy=_HINT)
+    require(names, root, expected="pictures of at least one view", found="none", remedy=_HINT)
     sides: dict[str, dict[str, Path]] = {}
     kinds = (("masks", SUFFIXES), ("materials", SUFFIXES), ("invalid", SUFFIXES), ("gt", (".npz",)))
     for kind, suffixes in kinds:
@@ -123,10 +122,9 @@ def refuse_scene(out: Path) -> None:
         known = folder.name in _READ_FOLDERS or _ANGLE_FOLDER.fullmatch(folder.name)
         if known and _is_scene(folder.parent):
             found = f"{folder.name}/ of a scene"
-    if found:
-        raise PolarguideError(
-            out, expected="an output folder", found=found, remedy="Choose another folder with --out."
-        )
+    require(
+        not found, out, expected="an output folder", found=found, remedy="Choose another folder with --out."
+    )
 
 
 def _is_scene(folder: Path) -> bool:
@@ -149,13 +147,13 @@ def select_views(layout: Layout, views: Sequence[str] | None) -> list[str]:
             if name not in layout.names:
                 raise unknown_view(f"{layout.root} (views)", name, layout.names)
         names = sorted(set(wanted))
-        if not names:
-            raise PolarguideError(
-                "views",
-                expected="at least one view name",
-                found="an empty list",
-                remedy="Leave it out to read all views.",
-            )
+        require(
+            names,
+            "views",
+            expected="at least one view name",
+            found="an empty list",
+            remedy="Leave it out to read all views.",
+        )
     _require_complete(layout, names)
     return names
 
@@ -192,13 +190,13 @@ def _read_flat(
     lines = read_table(table) if table is not None else []
     stored = {canonical(path.name): path for path in list_files(folder, SUFFIXES)}
     for item in lines:
-        if item.file not in stored:
-            raise PolarguideError(
-                f"{table} (line {item.number})",
-                expected="a picture in polar/",
-                found=f"none called {item.file}",
-                remedy="Correct the file's name in the table, or remove its line.",
-            )
+        require(
+            item.file in stored,
+            f"{table} (line {item.number})",
+            expected="a picture in polar/",
+            found=f"none called {item.file}",
+            remedy="Correct the file's name in the table, or remove its line.",
+        )
     pictures: dict[str, dict[int, Path]] = {}
     strangers = []
     listed_files = {item.file for item in lines}
@@ -396,13 +394,13 @@ def require_memory(where: Path, needed: int, what: str, *, remedy: str, limit: f
     else:
         allowed = int(SHARE * free_memory())
         whose = f"{SHARE:.0%} of what is free"
-    if needed > allowed:
-        raise PolarguideError(
-            where,
-            expected=f"pictures that take up to {allowed / GIBIBYTE:.1f} GiB, {whose}",
-            found=f"{what} that take {needed / GIBIBYTE:.1f} GiB",
-            remedy=remedy,
-        )
+    require(
+        needed <= allowed,
+        where,
+        expected=f"pictures that take up to {allowed / GIBIBYTE:.1f} GiB, {whose}",
+        found=f"{what} that take {needed / GIBIBYTE:.1f} GiB",
+        remedy=remedy,
+    )
 
 
 def stated_pixels(layout: Layout, names: Sequence[str]) -> list[int]:

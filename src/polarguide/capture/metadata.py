@@ -10,7 +10,7 @@ import msgspec
 from polarguide.capture.calibration import Calibration, Sense, combined
 from polarguide.capture.formats.pictures import MOST_MATERIAL
 from polarguide.capture.view import unknown_view
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import require
 from polarguide.core.records import decode
 from polarguide.core.text import canonical
 from polarguide.geometry.polarizer import ANGLES
@@ -99,13 +99,13 @@ def held_out(path: Path, data: bytes, names: list[str]) -> tuple[str, ...]:
     for name in test:
         if name not in names:
             raise unknown_view(f"{path} (test)", name, names)
-    if len(set(test)) >= len(names):
-        raise PolarguideError(
-            path,
-            expected="at least one view to train on",
-            found=f"all {len(names)} views in the test set",
-            remedy="Name fewer test views in split.json, or add views.",
-        )
+    require(
+        len(set(test)) < len(names),
+        path,
+        expected="at least one view to train on",
+        found=f"all {len(names)} views in the test set",
+        remedy="Name fewer test views in split.json, or add views.",
+    )
     return tuple(sorted(set(test)))
 
 
@@ -143,13 +143,13 @@ def indices_of(path: Path, data: bytes) -> dict[int, float]:
     table = decode(data, _Materials, path, remedy=remedy).materials
     numbers = {str(number) for number in range(FIRST_LISTED, MOST_MATERIAL + 1)}
     for key in table:
-        if key not in numbers:
-            raise PolarguideError(
-                f"{path} (materials)",
-                expected=f"numbers from {FIRST_LISTED} to {MOST_MATERIAL}",
-                found=repr(key),
-                remedy=remedy,
-            )
+        require(
+            key in numbers,
+            f"{path} (materials)",
+            expected=f"numbers from {FIRST_LISTED} to {MOST_MATERIAL}",
+            found=repr(key),
+            remedy=remedy,
+        )
     return {int(key): item.refractive_index for key, item in table.items()}
 
 

@@ -26,9 +26,9 @@ from polarguide.capture.datasets.dataset import (
     read_projections,
     require_known_names,
 )
-from polarguide.capture.formats.arrays import finite_numbers, wrong_camera
+from polarguide.capture.formats.arrays import finite_numbers, require_camera, wrong_camera
 from polarguide.capture.view import listed
-from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.errors import PolarguideError, PolarguideWarning, require
 from polarguide.core.files import read_file
 from polarguide.core.records import LARGEST_RECORD, decode, parse
 from polarguide.core.text import number_or_nan
@@ -64,8 +64,7 @@ def settled_size(
         PolarguideError: no size is known, the principal point fits none, or several fit.
     """
     expected = "width and height of the pictures that the camera was made for, w and h"
-    if not sizes:
-        raise wrong_camera(where, expected, "none")
+    require_camera(sizes, where, expected, "none")
     fitting = [size for size in sizes if is_centered(size, center)]
     named = " or ".join(f"{width}x{height}" for width, height in sizes)
     if not fitting:
@@ -73,8 +72,7 @@ def settled_size(
             where, f"a principal point near the middle of {named}", f"{center[0]}, {center[1]}"
         )
     areas = {width * height for width, height in fitting}
-    if len(areas) > 1 and in_pixels:
-        raise wrong_camera(where, expected, f"none, for pictures of {named}")
+    require_camera(len(areas) == 1 or not in_pixels, where, expected, f"none, for pictures of {named}")
     return fitting[0]
 
 
@@ -155,15 +153,14 @@ def read_transforms(path: Path, views: Collection[str], sizes: Sizes) -> dict[st
     cameras: dict[str, PosedCamera] = {}
     for number, frame in enumerate((*record.frames, *record.test_frames)):
         where = f"{path} (frame {number}, {frame.file_path})"
-        if not frame.file_path:
-            raise wrong_camera(
-                where,
-                "file_path and transform_matrix, as nerfstudio writes them",
-                listed(sorted(listed_frames[number])),
-            )
+        require_camera(
+            frame.file_path,
+            where,
+            "file_path and transform_matrix, as nerfstudio writes them",
+            listed(sorted(listed_frames[number])),
+        )
         view = view_of_name(frame.file_path, views)
-        if view in cameras:
-            raise wrong_camera(where, f"one frame called {view}", "two")
+        require_camera(view not in cameras, where, f"one frame called {view}", "two")
         lens = _lens_of(where, frame, record)
         # NeuS2 says by ``from_na`` that its axes are right, down, forward.
         to_world = _pose_of(where, frame) @ (np.eye(4) if record.from_na else _OPENGL)
@@ -197,8 +194,7 @@ def _lens_of(where: str, frame: Any, record: Any) -> dict[str, Any]:
         return used
     beside = {name: used[name] for name in (*_FOCAL, *_MATRIX) if name != "intrinsic_matrix"}
     named = [name for name, number in beside.items() if number is not None]
-    if named:
-        raise wrong_camera(where, "intrinsic_matrix alone", f"{', '.join(named)} beside it")
+    require_camera(not named, where, "intrinsic_matrix alone", f"{', '.join(named)} beside it")
     matrix = finite_numbers(where, used["intrinsic_matrix"], ((3, 3), *_SQUARE))[:3, :3]
     inner = checked_intrinsics(where, matrix)
     numbers = (inner[0, 0], inner[1, 1], inner[0, 2], inner[1, 2])
@@ -213,10 +209,12 @@ def _pose_of(where: str, frame: _Frame) -> Any:
         if matrix is not None
     ]
     numbers = [finite_numbers(where, matrix, _SQUARE)[:3] for matrix in matrices or [[]]]
-    if any(not np.allclose(numbers[0], other) for other in numbers[1:]):
-        raise wrong_camera(
-            where, "a camera that stands still", "transform_matrix_start and transform_matrix_end that differ"
-        )
+    require_camera(
+        all(np.allclose(numbers[0], other) for other in numbers[1:]),
+        where,
+        "a camera that stands still",
+        "transform_matrix_start and transform_matrix_end that differ",
+    )
     return np.vstack([numbers[0], [0, 0, 0, 1]])
 
 
@@ -250,8 +248,12 @@ def _is_fisheye(where: str, lens: Mapping[str, Any]) -> bool:
     named = next((name for name in others if lens[name]), None)
     if named is not None:
         raise wrong_camera(where, expected, f"{named} {lens[named]}")
-    if any(lens["rolling_shutter"] or ()) or lens["rolling_shutter_time"]:
-        raise wrong_camera(where, "a shutter that opens for all rows at once", "rolling_shutter")
+    require_camera(
+        not (any(lens["rolling_shutter"] or ()) or lens["rolling_shutter_time"]),
+        where,
+        "a shutter that opens for all rows at once",
+        "rolling_shutter",
+    )
     if model is not None and model not in (*_PERSPECTIVE, _FISHEYE):
         raise wrong_camera(where, expected, model)
     if lens["is_fisheye"] is not None and model is not None and lens["is_fisheye"] != (model == _FISHEYE):
@@ -273,10 +275,12 @@ def _distortion(where: str, lens: Mapping[str, Any], fisheye: bool) -> list[floa
     value = [float(number or 0.0) for number in coefficients]
     params = lens["distortion_params"]
     if params is not None:
-        if len(params) != len(_COEFFICIENTS):
-            raise wrong_camera(
-                where, "six distortion_params: k1, k2, k3, k4, p1, p2", f"{len(params)} numbers"
-            )
+        require_camera(
+            len(params) == len(_COEFFICIENTS),
+            where,
+            "six distortion_params: k1, k2, k3, k4, p1, p2",
+            f"{len(params)} numbers",
+        )
         if any(own is not None and own != other for own, other in zip(coefficients, params, strict=True)):
             raise wrong_camera(
                 where,
@@ -286,13 +290,11 @@ def _distortion(where: str, lens: Mapping[str, Any], fisheye: bool) -> list[floa
         value = [float(number) for number in params]
     k1, k2, k3, k4, p1, p2 = value
     if fisheye:
-        if p1 or p2:
-            raise wrong_camera(where, "a fisheye with k1 to k4 alone", f"p1 = {p1:g}, p2 = {p2:g}")
+        require_camera(not (p1 or p2), where, "a fisheye with k1 to k4 alone", f"p1 = {p1:g}, p2 = {p2:g}")
         return [k1, k2, k3, k4]
-    if k4:
-        raise wrong_camera(
-            where, "a perspective camera with at most three radial coefficients", f"k4 = {k4:g}"
-        )
+    require_camera(
+        not k4, where, "a perspective camera with at most three radial coefficients", f"k4 = {k4:g}"
+    )
     return [k1, k2, p1, p2, k3]
 
 
@@ -306,8 +308,12 @@ def _stated_size(where: str, lens: Mapping[str, Any]) -> tuple[int, int] | None:
     height = lens["h"]
     if width is None and height is None:
         return None
-    if not width or not height or not 0 < width < 1e5 or not 0 < height < 1e5:
-        raise wrong_camera(where, "width and height, w and h", f"{width} and {height}")
+    require_camera(
+        width and height and 0 < width < 1e5 and 0 < height < 1e5,
+        where,
+        "width and height, w and h",
+        f"{width} and {height}",
+    )
     return round(width), round(height)
 
 
@@ -369,8 +375,7 @@ def camera_to_world(
         PolarguideError: the matrix is not a pose.
     """
     scale = abs(np.linalg.det(to_world[:3, :3])) ** (1 / 3)
-    if not 1e-6 < scale < 1e6:
-        raise wrong_camera(where, "a rotation and a translation", "a singular matrix")
+    require_camera(1e-6 < scale < 1e6, where, "a rotation and a translation", "a singular matrix")
     axes, center = checked_pose(where, np.column_stack([to_world[:3, :3] / scale, to_world[:3, 3]]))
     rotation = axes.T
     return PosedCamera(*size, *lens, rotation, -rotation @ center)
@@ -406,13 +411,13 @@ def read_parts(
     for part, path in parts.items():
         of_part = read_pose_file(path, views, sizes)
         twice = sorted(cameras.keys() & of_part.keys())
-        if twice:
-            raise PolarguideError(
-                path,
-                expected="frames that no other part has, as names of views are compared without folders",
-                found=f"{listed(twice)} again",
-                remedy="Give the pictures of each part names of their own, in the files of poses, too.",
-            )
+        require(
+            not twice,
+            path,
+            expected="frames that no other part has, as names of views are compared without folders",
+            found=f"{listed(twice)} again",
+            remedy="Give the pictures of each part names of their own, in the files of poses, too.",
+        )
         cameras |= of_part
         tests = tuple(sorted(of_part)) if part == TEST else tests
     return cameras, tests
@@ -435,13 +440,13 @@ def read_pose_file(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, 
         return _idr(path, views, sizes)
     names = frozenset(views)
     cameras = read_metashape(path, names) if suffix == ".xml" else read_transforms(path, names, sizes)
-    if not cameras:
-        raise PolarguideError(
-            path,
-            expected="cameras with a pose",
-            found="none",
-            remedy="Align the pictures and export the cameras again.",
-        )
+    require(
+        cameras,
+        path,
+        expected="cameras with a pose",
+        found="none",
+        remedy="Align the pictures and export the cameras again.",
+    )
     return cameras
 
 
@@ -540,8 +545,7 @@ def read_metashape(path: Path, views: Collection[str]) -> dict[str, PosedCamera]
         sensor = sensors.get(camera.get("sensor_id"))
         if sensor is None:
             raise wrong_camera(where, "the sensor it names", "none")
-        if view in world_cameras:
-            raise wrong_camera(where, f"one camera called {view}", "two")
+        require_camera(view not in world_cameras, where, f"one camera called {view}", "two")
         _require_known(path, camera, sensor)
         text = camera.findtext("transform") or ""
         numbers = finite_numbers(where, [number_or_nan(part) for part in text.split()], ((16,),))
@@ -608,12 +612,12 @@ def _require_known(path: Path, camera: ElementTree.Element, sensor: ElementTree.
     """
     for element in (camera, sensor):
         for shutter in element.iter("rolling_shutter"):
-            if (shutter.text or "").strip().lower() not in _OFF or len(shutter):
-                raise wrong_camera(
-                    f"{path} ({element.tag} {element.get('label')})",
-                    "a shutter that opens for all rows at once",
-                    "rolling_shutter",
-                )
+            require_camera(
+                (shutter.text or "").strip().lower() in _OFF and not len(shutter),
+                f"{path} ({element.tag} {element.get('label')})",
+                "a shutter that opens for all rows at once",
+                "rolling_shutter",
+            )
     for kind, elements in (
         ("camera", [camera]),
         ("sensor", [sensor]),

@@ -21,7 +21,7 @@ import torch
 from msgspec import Meta
 from torch import Tensor
 
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import write_whole
 from polarguide.core.records import read_record, to_json
 from polarguide.geometry.scene_frame import SceneFrame
@@ -60,13 +60,13 @@ class Crop(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
 
     def __post_init__(self) -> None:
         for low, high in zip(self.low, self.high, strict=True):
-            if not -WIDEST_CROP <= low < high <= WIDEST_CROP:
-                raise PolarguideError(
-                    "crop",
-                    expected=f"a low side less than the high one, both within {WIDEST_CROP:g} distances",
-                    found=f"{low:g} to {high:g}",
-                    remedy=REMEDY,
-                )
+            require(
+                -WIDEST_CROP <= low < high <= WIDEST_CROP,
+                "crop",
+                expected=f"a low side less than the high one, both within {WIDEST_CROP:g} distances",
+                found=f"{low:g} to {high:g}",
+                remedy=REMEDY,
+            )
         _check_direction("crop.up", self.up)
 
     def _frame(self, around: SceneFrame) -> SceneFrame:
@@ -106,18 +106,21 @@ class Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     view: Text
 
     def __post_init__(self) -> None:
-        if not abs(float(torch.tensor(self.matrix, dtype=torch.float64).det())) > 1e-9:
-            raise PolarguideError(
-                "matrix", expected="a matrix with an inverse", found=str(self.matrix), remedy=REMEDY
-            )
+        require(
+            abs(float(torch.tensor(self.matrix, dtype=torch.float64).det())) > 1e-9,
+            "matrix",
+            expected="a matrix with an inverse",
+            found=str(self.matrix),
+            remedy=REMEDY,
+        )
         darkest = min(sum(row) for row in self.matrix)
-        if not darkest > 0:
-            raise PolarguideError(
-                "matrix",
-                expected="rows with positive sums: what is gray to the camera has light in every channel",
-                found=f"a sum of {darkest:g}, which makes it black",
-                remedy=REMEDY,
-            )
+        require(
+            darkest > 0,
+            "matrix",
+            expected="rows with positive sums: what is gray to the camera has light in every channel",
+            found=f"a sum of {darkest:g}, which makes it black",
+            remedy=REMEDY,
+        )
 
 
 class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -157,10 +160,9 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
             raise PolarguideError("crop", expected="a box, or the whole scene", found=found, remedy=REMEDY)
         for name in CREDITS:
             text = getattr(self, name)
-            if not text.isprintable():
-                raise PolarguideError(
-                    name, expected="one line of text", found=repr(text)[:100], remedy=REMEDY
-                )
+            require(
+                text.isprintable(), name, expected="one line of text", found=repr(text)[:100], remedy=REMEDY
+            )
 
     @property
     def credit(self) -> str:
@@ -251,13 +253,13 @@ def parse_length(text: str) -> float:
     match = re.fullmatch(r"\s*((?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*([a-z]*)\s*", text)
     unit = LENGTHS.get((match[2] or "m") if match else "")
     meters = float(match[1]) * unit if match and unit else math.nan
-    if not 0 < meters <= MOST_METERS:
-        raise PolarguideError(
-            "distance",
-            expected=f"a length above 0 such as 85mm (units: {', '.join(LENGTHS)}; m without one)",
-            found=repr(text),
-            remedy="Give a number above 0 and its unit.",
-        )
+    require(
+        0 < meters <= MOST_METERS,
+        "distance",
+        expected=f"a length above 0 such as 85mm (units: {', '.join(LENGTHS)}; m without one)",
+        found=repr(text),
+        remedy="Give a number above 0 and its unit.",
+    )
     return meters
 
 

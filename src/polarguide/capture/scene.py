@@ -41,7 +41,7 @@ from polarguide.capture.view_reader import (
     stored_pictures,
     view_data,
 )
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import require
 from polarguide.core.options import Split, check_choice, check_count
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.text import canonical
@@ -348,21 +348,26 @@ def _view_of(
     """
     where = f"pictures ({name})"
     floats = np.issubdtype(as_numpy(pictures).dtype, np.floating)
-    if floats and transfer != "linear":
-        raise _unlike(where, f"whole numbers, which transfer {transfer} decodes", "floats, which are linear")
+    _require_array(
+        not floats or transfer == "linear",
+        where,
+        f"whole numbers, which transfer {transfer} decodes",
+        "floats, which are linear",
+    )
     stored = stored_pictures(pictures, where)
     exposures = exposures_of(angles, len(pictures), f"angles ({name})")
     stored, exposures = in_order(stored, exposures)
     height, width = stored.shape[1:3]
     require_factor(factor, height, width)
-    if not isinstance(camera, Camera):
-        raise _unlike(f"cameras ({name})", "a polarguide.Camera", type(camera).__name__)
-    if (camera.width, camera.height) != (width, height):
-        raise _unlike(
-            f"cameras ({name})",
-            f"the size of the pictures, {width}x{height}",
-            f"{camera.width}x{camera.height}",
-        )
+    _require_array(
+        isinstance(camera, Camera), f"cameras ({name})", "a polarguide.Camera", type(camera).__name__
+    )
+    _require_array(
+        (camera.width, camera.height) == (width, height),
+        f"cameras ({name})",
+        f"the size of the pictures, {width}x{height}",
+        f"{camera.width}x{camera.height}",
+    )
     masks = {
         what: _mask(of_view.get(name), f"{what} ({name})", (height, width))
         for what, of_view in beside.items()
@@ -382,8 +387,9 @@ def _mask(values: Array | None, where: str, size: tuple[int, int]) -> NDArray[np
     if values is None:
         return None
     mask = as_numpy(values)
-    if mask.shape != size or mask.dtype != bool:
-        raise _unlike(where, f"bool of shape {list(size)}", kind_of(mask))
+    _require_array(
+        mask.shape == size and mask.dtype == bool, where, f"bool of shape {list(size)}", kind_of(mask)
+    )
     return np.ascontiguousarray(mask)
 
 
@@ -394,23 +400,29 @@ def _points_of(
     places = _rows(points, "points", np.float32)
     colors = np.full(places.shape, 128, np.uint8) if point_colors is None else point_colors
     shades = _rows(colors, "point_colors", np.uint8)
-    if len(shades) != len(places):
-        raise _unlike("point_colors", f"{len(places)} rows, one a point", str(len(shades)))
+    _require_array(
+        len(shades) == len(places), "point_colors", f"{len(places)} rows, one a point", str(len(shades))
+    )
     return places, shades
 
 
 def _rows(values: Any, where: str, kind: type[np.generic]) -> NDArray[Any]:
     """Rows of three finite numbers."""
     array = as_numpy(values)
-    if array.ndim != 2 or array.shape[1] != 3 or not len(array) or not np.isfinite(array).all():
-        raise _unlike(where, "finite numbers of shape [M, 3], at least one row", kind_of(array))
-    if kind is np.uint8 and array.dtype != np.uint8:
-        raise _unlike(where, "uint8 of shape [M, 3]", kind_of(array))
+    _require_array(
+        array.ndim == 2 and array.shape[1] == 3 and len(array) and np.isfinite(array).all(),
+        where,
+        "finite numbers of shape [M, 3], at least one row",
+        kind_of(array),
+    )
+    _require_array(
+        kind is not np.uint8 or array.dtype == np.uint8, where, "uint8 of shape [M, 3]", kind_of(array)
+    )
     return np.array(array, kind)
 
 
-def _unlike(where: str, expected: str, found: str) -> PolarguideError:
-    return PolarguideError(where, expected=expected, found=found, remedy="Correct the array.")
+def _require_array(condition: object, where: str, expected: str, found: str) -> None:
+    require(condition, where, expected=expected, found=found, remedy="Correct the array.")
 
 
 def _digest(
@@ -499,13 +511,13 @@ def load_scene(
         files.digests.update(item.digests)
     without_pixels = [item.name for item in stored.data if item.invalid.all()]
     counted = {item.name for item in stored.data} - (set(tests) if views is None else set())
-    if counted and counted <= set(without_pixels):
-        raise PolarguideError(
-            root / "invalid",
-            expected="at least one pixel to train on that is not invalid",
-            found=f"none in {len(counted)} views",
-            remedy="White is invalid there: invert the pictures, or remove them.",
-        )
+    require(
+        not (counted and counted <= set(without_pixels)),
+        root / "invalid",
+        expected="at least one pixel to train on that is not invalid",
+        found=f"none in {len(counted)} views",
+        remedy="White is invalid there: invert the pictures, or remove them.",
+    )
     even = stored.exposures is None or keeps_gains(root / "scene.json", about)
     gains = [EVEN] * len(names) if even or stored.exposures is None else stored.exposures.gains()
     stays = None if hold else ViewFiles(layout, downscale, transfer, files.digests)

@@ -19,7 +19,7 @@ from polarguide.capture.box_filter import agreed, every, maximum, mean_codes
 from polarguide.capture.exposures import FOUR, PLAIN, Exposure
 from polarguide.capture.scene import Scene
 from polarguide.capture.view import EVEN, FULL_CODE, Latest, Loader, View
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.options import EXPOSURES, Exposures, check_choice
 from polarguide.geometry.camera import seen_at
 from polarguide.geometry.polarizer import ANGLES
@@ -86,13 +86,13 @@ def mask_background(scene: Scene) -> Scene:
         views.append(view.masked())
     # The masks of test views tell training nothing.
     inside = _in_masks(scene.points, [view for view in views if view.name not in scene.test_names])
-    if len(scene.points) and not bool(inside.any()):
-        raise PolarguideError(
-            scene.root / "masks",
-            expected="masks with points of the COLMAP model in them",
-            found=f"none of {len(scene.points)} points",
-            remedy="White is the subject there: invert the masks, or choose another background.",
-        )
+    require(
+        not len(scene.points) or bool(inside.any()),
+        scene.root / "masks",
+        expected="masks with points of the COLMAP model in them",
+        found=f"none of {len(scene.points)} points",
+        remedy="White is the subject there: invert the masks, or choose another background.",
+    )
     return replace(
         scene, views=tuple(views), points=scene.points[inside], point_colors=scene.point_colors[inside]
     )

@@ -31,7 +31,7 @@ from polarguide.capture.ground_truth import GroundTruth, read_ground_truth
 from polarguide.capture.layout import Layout
 from polarguide.capture.point_exposures import ComparedPoints, PointExposures, PointSamples
 from polarguide.capture.view import EVEN, FULL_CODE, Latest, Loader, View
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import LARGEST_FILE, read_file
 from polarguide.core.records import LARGEST_RECORD
 from polarguide.core.text import canonical
@@ -63,13 +63,13 @@ def stored_pictures(pictures: Array, where: str) -> NDArray[Any]:
         PolarguideError: the pictures have another shape or type, or floats outside 0 to 1.
     """
     values = as_numpy(pictures)
-    if values.ndim not in (3, 4) or 0 in values.shape or (values.ndim == 4 and values.shape[3] not in (1, 3)):
-        raise PolarguideError(
-            where,
-            expected=_PICTURES,
-            found=kind_of(values),
-            remedy="Put the angles first and the colors last.",
-        )
+    require(
+        0 not in values.shape and (values.ndim == 3 or (values.ndim == 4 and values.shape[3] in (1, 3))),
+        where,
+        expected=_PICTURES,
+        found=kind_of(values),
+        remedy="Put the angles first and the colors last.",
+    )
     if values.ndim == 3:
         values = values[..., None]
     if np.issubdtype(values.dtype, np.floating):
@@ -92,13 +92,13 @@ def codes_of_floats(values: NDArray[Any], where: str) -> NDArray[np.uint16]:
     """
     low = float(values.min())
     high = float(values.max())
-    if not (low >= 0 and high <= 1):
-        raise PolarguideError(
-            where,
-            expected="floats from 0 to 1, linear, 1 at full scale",
-            found=f"{low:g} to {high:g}",
-            remedy="Divide by the value at full scale, and clip negative noise to 0.",
-        )
+    require(
+        low >= 0 and high <= 1,
+        where,
+        expected="floats from 0 to 1, linear, 1 at full scale",
+        found=f"{low:g} to {high:g}",
+        remedy="Divide by the value at full scale, and clip negative noise to 0.",
+    )
     return np.rint(values.astype(np.float64) * FULL_CODE).astype(np.uint16)
 
 
@@ -108,13 +108,13 @@ def exposures_of(angles: Sequence[Angle], count: int, where: str) -> tuple[Expos
     Raises:
         PolarguideError: there are more or fewer angles, or one is neither a number nor a word.
     """
-    if len(angles) != count:
-        raise PolarguideError(
-            where,
-            expected=f"{count} angles, one a picture",
-            found=str(len(angles)),
-            remedy="Name an angle in degrees, unknown or none for each picture.",
-        )
+    require(
+        len(angles) == count,
+        where,
+        expected=f"{count} angles, one a picture",
+        found=str(len(angles)),
+        remedy="Name an angle in degrees, unknown or none for each picture.",
+    )
     return tuple(_exposure(angle, where) for angle in angles)
 
 
@@ -125,13 +125,13 @@ def _exposure(angle: Angle, where: str) -> Exposure:
         degrees = float(angle)
     except (TypeError, ValueError):
         degrees = np.nan
-    if not abs(degrees) <= LARGEST:
-        raise PolarguideError(
-            where,
-            expected=f"angles in degrees up to {LARGEST:g}, unknown or none",
-            found=repr(angle),
-            remedy="Give the angle in degrees, or None where it is not known.",
-        )
+    require(
+        abs(degrees) <= LARGEST,
+        where,
+        expected=f"angles in degrees up to {LARGEST:g}, unknown or none",
+        found=repr(angle),
+        remedy="Give the angle in degrees, or None where it is not known.",
+    )
     return Exposure(normalized(degrees))
 
 
@@ -314,13 +314,13 @@ class ViewFiles:
 
     def _check(self, files: Files) -> None:
         for path, digest in files.digests.items():
-            if self._digests[path] != digest:
-                raise PolarguideError(
-                    path,
-                    expected="the file that was there as the scene was read",
-                    found="other contents",
-                    remedy="Leave a scene alone while it is worked on; then start again.",
-                )
+            require(
+                self._digests[path] == digest,
+                path,
+                expected="the file that was there as the scene was read",
+                found="other contents",
+                remedy="Leave a scene alone while it is worked on; then start again.",
+            )
 
 
 def _compact(mask: Tensor) -> Tensor:
@@ -374,13 +374,13 @@ def require_factor(factor: int, height: int, width: int) -> None:
     Raises:
         PolarguideError: the boxes do not fit.
     """
-    if factor > min(height, width):
-        raise PolarguideError(
-            "downscale",
-            expected=f"at most {min(height, width)} for pictures of {width}x{height}",
-            found=str(factor),
-            remedy="Choose a smaller factor.",
-        )
+    require(
+        factor <= min(height, width),
+        "downscale",
+        expected=f"at most {min(height, width)} for pictures of {width}x{height}",
+        found=str(factor),
+        remedy="Choose a smaller factor.",
+    )
 
 
 def view_data(

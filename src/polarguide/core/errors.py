@@ -36,6 +36,19 @@ class PolarguideError(Exception):
         self.remedy = remedy
 
 
+def require(condition: object, where: object, *, expected: str, found: str, remedy: str) -> None:
+    """Check a condition on what was given to the program.
+
+    Args:
+        condition: its truth value counts. where, expected, found, remedy: as for ``PolarguideError``.
+
+    Raises:
+        PolarguideError: the condition does not hold.
+    """
+    if not condition:
+        raise PolarguideError(where, expected=expected, found=found, remedy=remedy)
+
+
 class PolarguideWarning(UserWarning):
     """Something that the user should know before relying on a result."""
 

@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import require
 from polarguide.core.records import read_record
 from polarguide.geometry.camera import FARTHEST, LENS, Camera, can_be_lens, look_at
 from polarguide.geometry.scene_frame import SceneFrame, scene_frame
@@ -145,19 +145,28 @@ def _camera_of(record: _CameraRecord, where: str) -> Camera:
     lens = f"fx {record.fx:g}, fy {record.fy:g}, cx {record.cx:g}, cy {record.cy:g}"
     size = f"{record.width} x {record.height}"
     place = list(record.translation)
-    if not can_be_lens((record.width, record.height), (record.fx, record.fy), (record.cx, record.cy)):
-        raise _fault(f"{where})", f"numbers up to {FARTHEST:g}, {LENS}", f"{lens} for {size} pixels")
-    if not max(map(abs, place)) <= FARTHEST:
-        raise _fault(f"{where}.translation)", f"numbers up to {FARTHEST:g}", str(place))
+    _require_camera(
+        can_be_lens((record.width, record.height), (record.fx, record.fy), (record.cx, record.cy)),
+        f"{where})",
+        f"numbers up to {FARTHEST:g}, {LENS}",
+        f"{lens} for {size} pixels",
+    )
+    _require_camera(
+        max(map(abs, place)) <= FARTHEST, f"{where}.translation)", f"numbers up to {FARTHEST:g}", str(place)
+    )
     rotation = torch.tensor(record.rotation, dtype=torch.float64).reshape(3, 3)
     turned = torch.dist(rotation @ rotation.T, torch.eye(3, dtype=torch.float64)) < 1e-3
-    if not (turned and float(torch.linalg.det(rotation)) > 0):
-        raise _fault(f"{where}.rotation)", "a rotation", str(list(record.rotation)))
+    _require_camera(
+        turned and float(torch.linalg.det(rotation)) > 0,
+        f"{where}.rotation)",
+        "a rotation",
+        str(list(record.rotation)),
+    )
     return Camera(
         record.width, record.height, record.fx, record.fy, record.cx, record.cy,
         rotation, torch.tensor(record.translation, dtype=torch.float64),
     )  # fmt: skip
 
 
-def _fault(where: str, expected: str, found: str) -> PolarguideError:
-    return PolarguideError(where, expected=expected, found=found, remedy=REMEDY)
+def _require_camera(condition: object, where: str, expected: str, found: str) -> None:
+    require(condition, where, expected=expected, found=found, remedy=REMEDY)

@@ -15,7 +15,7 @@ from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR, RECIPE_REF_GS
 from polarguide.recipes.polarguide import (
     RECIPE_POLARGUIDE,
@@ -123,13 +123,13 @@ def recipe_named(name: str) -> Recipe:
     if name in _BUILT_IN:
         return _BUILT_IN[name]
     base = name.partition(":")[0]
-    if base == _ONLY_COMPARED:
-        raise PolarguideError(
-            "recipe",
-            expected="a recipe of Gaussians",
-            found=f"{name}, a signed-distance field, which is a baseline of comparisons",
-            remedy=f"Train and score it with polarguide compare SCENE --recipes {name}.",
-        )
+    require(
+        base != _ONLY_COMPARED,
+        "recipe",
+        expected="a recipe of Gaussians",
+        found=f"{name}, a signed-distance field, which is a baseline of comparisons",
+        remedy=f"Train and score it with polarguide compare SCENE --recipes {name}.",
+    )
     ablations = _ablations()
     if name in ablations:
         return ablations[name]
@@ -137,13 +137,13 @@ def recipe_named(name: str) -> Recipe:
     offered = offers.get(name, {})
     if len(offered) == 1:
         return next(iter(offered.values()))
-    if offered:
-        raise PolarguideError(
-            f"recipe {name}",
-            expected="one plug-in with that name",
-            found=" and ".join(offered),
-            remedy="Uninstall one of them.",
-        )
+    require(
+        not offered,
+        f"recipe {name}",
+        expected="one plug-in with that name",
+        found=" and ".join(offered),
+        remedy="Uninstall one of them.",
+    )
     if base in failures:
         raise failures[base]
     names = [*RECIPES, *(key for key in {**_BUILT_IN, **ablations} if key.startswith(f"{base}:")), *offers]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polarguide.capture.view import listed
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import read_file
 from polarguide.core.text import canonical, decimal_comma
 from polarguide.geometry.camera import FARTHEST, LENS, Camera, can_be_lens, quaternion
@@ -388,13 +388,13 @@ def read_model(root: Path) -> ColmapModel:
     images = posed_images(model)
     points, colors, tracks, numbers = _points_of(model)
     dropped = len(model.points3D) - len(points)
-    if len(points) == 0:
-        raise PolarguideError(
-            folder / ("points3D" + kind),
-            expected="3D points to start from",
-            found="none",
-            remedy="Triangulate points with the known poses (colmap point_triangulator).",
-        )
+    require(
+        len(points),
+        folder / ("points3D" + kind),
+        expected="3D points to start from",
+        found="none",
+        remedy="Triangulate points with the known poses (colmap point_triangulator).",
+    )
     beyond = f"not finite, or farther than {FARTHEST:g}, and were left out."
     warning = f"{dropped} of {dropped + len(points)} 3D points are {beyond}"
     warnings = (*stale, *([warning] if dropped else []))
@@ -410,13 +410,13 @@ def fit_camera(camera: Camera, width: int, height: int, *, folder: Path, view: s
     """
     if (camera.width, camera.height) == (width, height):
         return camera
-    if camera.width * height != camera.height * width or not camera.width:
-        raise PolarguideError(
-            f"{folder} (camera of view {view})",
-            expected=f"the size of the pictures, {width}x{height}",
-            found=f"{camera.width}x{camera.height}",
-            remedy="Give intrinsics for these pictures, or pictures of the size COLMAP saw (no crop).",
-        )
+    require(
+        camera.width and camera.width * height == camera.height * width,
+        f"{folder} (camera of view {view})",
+        expected=f"the size of the pictures, {width}x{height}",
+        found=f"{camera.width}x{camera.height}",
+        remedy="Give intrinsics for these pictures, or pictures of the size COLMAP saw (no crop).",
+    )
     return camera.scaled(width / camera.width, width, height)
 
 

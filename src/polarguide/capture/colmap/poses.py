@@ -29,7 +29,7 @@ from polarguide.capture.colmap.model import (
 )
 from polarguide.capture.filter.develop import remapped_mask
 from polarguide.capture.view import listed
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.geometry.camera import FARTHEST, LENS
 
 
@@ -197,13 +197,13 @@ class Poses:
         images = posed_images(self._model, frozenset(views))
         self.views = [view for view in views if view in images]
         self.missing = [view for view in views if view not in images]
-        if not self.views:
-            raise PolarguideError(
-                self.folder,
-                expected=f"images named like the views ({listed(views, 3)}), with any suffix",
-                found=listed(sorted(images), 3) or "no posed image",
-                remedy="Rename the images in the model or the pictures; names are matched without folder and suffix.",
-            )
+        require(
+            self.views,
+            self.folder,
+            expected=f"images named like the views ({listed(views, 3)}), with any suffix",
+            found=listed(sorted(images), 3) or "no posed image",
+            remedy="Rename the images in the model or the pictures; names are matched without folder and suffix.",
+        )
         self._images = {view: images[view][0] for view in self.views}
         for view in self.views:
             if len(images[view]) > 1:

@@ -26,7 +26,7 @@ from polarguide.capture.colmap.model import PosedCamera, colmap_camera, load_mod
 from polarguide.capture.filter.camera_files import Lens
 from polarguide.capture.view import listed
 from polarguide.capture.write import write_png
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder, writing
 from polarguide.core.progress import Reporter
 from polarguide.optics.color import srgb_encode_array
@@ -210,13 +210,13 @@ def run_step(
         process.stdin.close()
         process.stdout.close()
     last = answers[-1] if answers and isinstance(answers[-1], dict) else {}
-    if "value" not in last:
-        raise PolarguideError(
-            label,
-            expected="COLMAP to succeed",
-            found=last.get("error", f"its process ended with status {process.returncode}"),
-            remedy="Repeat the command, or bring a model with --poses PATH.",
-        )
+    require(
+        "value" in last,
+        label,
+        expected="COLMAP to succeed",
+        found=last.get("error", f"its process ended with status {process.returncode}"),
+        remedy="Repeat the command, or bring a model with --poses PATH.",
+    )
     return last["value"]
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from polarguide.capture.colmap.model import PosedCamera, colmap_camera, load_model, write_cameras
 from polarguide.capture.colmap.sfm import match_features, run_step
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_picture
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder, write_whole, writing
 from polarguide.core.progress import Reporter
 from polarguide.core.records import read_record
@@ -224,13 +224,13 @@ def _sample(
             masks[view] = decode_mask(path, read_picture(path), any_value=True)
     places = sample_visual_hull(cameras, masks, SAMPLES, np.random.default_rng(seed))
     kind = "the hull of the masks" if masks else "the cameras' common field of view"
-    if len(places) == 0:
-        raise PolarguideError(
-            where,
-            expected="poses of cameras with a common field of view",
-            found=f"{triangulated} triangulated points, and nothing in {kind}",
-            remedy="Check the poses (world to camera, axes right, down, forward), or bring a model with points.",
-        )
+    require(
+        len(places),
+        where,
+        expected="poses of cameras with a common field of view",
+        found=f"{triangulated} triangulated points, and nothing in {kind}",
+        remedy="Check the poses (world to camera, axes right, down, forward), or bring a model with points.",
+    )
     model = load_model(start, ".bin")
     for place, color in zip(places, _colors(folder, cameras, places), strict=True):
         model.add_point3D(place, pycolmap.Track(), color)

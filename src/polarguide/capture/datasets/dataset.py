@@ -16,11 +16,17 @@ from scipy.linalg import rq
 
 from polarguide.capture.calibration import Sense
 from polarguide.capture.colmap.model import PosedCamera
-from polarguide.capture.formats.arrays import finite_numbers, read_arrays, read_radiance, wrong_camera
+from polarguide.capture.formats.arrays import (
+    finite_numbers,
+    read_arrays,
+    read_radiance,
+    require_camera,
+    wrong_camera,
+)
 from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, decode_stored, read_picture
 from polarguide.capture.layout import index_files
 from polarguide.capture.view import listed
-from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.errors import PolarguideError, PolarguideWarning, require
 
 StokesImage = tuple[NDArray[np.float32], NDArray[np.bool_]]
 """Stokes vectors of a view [3, H, W, 3] in the dataset's own sense of angles; pixels at full scale in its pictures."""
@@ -108,6 +114,16 @@ def not_as_published(where: object, expected: str, found: str) -> PolarguideErro
     )
 
 
+def require_published(condition: object, where: object, expected: str, found: str) -> None:
+    """Check a condition on a file of a dataset.
+
+    Raises:
+        PolarguideError: the condition does not hold.
+    """
+    if not condition:
+        raise not_as_published(where, expected, found)
+
+
 def stokes_dataset(
     name: str,
     parts: Sequence[str],
@@ -168,13 +184,13 @@ def require_files(files: Mapping[str, Path], kind: str) -> None:
         PolarguideError: one is missing.
     """
     for view, path in files.items():
-        if not path.is_file():
-            raise PolarguideError(
-                path,
-                expected=f"the {kind} of view {view}",
-                found="nothing",
-                remedy="Add the file, or remove the others of the view.",
-            )
+        require(
+            path.is_file(),
+            path,
+            expected=f"the {kind} of view {view}",
+            found="nothing",
+            remedy="Add the file, or remove the others of the view.",
+        )
 
 
 def cameras_of_views(
@@ -209,10 +225,8 @@ def require_same_shape(path: Path, shape: tuple[int, ...], first: tuple[int, ...
     Raises:
         PolarguideError: the sizes differ.
     """
-    if shape[:2] != first[:2]:
-        raise not_as_published(
-            path, f"{first[1]}x{first[0]} pixels like {like.name}", f"{shape[1]}x{shape[0]}"
-        )
+    expected = f"{first[1]}x{first[0]} pixels like {like.name}"
+    require_published(shape[:2] == first[:2], path, expected, f"{shape[1]}x{shape[0]}")
 
 
 def numbered_views(stems: set[str]) -> dict[str, int]:
@@ -226,8 +240,7 @@ def first_picture_size(pictures: Mapping[str, Path], folder: Path) -> tuple[int,
     Raises:
         PolarguideError: there is none, or it is damaged.
     """
-    if not pictures:
-        raise not_as_published(folder, "the pictures that the intrinsics belong to", "none")
+    require_published(pictures, folder, "the pictures that the intrinsics belong to", "none")
     path = pictures[min(pictures)]
     height, width = decode_stored(path, read_picture(path)).shape[:2]
     return width, height
@@ -247,10 +260,12 @@ def resized_mask(dataset: Dataset, view: str, size: tuple[int, int]) -> NDArray[
     if mask.shape == size:
         return mask
     height, width = mask.shape
-    if abs(height * size[1] - width * size[0]) > max(height, width):
-        raise not_as_published(
-            f"mask of view {view}", f"the aspect of the pictures, {size[1]}x{size[0]}", f"{width}x{height}"
-        )
+    require_published(
+        abs(height * size[1] - width * size[0]) <= max(height, width),
+        f"mask of view {view}",
+        f"the aspect of the pictures, {size[1]}x{size[0]}",
+        f"{width}x{height}",
+    )
     way = cv2.INTER_AREA if height > size[0] else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(mask.astype(np.float32), (size[1], size[0]), interpolation=way) >= 0.5)
 
@@ -293,19 +308,21 @@ def read_projections(path: Path) -> Projections:
         if match is None:
             continue
         number = int(match[1])
-        if number in parts:
-            raise wrong_camera(
-                path, f"one camera of the number {number}", "two, with and without zeros before it"
-            )
+        require_camera(
+            number not in parts,
+            path,
+            f"one camera of the number {number}",
+            "two, with and without zeros before it",
+        )
         padded |= match[1] != str(number)
         scale_key = f"scale_mat_{match[1]}"
         inner_key = f"camera_mat_{match[1]}"
-        if inner_key in arrays and not _is_identity(arrays[inner_key]):
-            raise wrong_camera(
-                path,
-                "world_mat that projects to pixels",
-                f"{inner_key}, which scales them to a picture from -1 to 1",
-            )
+        require_camera(
+            inner_key not in arrays or _is_identity(arrays[inner_key]),
+            path,
+            "world_mat that projects to pixels",
+            f"{inner_key}, which scales them to a picture from -1 to 1",
+        )
         if scale_key not in arrays:
             raise missing_entry(path, scale_key, arrays)
         world = finite_numbers(f"{path} ({key})", arrays[key], _SQUARE)
@@ -342,8 +359,9 @@ def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Mat
         PolarguideError: the matrix is singular, or its pixels are skewed.
     """
     left = projection[:, :3]
-    if not np.linalg.cond(left) < 1e10:
-        raise wrong_camera(where, "a camera matrix that can be inverted", "a singular one")
+    require_camera(
+        np.linalg.cond(left) < 1e10, where, "a camera matrix that can be inverted", "a singular one"
+    )
     if np.linalg.det(left) < 0:  # a matrix means the same with the other sign; rotations have determinant 1
         projection = -projection
         left = -left
@@ -363,12 +381,12 @@ def checked_intrinsics(where: object, inner: Matrix) -> Matrix:
     """
     lower = np.abs([inner[1, 0], inner[2, 0], inner[2, 1], inner[2, 2] - 1]).max()
     skew = abs(inner[0, 1]) / max(abs(inner[0, 0]), 1e-12)
-    if not (inner[0, 0] > 0 and inner[1, 1] > 0 and lower < 1e-6 and skew < _LARGEST_SKEW):
-        raise wrong_camera(
-            where,
-            "an intrinsic matrix with positive focal lengths and without skew",
-            str(np.round(inner, 4).tolist()),
-        )
+    require_camera(
+        inner[0, 0] > 0 and inner[1, 1] > 0 and lower < 1e-6 and skew < _LARGEST_SKEW,
+        where,
+        "an intrinsic matrix with positive focal lengths and without skew",
+        str(np.round(inner, 4).tolist()),
+    )
     return inner
 
 

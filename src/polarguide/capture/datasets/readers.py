@@ -30,6 +30,7 @@ from polarguide.capture.datasets.dataset import (
     read_projections,
     require_files,
     require_known_names,
+    require_published,
     require_same_shape,
     stokes_dataset,
 )
@@ -183,10 +184,12 @@ def _read_archive(path: Path) -> NDArray[np.float32]:
         if key not in arrays:
             raise missing_entry(path, key, arrays)
         plane = arrays[key]
-        if plane.ndim != 3 or plane.shape[2] != 3 or plane.dtype.kind != "f":
-            raise not_as_published(
-                f"{path} ({key})", "floating-point numbers of three channels", array_kind(plane)
-            )
+        require_published(
+            plane.ndim == 3 and plane.shape[2] == 3 and plane.dtype.kind == "f",
+            f"{path} ({key})",
+            "floating-point numbers of three channels",
+            array_kind(plane),
+        )
         require_same_shape(path, plane.shape, arrays["S0"].shape, path)
     return np.stack([arrays[key] for key in _NERSP_ENTRIES]).astype(np.float32)
 
@@ -305,17 +308,23 @@ def open_neisf(root: Path) -> Dataset:
 def _llff_cameras(path: Path) -> dict[int, PosedCamera]:
     """Row -> camera; rows count from 1 like the files."""
     rows = read_array(path)
-    if rows.ndim != 2 or rows.shape[1] != 17 or len(rows) == 0:
-        raise not_as_published(path, "an array N x 17 of poses and bounds (LLFF)", array_size(rows))
+    require_published(
+        rows.ndim == 2 and rows.shape[1] == 17 and len(rows),
+        path,
+        "an array N x 17 of poses and bounds (LLFF)",
+        array_size(rows),
+    )
     cameras = {}
     for index, row in enumerate(rows):
         where = f"{path} (row {index})"
         down, right, back, center, inner = finite_numbers(where, row[:15], ((15,),)).reshape(3, 5).T
         height, width, focal = inner
-        if not (1 <= height <= 1e5 and 1 <= width <= 1e5 and focal > 0):
-            raise not_as_published(
-                where, "height, width and focal length in pixels", f"{height:g}, {width:g} and {focal:g}"
-            )
+        require_published(
+            1 <= height <= 1e5 and 1 <= width <= 1e5 and focal > 0,
+            where,
+            "height, width and focal length in pixels",
+            f"{height:g}, {width:g} and {focal:g}",
+        )
         # OpenCV's axes: right, down, forward.
         axes = np.column_stack([np.stack([right, down, -back]), np.zeros(3)])
         rotation, _ = checked_pose(where, axes)
@@ -384,8 +393,12 @@ def _plane(path: Path, shape: tuple[int, ...], like: Path) -> NDArray[np.float32
     plane = read_array(path)
     if plane.ndim == 3 and plane.shape[2] == 1:
         plane = plane[..., 0]
-    if plane.ndim != 2 or plane.dtype.kind != "f":
-        raise not_as_published(path, "floating-point numbers of one channel", array_kind(plane))
+    require_published(
+        plane.ndim == 2 and plane.dtype.kind == "f",
+        path,
+        "floating-point numbers of one channel",
+        array_kind(plane),
+    )
     require_same_shape(path, plane.shape, shape, like)
     return np.asarray(plane, np.float32)
 
@@ -439,15 +452,19 @@ def open_phygap(root: Path) -> Dataset:
     require_known_names(path, arrays.keys() - _PHYGAP_ENTRIES)
     inner = checked_intrinsics(f"{path} (intrinsics)", finite_numbers(path, arrays["intrinsics"], ((3, 3),)))
     poses = arrays["extrinsics"]
-    if poses.ndim != 3 or poses.shape[1:] not in ((3, 4), (4, 4)):
-        raise not_as_published(f"{path} (extrinsics)", "matrices N x 4 x 4", array_size(poses))
+    require_published(
+        poses.ndim == 3 and poses.shape[1:] in _SHAPES,
+        f"{path} (extrinsics)",
+        "matrices N x 4 x 4",
+        array_size(poses),
+    )
     sides = [finite_numbers(f"{path} ({key})", arrays[key], ((),)) for key in ("image_width", "image_height")]
-    if not all(1 <= side <= 1e5 for side in sides):
-        raise not_as_published(
-            f"{path} (image_width, image_height)",
-            "a size in pixels",
-            " and ".join(f"{float(side):g}" for side in sides),
-        )
+    require_published(
+        all(1 <= side <= 1e5 for side in sides),
+        f"{path} (image_width, image_height)",
+        "a size in pixels",
+        " and ".join(f"{float(side):g}" for side in sides),
+    )
     size = (int(sides[0]), int(sides[1]))
     cameras = {}
     for number, pose in enumerate(poses):
@@ -535,12 +552,12 @@ def _gamma(root: Path) -> float:
         gamma = float(files[0].name.removeprefix("gamma").removesuffix(".txt"))
     except ValueError:
         gamma = math.nan
-    if len(files) > 1 or not 0.2 <= gamma <= 5:
-        raise not_as_published(
-            root,
-            "one file called gamma<number>.txt with a number from 0.2 to 5",
-            ", ".join(path.name for path in files),
-        )
+    require_published(
+        len(files) == 1 and 0.2 <= gamma <= 5,
+        root,
+        "one file called gamma<number>.txt with a number from 0.2 to 5",
+        ", ".join(path.name for path in files),
+    )
     return gamma
 
 

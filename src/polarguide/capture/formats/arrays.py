@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.formats.headers import LARGEST_PIXELS, damaged
-from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.errors import PolarguideError, optional_import, require
 from polarguide.core.files import in_utf8, read_file
 
 _LARGEST_HEADER = 1 << 16
@@ -44,6 +44,16 @@ def array_kind(array: NDArray[Any]) -> str:
 def wrong_camera(where: object, expected: str, found: str) -> PolarguideError:
     """The error that the numbers of a camera make no sense."""
     return PolarguideError(where, expected=expected, found=found, remedy="Export the cameras again.")
+
+
+def require_camera(condition: object, where: object, expected: str, found: str) -> None:
+    """Check a condition on the numbers of a camera.
+
+    Raises:
+        PolarguideError: the condition does not hold.
+    """
+    if not condition:
+        raise wrong_camera(where, expected, found)
 
 
 def read_array(path: Path) -> NDArray[Any]:
@@ -127,10 +137,8 @@ def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], 
         numbers = np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise wrong_camera(where, expected, f"something else ({error})") from None
-    if numbers.shape not in shapes:
-        raise wrong_camera(where, expected, array_size(numbers))
-    if not np.isfinite(numbers).all():
-        raise wrong_camera(where, expected, "values that are not finite")
+    require_camera(numbers.shape in shapes, where, expected, array_size(numbers))
+    require_camera(np.isfinite(numbers).all(), where, expected, "values that are not finite")
     return numbers
 
 
@@ -185,13 +193,13 @@ def read_radiance(path: Path) -> NDArray[np.float32]:
         pixels = read_array(path)
     if pixels.ndim == 2:
         pixels = pixels[..., None]
-    if pixels.ndim != 3 or pixels.shape[2] not in (1, 3) or 0 in pixels.shape or pixels.dtype.kind != "f":
-        raise PolarguideError(
-            path,
-            expected="a picture of floating-point numbers with one or three channels",
-            found=array_kind(pixels),
-            remedy="Export the file again.",
-        )
+    require(
+        pixels.ndim == 3 and pixels.shape[2] in (1, 3) and 0 not in pixels.shape and pixels.dtype.kind == "f",
+        path,
+        expected="a picture of floating-point numbers with one or three channels",
+        found=array_kind(pixels),
+        remedy="Export the file again.",
+    )
     with np.errstate(over="ignore"):
         return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3)), dtype=np.float32)
 

@@ -33,7 +33,7 @@ from polarguide.capture.formats.headers import (
     tiff_size,
 )
 from polarguide.capture.view import FULL_CODE
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import LARGEST_FILE, read_file
 from polarguide.optics.color import srgb_decode_array
 
@@ -72,21 +72,21 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
         pixels = _codes_of_floats(path, pixels)
     elif full is not None:
         pixels = rescaled(pixels, full)
-    if pixels.dtype not in (np.uint8, np.uint16):
-        raise PolarguideError(
-            path,
-            expected="a picture with 8 or 16 bits a channel",
-            found=f"values of type {pixels.dtype}",
-            remedy="Save it as 16-bit PNG with value 65535 for linear intensity 1.",
-        )
+    require(
+        pixels.dtype in (np.uint8, np.uint16),
+        path,
+        expected="a picture with 8 or 16 bits a channel",
+        found=f"values of type {pixels.dtype}",
+        remedy="Save it as 16-bit PNG with value 65535 for linear intensity 1.",
+    )
     clear = 0.0 if pixels.shape[2:] != (4,) else float((pixels[..., 3] < np.iinfo(pixels.dtype).max).mean())
-    if clear:
-        raise PolarguideError(
-            path,
-            expected="an opaque picture",
-            found=f"{clear:.1%} of it transparent",
-            remedy="Save it without transparency; what is not to be looked at belongs into masks/ or invalid/.",
-        )
+    require(
+        not clear,
+        path,
+        expected="an opaque picture",
+        found=f"{clear:.1%} of it transparent",
+        remedy="Save it without transparency; what is not to be looked at belongs into masks/ or invalid/.",
+    )
     if pixels.ndim == 2:
         return np.repeat(pixels[..., None], 3, axis=2)
     return np.ascontiguousarray(pixels[..., 2::-1])
@@ -190,13 +190,13 @@ def decode_materials(path: Path, data: bytes) -> NDArray[np.uint8]:
         PolarguideError: the file is damaged, cut short, of another kind, lossy, or has a value beyond 255.
     """
     pixels = decode_stored(path, data)
-    if _loses_detail(data):
-        raise PolarguideError(
-            path,
-            expected="a lossless picture, such as PNG, which keeps the numbers of materials",
-            found="a compression that changes them (JPEG, HEIC, WebP)",
-            remedy=f"Save it as PNG. {MATERIAL_REMEDY}",
-        )
+    require(
+        not _loses_detail(data),
+        path,
+        expected="a lossless picture, such as PNG, which keeps the numbers of materials",
+        found="a compression that changes them (JPEG, HEIC, WebP)",
+        remedy=f"Save it as PNG. {MATERIAL_REMEDY}",
+    )
     gray = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)
     if int(gray.max(initial=0)) > MOST_MATERIAL:
         raise PolarguideError(
