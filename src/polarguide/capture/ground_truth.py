@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polarguide.capture import box_filter as boxes
-from polarguide.capture.formats.arrays import BROKEN, unpacked
+from polarguide.capture.formats.arrays import decode_arrays
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.records import decode
 
@@ -104,6 +104,7 @@ _CHANNELS = {"normal": 3, "depth": 0, "mask": 0, "specular": 3, "diffuse": 3, "o
 _NOT_NEGATIVE = ("depth", "specular", "diffuse")
 _ROUNDING = 1e-3  # of differences of what was rendered
 _LARGEST_NUMBER = 16  # bytes
+_LARGEST_HEADERS = 1 << 18  # bytes
 _LARGEST = 1e18  # its square still is a number in single precision
 
 
@@ -143,7 +144,16 @@ def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor:
     Raises:
         PolarguideError: the file cannot be read, an array has another size, or values are not finite.
     """
-    arrays = _read_arrays(path, data, size)
+    arrays = decode_arrays(
+        path,
+        data,
+        _CHANNELS,
+        _LARGEST_NUMBER * sum(max(1, count) for count in _CHANNELS.values()) * size[0] * size[1]
+        + _LARGEST_HEADERS,
+        kinds="biufcSU",
+        expected="a NumPy .npz file with normal, depth, mask, specular, diffuse or objid",
+        remedy="Write it again with numpy.savez_compressed, or remove it.",
+    )
     for name, array in arrays.items():
         _check(path, name, array, size)
     fields: dict[str, NDArray[Any]] = {}
@@ -162,18 +172,6 @@ def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor:
     return GroundTruth(
         **{name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in fields.items()}
     )
-
-
-def _read_arrays(path: Path, data: bytes, size: tuple[int, int]) -> dict[str, NDArray[Any]]:
-    try:
-        return unpacked(data, _CHANNELS, _LARGEST_NUMBER * max(3, *_CHANNELS.values()) * size[0] * size[1])
-    except BROKEN as error:
-        raise PolarguideError(
-            path,
-            expected="a NumPy .npz file with normal, depth, mask, specular, diffuse or objid",
-            found="a damaged, truncated or other file",
-            remedy="Write it again with numpy.savez_compressed, or remove it.",
-        ) from error
 
 
 def _check(path: Path, name: str, array: NDArray[Any], size: tuple[int, int]) -> None:

@@ -323,8 +323,7 @@ def read_projections(path: Path) -> Projections:
             "world_mat that projects to pixels",
             f"{inner_key}, which scales them to a picture from -1 to 1",
         )
-        if scale_key not in arrays:
-            raise missing_entry(path, scale_key, arrays)
+        require_entries(path, arrays, scale_key)
         world = finite_numbers(f"{path} ({key})", arrays[key], _SQUARE)
         scale = finite_numbers(f"{path} ({scale_key})", arrays[scale_key], ((4, 4),))
         if size := float(
@@ -333,7 +332,7 @@ def read_projections(path: Path) -> Projections:
             checked_pose(f"{path} ({scale_key})", scale[:3] / size)
         parts[number] = decompose_projection(f"{path} ({key} @ {scale_key})", (world @ scale)[:3])
     if not parts:
-        raise missing_entry(path, "world_mat_<i>", arrays)
+        require_entries(path, arrays, "world_mat_<i>")
     require_known_names(path, (key for key in arrays if _IDR_ENTRY.fullmatch(key) is None))
     return Projections(parts, padded)
 
@@ -430,8 +429,11 @@ def distorted_camera(
     return PosedCamera(*size, "FULL_OPENCV", tuple(float(p) for p in parameters), rotation, translation)
 
 
-def missing_entry(path: Path, key: str, entries: Mapping[str, object]) -> PolarguideError:
-    """The error that a file lacks an entry."""
-    names = sorted(entries)
-    listing = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-    return not_as_published(path, f"the entry {key}", listing or "no entry")
+def require_entries(path: Path, entries: Mapping[str, object], *keys: str) -> None:
+    """Check that a file has entries.
+
+    Raises:
+        PolarguideError: one is missing.
+    """
+    for key in keys:
+        require_published(key in entries, path, f"the entry {key}", listed(sorted(entries)) or "no entry")

@@ -22,12 +22,12 @@ from polarguide.capture.datasets.dataset import (
     distorted_camera,
     first_picture_size,
     masks_beside,
-    missing_entry,
     not_as_published,
     numbered_views,
     pinhole_camera,
     read_mask,
     read_projections,
+    require_entries,
     require_files,
     require_known_names,
     require_published,
@@ -35,16 +35,15 @@ from polarguide.capture.datasets.dataset import (
     stokes_dataset,
 )
 from polarguide.capture.formats.arrays import (
-    BROKEN,
     array_kind,
     array_size,
+    decode_arrays,
     finite_numbers,
     read_array,
     read_arrays,
     read_exr_channels,
-    unpacked,
 )
-from polarguide.capture.formats.headers import LARGEST_PIXELS, damaged
+from polarguide.capture.formats.headers import LARGEST_PIXELS
 from polarguide.capture.formats.pictures import (
     SUFFIXES,
     decode_picture,
@@ -175,14 +174,9 @@ def _read_archive(path: Path) -> NDArray[np.float32]:
     Raises:
         PolarguideError: the file cannot be read, lacks an entry, or its entries are no pictures of one size.
     """
-    data = read_file(path)
-    try:
-        arrays = unpacked(data, _NERSP_ENTRIES, 8 * 3 * LARGEST_PIXELS)
-    except BROKEN as error:
-        raise damaged(path, "a complete .npz file of numbers", f"a damaged one ({error})") from error
+    arrays = decode_arrays(path, read_file(path), _NERSP_ENTRIES, 3 * 8 * 3 * LARGEST_PIXELS, kinds="biufcSU")
+    require_entries(path, arrays, *_NERSP_ENTRIES)
     for key in _NERSP_ENTRIES:
-        if key not in arrays:
-            raise missing_entry(path, key, arrays)
         plane = arrays[key]
         require_published(
             plane.ndim == 3 and plane.shape[2] == 3 and plane.dtype.kind == "f",
@@ -415,14 +409,13 @@ def _gnerp_cameras(path: Path, size: tuple[int, int]) -> dict[int, PosedCamera]:
         if match is None:
             continue
         inner_key = f"intrinsic_{match[1]}" if f"intrinsic_{match[1]}" in content else "intrinsic"
-        if inner_key not in content:
-            raise missing_entry(path, inner_key, content)
+        require_entries(path, content, inner_key)
         where = f"{path} ({inner_key})"
         inner = finite_numbers(where, content[inner_key], ((3, 3), *_SHAPES))[:3, :3]
         pose = checked_pose(f"{path} ({key})", finite_numbers(f"{path} ({key})", value, _SHAPES))
         cameras[int(match[1])] = pinhole_camera(size, checked_intrinsics(where, inner), *pose)
     if not cameras:
-        raise missing_entry(path, "w2c_mat_<i>", content)
+        require_entries(path, content, "w2c_mat_<i>")
     require_known_names(path, (key for key in content if _GNERP_ENTRY.fullmatch(key) is None))
     return cameras
 
@@ -446,9 +439,7 @@ def open_phygap(root: Path) -> Dataset:
     numbers = numbered_views(set(files))
     path = root / PHYGAP_CAMERAS
     arrays = read_arrays(path)
-    for key in ("intrinsics", "extrinsics", "image_width", "image_height"):
-        if key not in arrays:
-            raise missing_entry(path, key, arrays)
+    require_entries(path, arrays, "intrinsics", "extrinsics", "image_width", "image_height")
     require_known_names(path, arrays.keys() - _PHYGAP_ENTRIES)
     inner = checked_intrinsics(f"{path} (intrinsics)", finite_numbers(path, arrays["intrinsics"], ((3, 3),)))
     poses = arrays["extrinsics"]
@@ -511,9 +502,7 @@ def open_pisr(root: Path) -> Dataset:
     )
     inner_file = root / "intrinsics.npz"
     intrinsics = read_arrays(inner_file)
-    for key in ("camera_matrix", "dist_coeffs"):
-        if key not in intrinsics:
-            raise missing_entry(inner_file, key, intrinsics)
+    require_entries(inner_file, intrinsics, "camera_matrix", "dist_coeffs")
     require_known_names(inner_file, intrinsics.keys() - _PISR_ENTRIES)
     where = f"{inner_file} (camera_matrix)"
     inner = checked_intrinsics(where, finite_numbers(where, intrinsics["camera_matrix"], ((3, 3),)))

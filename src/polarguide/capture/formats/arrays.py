@@ -64,7 +64,7 @@ def read_array(path: Path) -> NDArray[Any]:
     """
     data = read_file(path)
     try:
-        return _array(data)
+        return _array(data, "biuf")
     except BROKEN as error:
         raise damaged(
             path,
@@ -74,44 +74,43 @@ def read_array(path: Path) -> NDArray[Any]:
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays in an ``.npz`` file, by name.
+    """The arrays in an ``.npz`` file of cameras, by name; see ``decode_arrays``."""
+    return decode_arrays(path, read_file(path))
+
+
+def decode_arrays(
+    path: Path,
+    data: bytes,
+    names: Collection[str] | None = None,
+    largest: int = _LARGEST_ARCHIVE,
+    *,
+    kinds: str = "biuf",
+    expected: str = "a complete .npz file of numbers",
+    remedy: str = "Copy or export the file again.",
+) -> dict[str, NDArray[Any]]:
+    """Decode the arrays of an ``.npz`` file.
+
+    Args:
+        path: for messages. data: the whole file.
+        names: names of the arrays, of which some may be missing; None: all. largest: bytes that they may take together.
+        kinds: types of their values, as NumPy calls them. expected, remedy: for messages.
 
     Raises:
-        PolarguideError: the file cannot be read, is damaged, or decompresses to more data than a file of
-            cameras may have.
+        PolarguideError: the file is damaged or encrypted, or decompresses to more data than ``largest``.
     """
-    data = read_file(path)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
-            size = sum(entry.file_size for entry in archive.infolist())
-            if size > _LARGEST_ARCHIVE:
+            chosen = members.keys() if names is None else members.keys() & {*names}
+            size = sum(members[name].file_size for name in chosen)
+            if size > largest:
                 raise ValueError(f"an archive that decompresses to {size} bytes")
-            return {name: _array(_member(archive, entry)) for name, entry in members.items()}
+            return {
+                name: _array(_member(archive, members[name]), kinds) for name in members if name in chosen
+            }
     except BROKEN as error:
-        what = "one that cannot be unpacked" if isinstance(error, zipfile.BadZipFile) else "a damaged one"
-        found = f"{what} ({error})" if data else "an empty file"
-    raise damaged(path, "a complete .npz file of numbers", found)
-
-
-def unpacked(data: bytes, names: Collection[str], largest: int) -> dict[str, NDArray[Any]]:
-    """Arrays of an ``.npz`` file by name, those that are there; the others in it are not looked at.
-
-    Args:
-        data: the whole file. names: names of the arrays. largest: bytes that any of them may take.
-
-    Raises:
-        One of ``BROKEN``: it is damaged, encrypted, or one of them is larger or holds no numbers.
-    """
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        arrays = {}
-        for entry in archive.infolist():
-            name = entry.filename.removesuffix(".npy")
-            if name in names and entry.filename.endswith(".npy"):
-                if entry.file_size > largest + _LARGEST_HEADER:
-                    raise ValueError(f"{name} of {entry.file_size} bytes")
-                arrays[name] = _array(_member(archive, entry), "biufcSU")
-        return arrays
+        found = f"a damaged one ({error})" if data else "an empty file"
+        raise PolarguideError(path, expected=expected, found=found, remedy=remedy) from error
 
 
 def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
@@ -154,7 +153,7 @@ def array_header(stream: io.BytesIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
     return shape, dtype
 
 
-def _array(data: bytes, kinds: str = "biuf") -> NDArray[Any]:
+def _array(data: bytes, kinds: str) -> NDArray[Any]:
     """Decode ``.npy``; a header that promises more than there is, is refused before memory is taken for it.
 
     ``kinds`` are the types of values that may be in it, as NumPy calls them.
