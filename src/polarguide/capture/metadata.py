@@ -119,8 +119,7 @@ def refractive_index_of(path: Path, data: bytes) -> float | None:
     Raises:
         PolarguideError: the index is not a number between 1 and 4.
     """
-    remedy = "Correct it, or remove it to use the default."
-    scene = decode(data, _Scene, path, remedy=remedy)
+    scene = decode(data, _Scene, path, remedy="Correct it, or remove it to use the default.")
     if scene.refractive_index is not None:
         return scene.refractive_index
     materials = [item.material for item in scene.objects]

@@ -61,8 +61,7 @@ def empty_pixels(view: View) -> Tensor:
     if view.mask is not None:
         subject = view.mask.cpu().numpy()
     else:
-        black = _black(view)
-        regions, _ = label(black)
+        regions, _ = label(_black(view))
         outside = np.unique(np.concatenate([regions[0], regions[-1], regions[:, 0], regions[:, -1]]))
         subject = ~np.isin(regions, outside[outside > 0])
     return torch.from_numpy(~_grown(subject, GROWN))

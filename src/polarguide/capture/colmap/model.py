@@ -66,8 +66,7 @@ class PosedCamera:
 def colmap_camera(camera: PosedCamera, **more: Any) -> pycolmap.Camera:
     """The intrinsics of a camera as pycolmap's type."""
     size = {"width": camera.width, "height": camera.height}
-    params = list(camera.parameters)
-    return pycolmap.Camera(model=camera.model, params=params, **size, **more)
+    return pycolmap.Camera(model=camera.model, params=list(camera.parameters), **size, **more)
 
 
 def write_cameras(

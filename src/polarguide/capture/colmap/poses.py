@@ -321,8 +321,7 @@ class Poses:
 
     def _move_points(self, image: Any, before: Any, warp: Undistortion) -> None:
         """Undistort the observations of an image."""
-        places = np.array([point.xy for point in image.points2D])
-        rays = np.nan_to_num(before.cam_from_img(places))
+        rays = np.nan_to_num(before.cam_from_img(np.array([point.xy for point in image.points2D])))
         moved = warp.target.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
         for point, place in zip(image.points2D, moved, strict=True):
             point.xy = place

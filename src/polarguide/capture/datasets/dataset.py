@@ -421,8 +421,7 @@ def distorted_camera(
     Raises:
         PolarguideError: there are other coefficients.
     """
-    flat = np.ravel(np.asarray(coefficients))
-    k = finite_numbers(where, flat, ((4,), (5,), (8,)))
+    k = finite_numbers(where, np.ravel(np.asarray(coefficients)), ((4,), (5,), (8,)))
     padded = [*k, *[0.0] * (8 - len(k))]
     parameters = (inner[0, 0], inner[1, 1], inner[0, 2] + 0.5, inner[1, 2] + 0.5, *padded)
     rotation, translation = pose

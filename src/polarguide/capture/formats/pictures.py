@@ -161,8 +161,7 @@ def _require_two_levels(path: Path, gray: NDArray[Any]) -> None:
 
 def _grays(levels: NDArray[np.float32]) -> int:
     """How many grays more than a small share of some pixels have."""
-    counts = np.unique(levels, return_counts=True)[1]
-    return int((counts > _SMALL_AREA * levels.size).sum())
+    return int((np.unique(levels, return_counts=True)[1] > _SMALL_AREA * levels.size).sum())
 
 
 def _require_one_mask(path: Path, pixels: NDArray[Any], mask: NDArray[np.bool_]) -> None:
