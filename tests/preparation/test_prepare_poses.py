@@ -33,7 +33,7 @@ from relief import DEPTHS, write_relief
 
 from polarguide.capture import load_scene
 from polarguide.capture.colmap import triangulate as points_module
-from polarguide.capture.colmap.model import PosedCamera, write_cameras
+from polarguide.capture.colmap.model import PosedCamera, posed_model
 from polarguide.capture.colmap.sfm import match_features, tone_mapped
 from polarguide.capture.colmap.triangulate import sample_visual_hull
 from polarguide.capture.write import write_png
@@ -347,7 +347,7 @@ def test_points_are_triangulated_with_the_poses_as_they_are(tmp_path: Path, poin
     cameras = write_relief(tmp_path / "in")
     model = tmp_path / "model"
     model.mkdir()
-    write_cameras(model, cameras)
+    posed_model(cameras).write_binary(str(model))
     if not points_file:
         (model / "points3D.bin").unlink()
     heard = Heard()
@@ -373,7 +373,7 @@ def test_pictures_without_texture_get_samples(tmp_path: Path) -> None:
     for view in cameras:
         write_shots(tmp_path / "in", view, behind(smooth_light()))
     (tmp_path / "model").mkdir()
-    write_cameras(tmp_path / "model", cameras)
+    posed_model(cameras).write_binary(str(tmp_path / "model"))
     heard = Heard()
     settings = replace(FILTER, poses=str(tmp_path / "model"))
     prepare_scene(tmp_path / "in", tmp_path / "out", settings, heard)
@@ -390,7 +390,7 @@ def test_a_stopped_preparation_keeps_its_points(tmp_path: Path, monkeypatch: pyt
     for view in cameras:
         write_shots(tmp_path / "in", view, behind(smooth_light()))
     (tmp_path / "model").mkdir()
-    write_cameras(tmp_path / "model", cameras)
+    posed_model(cameras).write_binary(str(tmp_path / "model"))
     settings = replace(FILTER, poses=str(tmp_path / "model"))
 
     def stop(*arguments: object) -> None:
@@ -415,7 +415,7 @@ def test_cameras_that_look_apart_are_refused(tmp_path: Path) -> None:
     for view in cameras:
         write_shots(tmp_path / "in", view, behind(smooth_light()))
     (tmp_path / "model").mkdir()
-    write_cameras(tmp_path / "model", apart)
+    posed_model(apart).write_binary(str(tmp_path / "model"))
     Fault(expected="poses of cameras with a common field of view").raised_by(
         prepare_scene, tmp_path / "in", tmp_path / "out", replace(FILTER, poses=str(tmp_path / "model"))
     )

@@ -172,10 +172,15 @@ T = TypeVar("T")
 
 
 class Files:
-    """Reads files and records the SHA-256 of each."""
+    """Reads files and records the SHA-256 of each.
 
-    def __init__(self) -> None:
+    Args:
+        known: SHA-256 that the files have to have; None: any.
+    """
+
+    def __init__(self, known: Mapping[Path, str] | None = None) -> None:
         self.digests: dict[Path, str] = {}
+        self._known = known
 
     def read(self, path: Path, largest: int = LARGEST_FILE) -> bytes:
         """The bytes of a file of up to ``largest``."""
@@ -186,7 +191,14 @@ class Files:
         return self._noted(path, read_picture(path))
 
     def _noted(self, path: Path, data: bytes) -> bytes:
-        self.digests[path] = hashlib.sha256(data).hexdigest()
+        digest = self.digests[path] = hashlib.sha256(data).hexdigest()
+        require(
+            self._known is None or self._known[path] == digest,
+            path,
+            expected="the file that was there as the scene was read",
+            found="other contents",
+            remedy="Leave a scene alone while it is worked on; then start again.",
+        )
         return data
 
     def digest(self, root: Path) -> str:
@@ -301,31 +313,25 @@ class ViewFiles:
         return None if path is None else Loader(functools.partial(self._read_truth, path, size), self._truths)
 
     def _read_codes(self, name: str) -> Tensor:
-        files = Files()
-        raw = _read_pictures(files, self._layout.files(name))
-        self._check(files)
+        raw = _read_pictures(Files(self._digests), self._layout.files(name))
         return torch.from_numpy(_codes(raw, self._transfer, self._factor))
 
     def _read_truth(self, path: Path, size: tuple[int, int]) -> GroundTruth | None:
-        files = Files()
-        data = files.read(path)
-        self._check(files)
+        data = Files(self._digests).read(path)
         return read_ground_truth(path, data, size=(size[1], size[0]), factor=self._factor)
-
-    def _check(self, files: Files) -> None:
-        for path, digest in files.digests.items():
-            require(
-                self._digests[path] == digest,
-                path,
-                expected="the file that was there as the scene was read",
-                found="other contents",
-                remedy="Leave a scene alone while it is worked on; then start again.",
-            )
 
 
 def _compact(mask: Tensor) -> Tensor:
     """The mask, without memory where nothing is set."""
     return mask if bool(mask.any()) else torch.zeros((), dtype=torch.bool).expand(mask.shape)
+
+
+_BESIDE: dict[str, Callable[[Path, bytes], NDArray[Any]]] = {
+    "invalid": functools.partial(decode_mask, any_value=True),
+    "mask": functools.partial(decode_mask, any_value=False),
+    "materials": decode_materials,
+}
+"""Decoders of the pictures beside those of a view, by their kind."""
 
 
 def read_view(
@@ -344,12 +350,15 @@ def read_view(
     raw = _read_pictures(files, layout.files(name))
     height, width = raw[0].shape[:2]
     require_factor(factor, height, width)
+    beside = {
+        kind: _read_beside(files, folder, name, (height, width), _BESIDE[kind])
+        for kind, folder in (
+            ("invalid", layout.invalid),
+            ("mask", layout.masks),
+            ("materials", layout.materials),
+        )
+    }
     ground_truth = None
-    any_value = functools.partial(decode_mask, any_value=True)
-    invalid = _read_beside(files, layout.invalid, name, (height, width), any_value)
-    half_of_maximum = functools.partial(decode_mask, any_value=False)
-    mask = _read_beside(files, layout.masks, name, (height, width), half_of_maximum)
-    materials = _read_beside(files, layout.materials, name, (height, width), decode_materials)
     if name in layout.ground_truth:
         path = layout.ground_truth[name]
         ground_truth = read_ground_truth(path, files.read(path), size=(height, width), factor=factor)
@@ -359,13 +368,13 @@ def read_view(
         layout.exposures(name),
         factor=factor,
         transfer=transfer,
-        invalid=invalid,
-        mask=mask,
-        materials=materials,
+        **beside,
         ground_truth=ground_truth,
         digests=files.digests,
     )
-    return data if points is None else replace(data, samples=points.samples(name, raw, invalid, transfer))
+    if points is None:
+        return data
+    return replace(data, samples=points.samples(name, raw, beside["invalid"], transfer))
 
 
 def require_factor(factor: int, height: int, width: int) -> None:
@@ -470,17 +479,12 @@ def require_size(path: Path, data: bytes, size: Sequence[int], *, like: Path | N
         PolarguideError: the header states another size.
     """
     stated = declared_size(data)
-    if stated is not None:
-        _require_same(path, stated, size, like)
-
-
-def _require_same(path: Path, found: tuple[int, int], size: Sequence[int], like: Path | None = None) -> None:
-    if found != (size[1], size[0]):
+    if stated is not None and stated != (size[1], size[0]):
         alike = "the size of the pictures" if like is None else f"the size of {'/'.join(like.parts[-2:])}"
         raise PolarguideError(
             path,
             expected=f"{alike}, {size[1]}x{size[0]}",
-            found=f"{found[0]}x{found[1]}",
+            found=f"{stated[0]}x{stated[1]}",
             remedy="Make it anew for these pictures."
             if like is None
             else "Export all pictures of a view with the same settings.",
@@ -518,9 +522,7 @@ def _read_beside(
     path = folder[name]
     data = files.picture(path)
     require_size(path, data, size)
-    pixels = decode(path, data)
-    _require_same(path, (pixels.shape[1], pixels.shape[0]), size)  # of a format whose header says nothing
-    return pixels
+    return decode(path, data)
 
 
 @dataclass(frozen=True, eq=False)

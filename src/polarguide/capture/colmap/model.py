@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import math
+import re
 import shutil
 import struct
 import tempfile
@@ -69,36 +70,30 @@ def colmap_camera(camera: PosedCamera, **more: Any) -> pycolmap.Camera:
     return pycolmap.Camera(model=camera.model, params=list(camera.parameters), **size, **more)
 
 
-def write_cameras(
-    folder: Path, cameras: Mapping[str, PosedCamera], numbers: Mapping[str, tuple[int, int]] | None = None
-) -> None:
-    """Write a binary COLMAP model with one image ``<view>.png`` a view and no points.
+def posed_model(
+    cameras: Mapping[str, PosedCamera], numbers: Mapping[str, tuple[int, int]] | None = None
+) -> pycolmap.Reconstruction:
+    """A COLMAP model with one image ``<view>.png`` a view and no points.
 
     Views that share their intrinsics share a camera.
 
     Args:
-        folder: exists.
-        cameras: by view name; may not be empty.
+        cameras: by view name.
         numbers: numbers of each view's image and camera; counted from 1 if None.
     """
+    model = pycolmap.Reconstruction()
     number_of: dict[tuple[object, ...], int] = {}
-    used: dict[int, tuple[Any, ...]] = {}
-    images = []
     for number, (view, camera) in enumerate(sorted(cameras.items()), 1):
         of_camera = number_of.setdefault(camera.intrinsics, len(number_of) + 1)
         if numbers is not None:
             number, of_camera = numbers[view]
-        used[of_camera] = camera.intrinsics
-        pose = (*quaternion(camera.rotation), *camera.translation)
-        name = f"{view}.png".encode() + b"\0"
-        images.append(struct.pack("<I7dI", number, *pose, of_camera) + name + struct.pack("<Q", 0))
-    intrinsics = []
-    for number, (model, width, height, *parameters) in used.items():
-        head = struct.pack("<IiQQ", number, MODELS[str(model)][0], width, height)
-        intrinsics.append(head + struct.pack(f"<{len(parameters)}d", *parameters))
-    (folder / "cameras.bin").write_bytes(struct.pack("<Q", len(intrinsics)) + b"".join(intrinsics))
-    (folder / "images.bin").write_bytes(struct.pack("<Q", len(images)) + b"".join(images))
-    (folder / "points3D.bin").write_bytes(struct.pack("<Q", 0))
+        if not model.exists_camera(of_camera):
+            model.add_camera_with_trivial_rig(colmap_camera(camera, camera_id=of_camera))
+        w, *axis = quaternion(camera.rotation)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([*axis, w])), camera.translation)
+        image = pycolmap.Image(name=f"{view}.png", camera_id=of_camera, image_id=number)
+        model.add_image_with_trivial_frame(image, pose)
+    return model
 
 
 _PARAMETERS = dict(MODELS.values())
@@ -238,27 +233,18 @@ def _at_most(count: int, most: int) -> int:
     return count
 
 
+_NUMBER = re.compile(rb"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|nan|inf)", re.IGNORECASE)
 _POSE = 9  # number, quaternion, translation, camera: what stands before the name
 _PLACE = 3  # x, y and the number of a point; pycolmap checks all of them, lines of images show in the first
 
 
-@dataclass(frozen=True)
-class TextImages:
-    """A text model that pycolmap can read in place of an ``images.txt``.
-
-    Attributes:
-        data: the same file with names that have no blanks.
-        names: number of an image -> its name.
-    """
-
-    data: bytes
-    names: dict[int, str]
-
-
-def read_text_images(data: bytes) -> TextImages:
-    """Take the names out of an ``images.txt``.
+def read_text_images(data: bytes) -> tuple[bytes, dict[int, str]]:
+    """Take the names out of an ``images.txt``, for pycolmap, which cuts them at blanks.
 
     An image with one line, as some programs write it, would make pycolmap pass over every other image.
+
+    Returns:
+        The same file with numbers for names, and the name of each image by its number.
 
     Raises:
         ValueError: lines are not those of images and their observations in turn, or a name is not in UTF-8.
@@ -269,7 +255,7 @@ def read_text_images(data: bytes) -> TextImages:
     for count, line in enumerate(data.splitlines(), 1):
         cells = line.split()
         if number is not None:
-            if len(cells) % _PLACE or not all(map(_is_number, cells[: _POSE + _PLACE])):
+            if len(cells) % _PLACE or not all(map(_NUMBER.fullmatch, cells[: _POSE + _PLACE])):
                 raise ValueError(f"line {count} does not hold the observations of image {number}")
             number = None
             out.append(line)
@@ -277,7 +263,7 @@ def read_text_images(data: bytes) -> TextImages:
             out.append(line)
         else:
             head = line.split(None, _POSE)
-            if len(head) <= _POSE or not (head[0].isdigit() and all(map(_is_number, head[:_POSE]))):
+            if len(head) <= _POSE or not (head[0].isdigit() and all(map(_NUMBER.fullmatch, head[:_POSE]))):
                 raise ValueError(f"line {count} does not hold an image")
             number = int(head[0])
             if number in names:
@@ -287,15 +273,7 @@ def read_text_images(data: bytes) -> TextImages:
             except UnicodeDecodeError:
                 raise ValueError(f"line {count} has a name that is not in UTF-8") from None
             out.append(b" ".join([*head[:_POSE], b"%d" % number]))
-    return TextImages(b"\n".join(out) + b"\n\n", names)
-
-
-def _is_number(cell: bytes) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
+    return b"\n".join(out) + b"\n\n", names
 
 
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
@@ -471,8 +449,6 @@ def load_model(folder: Path, kind: str) -> Any:
     Raises:
         PolarguideError: pycolmap cannot read the model.
     """
-    import pycolmap  # here, because importing it is slow
-
     model = pycolmap.Reconstruction()
     check_model_files(folder, kind)
     try:
@@ -480,11 +456,11 @@ def load_model(folder: Path, kind: str) -> Any:
             with _whole(folder, kind) as whole:
                 model.read_binary(str(whole))
         else:
-            images = read_text_images(read_file(folder / "images.txt"))
-            with _whole(folder, kind, images.data) as whole:
+            images, names = read_text_images(read_file(folder / "images.txt"))
+            with _whole(folder, kind, images) as whole:
                 model.read_text(str(whole))
             for number, image in model.images.items():
-                image.name = images.names[number]
+                image.name = names[number]
     except PolarguideError:
         raise
     except Exception as error:  # pycolmap raises whatever C++ threw: ValueError, IndexError, MemoryError, ...

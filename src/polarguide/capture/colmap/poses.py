@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import functools
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,7 @@ from polarguide.capture.colmap.model import (
     load_model,
     other_text_model,
     posed_images,
-    write_cameras,
+    posed_model,
 )
 from polarguide.capture.filter.develop import remapped_mask
 from polarguide.capture.view import listed
@@ -236,9 +235,7 @@ class Poses:
         cls, cameras: Mapping[str, PosedCamera], where: Path, views: list[str], files: Sequence[Path] = ()
     ) -> Poses:
         """A model without points from cameras by view name; ``where`` names their origin in messages."""
-        with tempfile.TemporaryDirectory() as made:
-            write_cameras(Path(made), cameras)
-            return cls(load_model(Path(made), ".bin"), where, views, files)
+        return cls(posed_model(cameras), where, views, files)
 
     def others(self) -> list[tuple[Path, int]]:
         """Models beside this one (``sparse/1`` beside ``sparse/0``), and how many of the views each has poses of."""
@@ -312,19 +309,17 @@ class Poses:
         model = copy.deepcopy(self._model)
         for image in model.images.values():
             if image.camera_id in self._of_camera and len(image.points2D):
-                self._move_points(image, model.cameras[image.camera_id], self._of_camera[image.camera_id])
+                places = np.array([point.xy for point in image.points2D])
+                rays = np.nan_to_num(model.cameras[image.camera_id].cam_from_img(places))
+                target = self._of_camera[image.camera_id].target
+                moved = target.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+                for point, place in zip(image.points2D, moved, strict=True):
+                    point.xy = place
         for number, warp in self._of_camera.items():
             camera = model.cameras[number]
             for name in ("model", "width", "height", "params"):
                 setattr(camera, name, getattr(warp.target, name))
         model.write_binary(str(folder))
-
-    def _move_points(self, image: Any, before: Any, warp: Undistortion) -> None:
-        """Undistort the observations of an image."""
-        rays = np.nan_to_num(before.cam_from_img(np.array([point.xy for point in image.points2D])))
-        moved = warp.target.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
-        for point, place in zip(image.points2D, moved, strict=True):
-            point.xy = place
 
     def _require_numbers(self, view: str) -> None:
         image = self._images[view]

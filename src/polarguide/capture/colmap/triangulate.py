@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.model import PosedCamera, colmap_camera, load_model, write_cameras
+from polarguide.capture.colmap.model import PosedCamera, colmap_camera, load_model, posed_model
 from polarguide.capture.colmap.sfm import match_features, run_step
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_picture
 from polarguide.core.errors import PolarguideError, require
@@ -159,7 +159,7 @@ def add_points(
         shutil.rmtree(path, ignore_errors=True)
         make_folder(path)
     with writing(start):
-        write_cameras(start, cameras)
+        posed_model(cameras).write_binary(str(start))
     count, error = _triangulated(folder, start, trial, cameras, matching, seed, reporter)
     record: dict[str, Any] = {"from": "triangulation with fixed poses", "count": count}
     if error is not None:
@@ -195,7 +195,7 @@ def _triangulated(
             database, images, sizes, matching=matching, seed=seed, reporter=reporter, cameras=cameras
         )
         with writing(start):
-            write_cameras(start, cameras, numbers)
+            posed_model(cameras, numbers).write_binary(str(start))
         arguments = {"database": database, "images": images, "start": start, "out": trial}
         words = {name: str(path) for name, path in arguments.items()}
         run_step("triangulate", words, seed, reporter, "triangulating")
