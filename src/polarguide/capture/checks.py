@@ -22,7 +22,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.view import FULL_CODE, listed
+from polarguide.capture.view import FULL_CODE
+from polarguide.core.text import listed
 from polarguide.geometry.polarizer import ANGLES
 
 TOP_SHARE = 0.02

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from polarguide.capture.exposures import FOUR, TABLE, Exposure, Line, read_table
 from polarguide.capture.formats.pictures import SUFFIXES, stated_size
-from polarguide.capture.view import ANGLES, listed, unknown_view
-from polarguide.core.errors import PolarguideError, require
+from polarguide.capture.view import ANGLES
+from polarguide.core.errors import PolarguideError, require, unknown_view
 from polarguide.core.files import require_folder
 from polarguide.core.system import free_memory
-from polarguide.core.text import canonical, stem_of
+from polarguide.core.text import canonical, listed, stem_of
 
 _PICTURE_STEM = re.compile(r"(?P<view>.+)_(?P<angle>000|045|090|135)")
 _ANGLE_FOLDER = re.compile(r"(?:(?:i|pol|angle)[-_ ]?|[_ ])?(?P<angle>\d{1,3})(?:deg)?", re.IGNORECASE)

@@ -9,8 +9,7 @@ import msgspec
 
 from polarguide.capture.calibration import Calibration, Sense, combined
 from polarguide.capture.formats.pictures import MOST_MATERIAL
-from polarguide.capture.view import unknown_view
-from polarguide.core.errors import require
+from polarguide.core.errors import require, unknown_view
 from polarguide.core.records import decode
 from polarguide.core.text import canonical
 from polarguide.geometry.polarizer import ANGLES

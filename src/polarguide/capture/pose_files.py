@@ -27,11 +27,10 @@ from polarguide.capture.datasets.dataset import (
     require_known_names,
 )
 from polarguide.capture.formats.arrays import finite_numbers, require_camera, wrong_camera
-from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError, PolarguideWarning, require
 from polarguide.core.files import read_file
 from polarguide.core.records import LARGEST_RECORD, decode, parse
-from polarguide.core.text import number_or_nan
+from polarguide.core.text import listed, number_or_nan
 
 Size = tuple[int, int]
 Sizes = Callable[[str], tuple[Size, ...]]

@@ -23,7 +23,7 @@ from polarguide.capture.ground_truth import GroundTruth, SceneObject, objects_of
 from polarguide.capture.layout import Layout, check_memory, find_layout, select_views, stated_size
 from polarguide.capture.metadata import held_out, indices_of, keeps_gains, mount_of, refractive_index_of
 from polarguide.capture.point_exposures import ComparedPoints
-from polarguide.capture.view import ANGLES, EVEN, View, figure, listed, table, unknown_view
+from polarguide.capture.view import ANGLES, EVEN, View, figure, table
 from polarguide.capture.view_reader import (
     Array,
     Files,
@@ -41,10 +41,10 @@ from polarguide.capture.view_reader import (
     stored_pictures,
     view_data,
 )
-from polarguide.core.errors import require
+from polarguide.core.errors import require, unknown_view
 from polarguide.core.options import Split, check_choice, check_count
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.core.text import canonical
+from polarguide.core.text import canonical, listed
 from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import difflib
 import html
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -26,6 +25,7 @@ from polarguide.capture.exposures import (
 )
 from polarguide.capture.ground_truth import GroundTruth
 from polarguide.core.errors import PolarguideError
+from polarguide.core.text import listed as listed
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.polarizer import ANGLES as ANGLES
 from polarguide.optics import Mount
@@ -290,20 +290,3 @@ class View:
             found=f"{len(self.exposures)} ({angles})",
             remedy="Choose views with more pictures.",
         )
-
-
-def unknown_view(where: object, name: str, names: list[str]) -> PolarguideError:
-    """The error that ``name`` is not among the view names, with those nearest to it."""
-    near = difflib.get_close_matches(name, names, n=3, cutoff=0.4) or names[:3]
-    return PolarguideError(
-        where,
-        expected=f"the name of one of the {len(names)} views",
-        found=repr(name),
-        remedy=f"The nearest names are: {', '.join(near)}.",
-    )
-
-
-def listed(names: list[str], limit: int = 4) -> str:
-    """The first few names and the number of further ones, for messages."""
-    rest = len(names) - limit
-    return ", ".join(names[:limit]) + (f" and {rest} more" if rest > 0 else "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import importlib.util
 import os
@@ -10,6 +11,7 @@ import shlex
 import shutil
 import signal
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,6 +49,17 @@ def require(condition: object, where: object, *, expected: str, found: str, reme
     """
     if not condition:
         raise PolarguideError(where, expected=expected, found=found, remedy=remedy)
+
+
+def unknown_view(where: object, name: str, names: Sequence[str]) -> PolarguideError:
+    """The error that ``name`` is not among the view names, with those nearest to it."""
+    near = difflib.get_close_matches(name, names, n=3, cutoff=0.4) or names[:3]
+    return PolarguideError(
+        where,
+        expected=f"the name of one of the {len(names)} views",
+        found=repr(name),
+        remedy=f"The nearest names are: {', '.join(near)}.",
+    )
 
 
 class PolarguideWarning(UserWarning):

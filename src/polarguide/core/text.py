@@ -9,7 +9,7 @@ import math
 import re
 import shlex
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import PurePath
 
 _MOST_DIGITS = 10  # Python itself refuses thousands of them
@@ -59,6 +59,12 @@ def decimals(text: str) -> tuple[float, ...]:
         return tuple(decimal(part) for part in text.split(","))
     except ValueError:
         return ()
+
+
+def listed(names: Sequence[str], limit: int = 4) -> str:
+    """The first few names and the number of further ones, for messages."""
+    rest = len(names) - limit
+    return ", ".join(names[:limit]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def command(*words: object) -> str:

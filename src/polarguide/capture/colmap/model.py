@@ -20,10 +20,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import read_file
-from polarguide.core.text import canonical, decimal_comma
+from polarguide.core.text import canonical, decimal_comma, listed
 from polarguide.geometry.camera import FARTHEST, LENS, Camera, can_be_lens, quaternion
 
 MODELS = {

@@ -27,8 +27,8 @@ from polarguide.capture.colmap.model import (
     posed_model,
 )
 from polarguide.capture.filter.develop import remapped_mask
-from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError, require
+from polarguide.core.text import listed
 from polarguide.geometry.camera import FARTHEST, LENS
 
 

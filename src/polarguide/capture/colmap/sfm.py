@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from polarguide.capture.colmap import steps
 from polarguide.capture.colmap.model import PosedCamera, colmap_camera, load_model
 from polarguide.capture.filter.camera_files import Lens
-from polarguide.capture.view import listed
 from polarguide.capture.write import write_png
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder, writing
 from polarguide.core.progress import Reporter
+from polarguide.core.text import listed
 from polarguide.optics.color import srgb_encode_array
 
 _POLL_SECONDS = 0.5

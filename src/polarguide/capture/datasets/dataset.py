@@ -25,8 +25,8 @@ from polarguide.capture.formats.arrays import (
 )
 from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, decode_stored, read_picture
 from polarguide.capture.layout import index_files
-from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError, PolarguideWarning, require
+from polarguide.core.text import listed
 
 StokesImage = tuple[NDArray[np.float32], NDArray[np.bool_]]
 """Stokes vectors of a view [3, H, W, 3] in the dataset's own sense of angles; pixels at full scale in its pictures."""

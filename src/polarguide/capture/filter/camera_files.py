@@ -33,9 +33,9 @@ from polarguide.capture.formats.headers import (
     png_chunk,
 )
 from polarguide.capture.formats.pictures import read_picture
-from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import read_file
+from polarguide.core.text import listed
 
 CAMERA_RAW = (".dng", ".nef", ".nrw", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 """Suffixes that are read as camera raw."""

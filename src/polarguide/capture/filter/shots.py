@@ -36,10 +36,10 @@ from polarguide.capture.layout import (
 )
 from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
-from polarguide.capture.view import ANGLES, listed
+from polarguide.capture.view import ANGLES
 from polarguide.capture.view_reader import require_alike
 from polarguide.core.errors import PolarguideError
-from polarguide.core.text import canonical, stem_of
+from polarguide.core.text import canonical, listed, stem_of
 
 SHOT_SUFFIXES = (*SUFFIXES, *CAMERA_RAW)
 Candidates = dict[str, dict[int, list[Path]]]
