@@ -20,7 +20,7 @@ from msgspec import UNSET
 from numpy.typing import NDArray
 
 from polarguide.capture import Scene, View
-from polarguide.capture.ground_truth import METAL_CLASSES
+from polarguide.capture.metadata import METAL_CLASSES
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import write_text
 from polarguide.core.progress import Reporter

@@ -17,7 +17,7 @@ from tiny_capture import HEIGHT, WIDTH, TinyCapture, encode_srgb
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import load_scene
 from polarguide.capture.exposures import Exposure
-from polarguide.capture.ground_truth import Material
+from polarguide.capture.metadata import Material
 from polarguide.capture.variants import SmallerViews, smaller
 
 

@@ -18,7 +18,7 @@ from polarguide.capture.datasets.readers import open_dataset
 from polarguide.capture.formats.arrays import decode_arrays, read_array, read_arrays, read_radiance
 from polarguide.capture.formats.headers import declared_size, find_damage
 from polarguide.capture.formats.pictures import decode_stored
-from polarguide.capture.ground_truth import objects_of
+from polarguide.capture.metadata import objects_of
 from polarguide.capture.pose_files import read_pose_file
 
 HUGE, SMALL = 30_000, (24, 20)

@@ -9,7 +9,7 @@ from random_runs import ring
 from torch import Tensor
 
 from polarguide.capture import GroundTruth, Scene, View
-from polarguide.capture.ground_truth import Material, SceneObject
+from polarguide.capture.metadata import Material, SceneObject
 from polarguide.geometry.camera import Camera
 
 HEIGHT, WIDTH = 20, 26

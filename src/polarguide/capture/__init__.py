@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from polarguide.capture.colmap.model import ColmapModel, read_model
-    from polarguide.capture.ground_truth import GroundTruth
+    from polarguide.capture.metadata import GroundTruth
     from polarguide.capture.scene import Scene, load_scene
     from polarguide.capture.view import View
 
 # Where each name is defined. It is loaded when it is asked for: a calibration can be read without torch.
 _MODULES = {
     "ColmapModel": "colmap.model",
-    "GroundTruth": "ground_truth",
+    "GroundTruth": "metadata",
     "Scene": "scene",
     "View": "view",
     "load_scene": "scene",

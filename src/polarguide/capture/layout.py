@@ -166,21 +166,18 @@ def _require_complete(layout: Layout, names: list[str]) -> None:
     have = layout.pictures[name]
     missing = next(angle for angle in ANGLES if angle not in have)
     others = f" ({len(incomplete)} views are incomplete)" if len(incomplete) > 1 else ""
+    path = next(iter(have.values()))
+    if path.parent == layout.root / "polar":
+        path = path.with_name(f"{path.stem[:-3]}{missing:03d}{path.suffix}")
+    else:
+        folders = {at: file.parent for files in layout.pictures.values() for at, file in files.items()}
+        path = folders.get(missing, path.parent) / path.name
     raise PolarguideError(
-        _sibling(layout, have, missing),
+        path,
         expected=f"the picture of view {name} at {missing} degrees",
         found=f"only {', '.join(str(angle) for angle in sorted(have))} degrees{others}",
         remedy="Add the file, remove the other pictures of the view, or list what there is in angles.csv.",
     )
-
-
-def _sibling(layout: Layout, have: dict[int, Path], angle: int) -> Path:
-    """The expected path of the picture at ``angle``, given another angle of the view."""
-    path = next(iter(have.values()))
-    if path.parent == layout.root / "polar":
-        return path.with_name(f"{path.stem[:-3]}{angle:03d}{path.suffix}")
-    folders = {at: file.parent for files in layout.pictures.values() for at, file in files.items()}
-    return folders.get(angle, path.parent) / path.name
 
 
 def _read_flat(
@@ -404,15 +401,12 @@ def require_memory(where: Path, needed: int, what: str, *, remedy: str, limit: f
 
 
 def stated_pixels(layout: Layout, names: Sequence[str]) -> list[int]:
-    """Pixels of the pictures of each view, as their headers state; 0 where they do not."""
-    return [_largest(layout, name) for name in names]
-
-
-def _largest(layout: Layout, name: str) -> int:
-    """Pixels of the largest picture of a view, as the files state, with as much more for more than four pictures as
+    """Pixels of the largest picture of each view, as the files state, with as much more for more than four pictures as
     these take; 0 where the files state nothing.
     """
-    paths = layout.files(name)
-    sizes = [stated_size(path) for path in paths]
-    largest = max((size[0] * size[1] for size in sizes if size is not None), default=0)
-    return max(largest, largest * len(paths) // 4)
+    counts = []
+    for name in names:
+        paths = layout.files(name)
+        largest = max((math.prod(stated_size(path) or (0, 0)) for path in paths), default=0)
+        counts.append(max(largest, largest * len(paths) // 4))
+    return counts

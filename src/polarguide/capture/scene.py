@@ -19,9 +19,17 @@ from polarguide.capture import checks
 from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unseen_points, unused_poses
 from polarguide.capture.exposures import FOUR, Angle
 from polarguide.capture.formats.pictures import TRANSFERS
-from polarguide.capture.ground_truth import GroundTruth, SceneObject, objects_of
 from polarguide.capture.layout import Layout, check_memory, find_layout, select_views, stated_size
-from polarguide.capture.metadata import held_out, indices_of, keeps_gains, mount_of, refractive_index_of
+from polarguide.capture.metadata import (
+    GroundTruth,
+    SceneObject,
+    held_out,
+    indices_of,
+    keeps_gains,
+    mount_of,
+    objects_of,
+    refractive_index_of,
+)
 from polarguide.capture.point_exposures import ComparedPoints
 from polarguide.capture.view import ANGLES, EVEN, View, figure, table
 from polarguide.capture.view_reader import (

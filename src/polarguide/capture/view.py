@@ -23,7 +23,8 @@ from polarguide.capture.exposures import (
     measure_radiance,
     radiance_places,
 )
-from polarguide.capture.ground_truth import GroundTruth
+from polarguide.capture.formats.pictures import FULL_CODE as FULL_CODE
+from polarguide.capture.metadata import GroundTruth
 from polarguide.core.errors import PolarguideError
 from polarguide.core.text import listed as listed
 from polarguide.geometry.camera import Camera
@@ -104,8 +105,6 @@ class Loader(Generic[T]):
         return Loader(lambda: change(self()), self._latest, derived=True)
 
 
-FULL_CODE = 65535
-"""The code of linear intensity 1."""
 EVEN = (1.0, 1.0, 1.0)
 """Gains of a view that is exposed like the others."""
 

@@ -27,8 +27,8 @@ from polarguide.capture.formats.pictures import (
     linear_codes,
     read_picture,
 )
-from polarguide.capture.ground_truth import GroundTruth, read_ground_truth
 from polarguide.capture.layout import Layout
+from polarguide.capture.metadata import GroundTruth, read_ground_truth
 from polarguide.capture.point_exposures import ComparedPoints, PointExposures, PointSamples
 from polarguide.capture.view import EVEN, FULL_CODE, Latest, Loader, View
 from polarguide.core.errors import PolarguideError, require
@@ -557,7 +557,15 @@ class StoredViews:
         Raises:
             PolarguideError: the views differ in bit depth.
         """
-        largest_value = _largest_value(data)
+        first = {item.peak.dtype.itemsize: item.name for item in reversed(data)}
+        if len(first) > 1:
+            raise PolarguideError(
+                "pictures",
+                expected="the same bit depth in all views",
+                found=f"8 bits in view {first[1]} and 16 bits in view {first[2]}",
+                remedy="Save all pictures with the same bit depth.",
+            )
+        largest_value = int(np.iinfo(data[0].peak.dtype).max)
         scale = checks.full_scale(np.sum([item.histogram for item in data], axis=0), largest_value)
         measures = [
             checks.measure(item.codes, ~(item.invalid | item.saturated(scale)), four=item.exposures == FOUR)
@@ -575,16 +583,3 @@ class StoredViews:
         largest = max(int(item.peak.max()) for item in self.data)
         warnings = checks.exposure_warnings(names, self.measures, blown, largest, self.largest_value)
         return warnings + checks.polarization_warnings(names, self.measures, transfer)
-
-
-def _largest_value(data: Sequence[ViewData]) -> int:
-    """The largest value of the views' common type, 255 or 65535."""
-    first = {item.peak.dtype.itemsize: item.name for item in reversed(data)}
-    if len(first) > 1:
-        raise PolarguideError(
-            "pictures",
-            expected="the same bit depth in all views",
-            found=f"8 bits in view {first[1]} and 16 bits in view {first[2]}",
-            remedy="Save all pictures with the same bit depth.",
-        )
-    return int(np.iinfo(data[0].peak.dtype).max)

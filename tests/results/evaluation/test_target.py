@@ -8,7 +8,7 @@ import pytest
 import torch
 from known_scene import HEIGHT, NAMES, WIDTH, known_scene, rendered
 
-from polarguide.capture.ground_truth import Material, SceneObject
+from polarguide.capture.metadata import Material, SceneObject
 from polarguide.results.evaluation.scores import ErrorsByObject, score_view
 from polarguide.results.evaluation.target import SceneFacts, ViewTarget
 

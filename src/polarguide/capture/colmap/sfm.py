@@ -346,9 +346,10 @@ def reconstruct(
     images = folder / "images"
     trial = folder / "models"
     if lenses:
-        reporter.say(
-            _several_lenses(lenses, "each has its own" if intrinsics is None else "all are as given")
-        )
+        counts = Counter(lenses.values())
+        words = listed([f"{lens.camera} {lens.focal or ''}: {count} views" for lens, count in counts.items()])
+        given = "each has its own" if intrinsics is None else "all are as given"
+        reporter.say(f"EXIF states {len(counts)} cameras or focal lengths ({words}); intrinsics: {given}.")
     cameras = None
     if intrinsics is not None:
         still = np.eye(3), np.zeros(3)
@@ -390,13 +391,6 @@ def reconstruct(
     if registered < _FEW_SHARE * len(sizes):
         reporter.warn(f"Only {share}. {ADVICE} {untried}")
     return model
-
-
-def _several_lenses(lenses: Mapping[str, Lens], intrinsics: str) -> str:
-    """That the pictures are of several lenses, for the user."""
-    counts = Counter(lenses.values())
-    words = [f"{lens.camera} {lens.focal or ''}: {count} views" for lens, count in counts.items()]
-    return f"EXIF states {len(counts)} cameras or focal lengths ({listed(words)}); intrinsics: {intrinsics}."
 
 
 def _registered(models: Sequence[Any]) -> int:

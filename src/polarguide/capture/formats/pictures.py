@@ -32,7 +32,6 @@ from polarguide.capture.formats.headers import (
     tiff_full_scale,
     tiff_size,
 )
-from polarguide.capture.view import FULL_CODE
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import LARGEST_FILE, read_file
 from polarguide.optics.color import srgb_decode_array
@@ -43,6 +42,8 @@ TRANSFERS = ("linear", "srgb")
 # Bytes of a pixel: four channels of 16 bits, and as much for what a decoder works on.
 _DECODED = 16
 
+FULL_CODE = 65535
+"""The code of linear intensity 1."""
 MOST_MATERIAL = 255
 MATERIAL_REMEDY = (
     "Write the numbers 0 (unknown), 1 (dielectric) and 2 (metal) themselves, not levels of gray, and others only as "

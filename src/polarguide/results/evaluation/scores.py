@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from polarguide.capture.ground_truth import SceneObject
+from polarguide.capture.metadata import SceneObject
 from polarguide.optics.color import shown
 from polarguide.results.evaluation.metrics import LEAST_POLARIZED, Selection, decibels, normal_angles_deg
 from polarguide.results.evaluation.perceptual import flip, lpips

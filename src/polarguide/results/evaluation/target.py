@@ -14,7 +14,7 @@ from scipy.spatial.distance import pdist
 from torch import Tensor
 
 from polarguide.capture import Scene, View
-from polarguide.capture.ground_truth import METAL_CLASSES, SceneObject
+from polarguide.capture.metadata import METAL_CLASSES, SceneObject
 from polarguide.capture.variants import black_pixels
 from polarguide.capture.view import listed
 from polarguide.results.evaluation.metrics import Selection, has_direction, reflective_mask, window_centers
