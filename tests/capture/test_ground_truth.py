@@ -79,7 +79,7 @@ def test_a_single_array_and_pickled_objects_are_refused(capture: TinyCapture) ->
     Fault("gt/v000.npz", found="a damaged one").raised_by(load_scene, capture.root)
     with path.open("wb") as file:
         np.save(file, np.zeros((HEIGHT, WIDTH)))
-    Fault("gt/v000.npz", found="a damaged one").raised_by(load_scene, capture.root)
+    Fault("gt/v000.npz", found="one that cannot be unpacked").raised_by(load_scene, capture.root)
 
 
 CUP = {

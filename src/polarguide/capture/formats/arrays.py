@@ -109,7 +109,8 @@ def decode_arrays(
                 name: _array(_member(archive, members[name]), kinds) for name in members if name in chosen
             }
     except BROKEN as error:
-        found = f"a damaged one ({error})" if data else "an empty file"
+        damage = "one that cannot be unpacked" if isinstance(error, zipfile.BadZipFile) else "a damaged one"
+        found = f"{damage} ({error})" if data else "an empty file"
         raise PolarguideError(path, expected=expected, found=found, remedy=remedy) from error
 
 
