@@ -23,7 +23,8 @@ from polarguide.core.progress import Advance
 from polarguide.results.evaluation.record import validate_metrics
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, PLY
 from polarguide.shading.result import LAYERS, POLARIZED
-from polarguide.training.trainer import StepReport, Trainer
+from polarguide.training.loop import TrainingLoop
+from polarguide.training.settings import StepReport
 
 EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"))
 ONE_THREAD = SessionOptions(threads=1)
@@ -170,23 +171,23 @@ def test_a_keyboard_interrupt_saves_a_whole_state_and_goes_on_to_the_same_bits(
         )
 
     def interrupted_in(name: str, at: int) -> None:
-        inner = getattr(Trainer, name)
+        inner = getattr(TrainingLoop, name)
 
-        def stopped(self: Trainer, *arguments: object, **more: object) -> object:
+        def stopped(self: TrainingLoop, *arguments: object, **more: object) -> object:
             if self.state.step == at:
                 raise KeyboardInterrupt
             return inner(self, *arguments, **more)
 
         resume = (tmp_path / "run" / CONFIGURATION).exists()
         with monkeypatch.context() as patch:
-            patch.setattr(Trainer, name, stopped)
+            patch.setattr(TrainingLoop, name, stopped)
             with pytest.raises(KeyboardInterrupt):
                 train(resume=resume)
 
-    interrupted_in("_backpropagate", 17)
+    interrupted_in("backpropagate", 17)
     assert int(load_file(tmp_path / "run" / CHECKPOINT)["scalars"][0]) == 17
     assert not (tmp_path / "run" / PLY).exists()
-    interrupted_in("_optimize", 25)
+    interrupted_in("update_parameters", 25)
     assert int(load_file(tmp_path / "run" / CHECKPOINT)["scalars"][0]) == 20
     train(resume=True)
     whole = load_file(trained / CHECKPOINT)
@@ -195,8 +196,8 @@ def test_a_keyboard_interrupt_saves_a_whole_state_and_goes_on_to_the_same_bits(
 
 def test_stopping_when_asked(demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done: list[StepReport] = []
-    inner = Trainer.step
-    monkeypatch.setattr(Trainer, "step", lambda self: done.append(report := inner(self)) or report)
+    inner = TrainingLoop.step
+    monkeypatch.setattr(TrainingLoop, "step", lambda self: done.append(report := inner(self)) or report)
     with pytest.raises(KeyboardInterrupt, match="stopped after step 4"):
         polarguide.train(
             demo_scene,

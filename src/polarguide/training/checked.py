@@ -59,7 +59,7 @@ def refuse_foreign(tensors: Mapping[str, Tensor], recipe: Recipe) -> None:
         if float(values.min()) < 0 or float(values.max()) > LARGEST["means"]:
             raise ValueError(f"footprints from {float(values.min()):g} to {float(values.max()):g}")
         names.add("footprints")
-    strangers = sorted(tensors.keys() - names)
+    strangers = sorted(name for name in tensors.keys() - names if not name.startswith("callback."))
     if strangers:
         raise ValueError(f"{strangers[0][:80]}, which is not known")
 
