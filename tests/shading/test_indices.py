@@ -130,7 +130,7 @@ def test_colors_attributes_and_the_page() -> None:
 def trainer(tiny_scene: Scene) -> TrainingLoop:
     recipe = recipe_named("polarguide-stokes")
     made = make_trainer(tiny_scene, recipe, 60, seed=0)
-    made.run(lambda _: None, until=30)
+    made.run(30)
     return made
 
 

@@ -12,7 +12,7 @@ from trainings import different, make_trainer, run, trained
 from polarguide.capture import Scene
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
-from polarguide.training import feed
+from polarguide.training import storage
 from polarguide.training.feed import (
     Feed,
     coarse_steps,
@@ -105,7 +105,7 @@ def test_a_disk_without_room_is_said_once_and_costs_only_time(
     def full(**_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(feed.tempfile, "TemporaryFile", full)
+    monkeypatch.setattr(storage.tempfile, "TemporaryFile", full)
     said: list[str] = []
     store = ViewStore(0, tmp_path, said.append)
     for seed in (0, 1, 0):

@@ -367,6 +367,7 @@ def test_what_the_prior_alone_decides_is_undecided(
     labels = torch.zeros(len(first), 2)
     labels[:, 0] = 1.0
     values["labels"] = labels
+    undecided = MetalSearch(trainer.current).undecided(trainer.state)
     report_metals(tmp_path, tiny_scene, undecided, model, heard)
     assert not (tmp_path / METALS_PICTURE).exists()
 
