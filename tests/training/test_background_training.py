@@ -40,7 +40,7 @@ def test_the_mode_is_found_from_the_pictures_unless_it_is_given(
     for scene, found in ((tiny_scene, False), (black_scene, True)):
         for background, black in (("auto", found), ("scene", False), ("black", True), ("masked", True)):
             made = trainer(scene, background)
-            assert made.black == black
+            assert made.context.black == black
             if background == "auto":
                 assert made.settings.background == ("black" if found else "scene")
 

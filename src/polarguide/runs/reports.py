@@ -67,23 +67,31 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
         if 2 * doubtful > len(sought):
             reporter.warn(f"Most angles are doubtful, and so are the layers and normals. {REMEDY}")
     vague = [judgment for judgment in sought if judgment.vague]
-    if guessed := [judgment for judgment in vague if judgment.guesses]:
-        reporter.warn(f"{named(guessed)} hardly determine their angle; the most likely one is used.")
-    if lost := [judgment for judgment in vague if not judgment.guesses]:
-        reporter.warn(f"{named(lost)} do not determine their angle and are used as photographs.")
-    if unsettled := [judgment for judgment in sought if judgment.unsettled]:
-        reporter.warn(
-            f"{named(unsettled)} may be at another angle: the fits of the training do not agree on it."
-        )
-    if poor := [judgment for judgment in sought if judgment.poorly_explained and not judgment.unsettled]:
-        reporter.warn(
-            f"{named(poor)} may be at another angle: the scene explains them worse than the others, and hardly better "
-            "than a filter turned by 90 degrees would."
-        )
-    if plain := [judgment for judgment in judgments if judgment.unfiltered]:
-        reporter.warn(
-            f"{named(plain)} look as if taken without a filter, or through a circular one mounted the wrong way round."
-        )
+    for chosen, fault in (
+        (
+            [judgment for judgment in vague if judgment.guesses],
+            "hardly determine their angle; the most likely one is used.",
+        ),
+        (
+            [judgment for judgment in vague if not judgment.guesses],
+            "do not determine their angle and are used as photographs.",
+        ),
+        (
+            [judgment for judgment in sought if judgment.unsettled],
+            "may be at another angle: the fits of the training do not agree on it.",
+        ),
+        (
+            [judgment for judgment in sought if judgment.poorly_explained and not judgment.unsettled],
+            "may be at another angle: the scene explains them worse than the others, and hardly better than a filter "
+            "turned by 90 degrees would.",
+        ),
+        (
+            [judgment for judgment in judgments if judgment.unfiltered],
+            "look as if taken without a filter, or through a circular one mounted the wrong way round.",
+        ),
+    ):
+        if chosen:
+            reporter.warn(f"{named(chosen)} {fault}")
     specified = [judgment for judgment in judgments if judgment.specified.angle is not None]
     if specified and all(judgment.limit >= ANY for judgment in specified):
         reporter.say(

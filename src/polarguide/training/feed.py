@@ -41,27 +41,19 @@ def pack_priors(priors: ViewPriors, fields: Collection[str]) -> Entry:
 
 
 def unpack_priors(entry: Entry, camera: Camera, settings: Priors) -> ViewPriors:
-    """The priors again; what was not kept is not a number, in its shape.
+    """Return the priors of an entry; fields that were not kept are ``ABSENT``.
 
     Args:
-        entry: by ``pack_priors``. camera: camera of the view. settings: that they were computed with.
+        entry: by ``pack_priors``. camera: camera of the view. settings: settings of the priors.
     """
     values = {name: stored_values(stored) for name, stored in entry.items()}
-    device = next(iter(values.values())).device
-    nothing = torch.full((), torch.nan, device=device)
-    size = (camera.height, camera.width)
-    for name in ("specular", "diffuse", "normal", "plane", "chromatic"):
-        values.setdefault(name, nothing.expand(*size, 3))
-    for name in ("separated", "weight", "chromatic_weight", "stokes_weight", "surface"):
-        values.setdefault(name, nothing.expand(size))
-    measured = values.pop("stokes", None)
-    stokes = (
-        nothing.expand(3, *size, 3)
-        if measured is None
-        else torch.nn.functional.pad(measured, (0, 0, 0, 0, 0, 0, 1, 0), value=torch.nan)
+    if "stokes" in values:
+        values["stokes"] = torch.nn.functional.pad(
+            values["stokes"], (0, 0, 0, 0, 0, 0, 1, 0), value=torch.nan
+        )
+    return ViewPriors(
+        camera, azimuth_share=settings.azimuth_share, chromatic_share=settings.chromatic_share, **values
     )
-    shares = {"azimuth_share": settings.azimuth_share, "chromatic_share": settings.chromatic_share}
-    return ViewPriors(camera=camera, stokes=stokes, **values, **shares)  # type: ignore[arg-type]
 
 
 KINDS = ("photograph", "unguided", "priors")
