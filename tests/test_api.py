@@ -15,7 +15,7 @@ from camera_files import write_mosaics
 from faults import Fault
 from reduced_demo import VIEWS
 from safetensors.torch import load_file
-from trainings import different
+from trainings import Reports, different
 
 import polarguide
 from polarguide.core.options import SceneOptions, SessionOptions
@@ -24,7 +24,6 @@ from polarguide.results.evaluation.record import validate_metrics
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, PLY
 from polarguide.shading.result import LAYERS, POLARIZED
 from polarguide.training.loop import TrainingLoop
-from polarguide.training.settings import StepReport
 
 EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"))
 ONE_THREAD = SessionOptions(threads=1)
@@ -194,10 +193,8 @@ def test_a_keyboard_interrupt_saves_a_whole_state_and_goes_on_to_the_same_bits(
     assert not set(different(tmp_path / "run" / CHECKPOINT, whole)) & whole.keys()
 
 
-def test_stopping_when_asked(demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    done: list[StepReport] = []
-    inner = TrainingLoop.step
-    monkeypatch.setattr(TrainingLoop, "step", lambda self: done.append(report := inner(self)) or report)
+def test_stopping_when_asked(demo_scene: Path, tmp_path: Path) -> None:
+    kept = Reports()
     with pytest.raises(KeyboardInterrupt, match="stopped after step 4"):
         polarguide.train(
             demo_scene,
@@ -206,7 +203,8 @@ def test_stopping_when_asked(demo_scene: Path, tmp_path: Path, monkeypatch: pyte
             settings=polarguide.TrainSettings(12),
             reading=SMALL,
             session=ONE_THREAD,
-            should_stop=lambda: len(done) == 4,
+            should_stop=lambda: len(kept.reports) == 4,
+            callbacks=[kept],
         )
     assert polarguide.open_run(tmp_path / "run").steps == 4
 
