@@ -15,7 +15,7 @@ from camera_files import write_mosaics
 from faults import Fault
 from reduced_demo import VIEWS
 from safetensors.torch import load_file
-from trainings import different
+from trainings import Reports, different
 
 import polarguide
 from polarguide.core.options import SceneOptions, SessionOptions
@@ -23,7 +23,7 @@ from polarguide.core.progress import Advance
 from polarguide.results.evaluation.record import validate_metrics
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, PLY
 from polarguide.shading.result import LAYERS, POLARIZED
-from polarguide.training.trainer import StepReport, Trainer
+from polarguide.training.loop import TrainingLoop
 
 EXAMPLES = sorted((Path(__file__).resolve().parents[1] / "examples").glob("*.py"))
 ONE_THREAD = SessionOptions(threads=1)
@@ -170,33 +170,31 @@ def test_a_keyboard_interrupt_saves_a_whole_state_and_goes_on_to_the_same_bits(
         )
 
     def interrupted_in(name: str, at: int) -> None:
-        inner = getattr(Trainer, name)
+        inner = getattr(TrainingLoop, name)
 
-        def stopped(self: Trainer, *arguments: object, **more: object) -> object:
+        def stopped(self: TrainingLoop, *arguments: object, **more: object) -> object:
             if self.state.step == at:
                 raise KeyboardInterrupt
             return inner(self, *arguments, **more)
 
         resume = (tmp_path / "run" / CONFIGURATION).exists()
         with monkeypatch.context() as patch:
-            patch.setattr(Trainer, name, stopped)
+            patch.setattr(TrainingLoop, name, stopped)
             with pytest.raises(KeyboardInterrupt):
                 train(resume=resume)
 
-    interrupted_in("_backpropagate", 17)
+    interrupted_in("backpropagate", 17)
     assert int(load_file(tmp_path / "run" / CHECKPOINT)["scalars"][0]) == 17
     assert not (tmp_path / "run" / PLY).exists()
-    interrupted_in("_optimize", 25)
+    interrupted_in("update_parameters", 25)
     assert int(load_file(tmp_path / "run" / CHECKPOINT)["scalars"][0]) == 20
     train(resume=True)
     whole = load_file(trained / CHECKPOINT)
     assert not set(different(tmp_path / "run" / CHECKPOINT, whole)) & whole.keys()
 
 
-def test_stopping_when_asked(demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    done: list[StepReport] = []
-    inner = Trainer.step
-    monkeypatch.setattr(Trainer, "step", lambda self: done.append(report := inner(self)) or report)
+def test_stopping_when_asked(demo_scene: Path, tmp_path: Path) -> None:
+    kept = Reports()
     with pytest.raises(KeyboardInterrupt, match="stopped after step 4"):
         polarguide.train(
             demo_scene,
@@ -205,7 +203,8 @@ def test_stopping_when_asked(demo_scene: Path, tmp_path: Path, monkeypatch: pyte
             settings=polarguide.TrainSettings(12),
             reading=SMALL,
             session=ONE_THREAD,
-            should_stop=lambda: len(done) == 4,
+            should_stop=lambda: len(kept.reports) == 4,
+            callbacks=[kept],
         )
     assert polarguide.open_run(tmp_path / "run").steps == 4
 

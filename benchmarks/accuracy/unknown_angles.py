@@ -31,8 +31,9 @@ from polarguide.capture.view import View
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.runs.folder import resolve
+from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.angles.polarizers import Judgment
-from polarguide.training.angles.trainer import AngleTrainer
+from polarguide.training.context import TrainingContext
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 
@@ -56,10 +57,10 @@ def searched(scene: Scene, steps: int) -> list[Judgment]:
     recipe = recipe_named("polarguide-stokes")
     assert isinstance(recipe, Recipe)
     settings = resolve(TrainSettings(steps=steps), scene, recipe)
-    trainer = AngleTrainer(scene, recipe, settings, choose_backend("cpu"))
-    while not trainer.polarizers.settled:
-        trainer.step()
-    return trainer.polarizers.judgments()
+    loop, fits = gaussian_training(TrainingContext(scene, recipe, settings, choose_backend("cpu")))
+    while not fits.polarizers.settled:
+        loop.step()
+    return fits.polarizers.judgments()
 
 
 def search(scene: Scene, steps: int, first: int, folds: int, fold: int) -> dict[str, Any]:

@@ -16,12 +16,13 @@ from polarguide.raster import Backend, ScreenStatistic, Splats
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import resolve
 from polarguide.shading.gbuffer import RenderRequest, render
+from polarguide.training.angles.fits import gaussian_training
+from polarguide.training.context import TrainingContext
 from polarguide.training.losses import Weights
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide.training.trainer import Trainer
 
 STEPS, BEGIN = 1_000_000, 300_000  # in stage 2 of polarguide, with all harmonics
 
@@ -53,7 +54,9 @@ class Ours:
     def __init__(self, scene: Scene, state: TrainingState, backend: Backend) -> None:
         recipe = steady("polarguide")
         state.step = BEGIN
-        self.trainer = Trainer(scene, recipe, resolve(TrainSettings(STEPS, 0), scene, recipe), backend, state)
+        settings = resolve(TrainSettings(STEPS, 0), scene, recipe)
+        self.trainer, _ = gaussian_training(TrainingContext(scene, recipe, settings, backend), state)
+        self.trainer.prepare()
         self.stage = self.trainer.schedule.at(BEGIN).stage
         assert self.stage.reflection
         assert self.stage.densify
@@ -64,16 +67,16 @@ class Ours:
         trainer, state = self.trainer, self.trainer.state
         render(
             state.gaussians,
-            trainer._view_of(state.step + self._next()).camera,
-            trainer.backend.rasterize,
+            trainer.view_at(state.step + self._next()).camera,
+            trainer.context.backend.rasterize,
             RenderRequest(depth=True),
-            shading=trainer.shading,
+            shading=trainer.context.shading,
             light=state.light,
         )
 
     def look(self) -> None:
         """Forward and backward, with all losses."""
-        self.trainer._backpropagate(self._next(), self.stage, True)
+        self.trainer.backpropagate(self._next())
 
     def step(self) -> None:
         """A whole step."""
@@ -83,20 +86,20 @@ class Ours:
     def frame(self, *, layers: bool) -> None:
         """A picture of a trained scene: the final one, or all layers."""
         trainer, state = self.trainer, self.trainer.state
-        view = trainer._view_of(state.step + self._next())
+        view = trainer.view_at(state.step + self._next())
         render(
             state.gaussians,
             view.camera,
-            trainer.backend.rasterize,
+            trainer.context.backend.rasterize,
             RenderRequest(normals=layers, depth=layers),
-            shading=trainer.shading,
+            shading=trainer.context.shading,
             light=state.light,
         )
 
     def parts(self) -> dict[str, Any]:
         """The rasterizer, SSIM and the optimizer of a step by themselves, as calls."""
         trainer, gaussians = self.trainer, self.trainer.state.gaussians
-        view = trainer._view_of(trainer.state.step)
+        view = trainer.view_at(trainer.state.step)
         inputs = Splats(
             gaussians["means"],
             gaussians["quaternions"],
@@ -105,11 +108,13 @@ class Ours:
             torch.rand(len(gaussians), 8, device=gaussians["means"].device),
         )
         splats = Splats(*(t.detach().requires_grad_() for t in inputs))
-        shown = trainer._feed.targets(trainer.state.step, view, Weights(), None).picture
+        shown = trainer.feed.targets(trainer.state.step, view, Weights(), None).picture
         prediction = shown.clone().requires_grad_()
 
         def raster() -> None:
-            picture = trainer.backend.rasterize(splats, view.camera, statistic=ScreenStatistic((0, 1, 2)))
+            picture = trainer.context.backend.rasterize(
+                splats, view.camera, statistic=ScreenStatistic((0, 1, 2))
+            )
             torch.autograd.grad((picture.features.sum() + picture.alpha.sum()), splats)
 
         def ssim() -> None:
@@ -120,12 +125,12 @@ class Ours:
         def optimizer() -> None:
             for t in gaussians.trained():
                 t.grad = torch.zeros_like(t)
-            trainer._optimize()
+            trainer.update_parameters()
 
         return {"rasterizer": raster, "ssim": ssim, "optimizer": optimizer}
 
     def _next(self) -> int:
-        self._turn = (self._turn + 1) % len(self.trainer.scene.train_views)
+        self._turn = (self._turn + 1) % len(self.trainer.context.scene.train_views)
         return self._turn
 
 

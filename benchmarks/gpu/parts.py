@@ -29,9 +29,10 @@ from polarguide.recipes import RECIPES
 from polarguide.results.evaluation.metrics import psnr
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint
 from polarguide.shading.gbuffer import render
+from polarguide.training.angles.fits import gaussian_training
+from polarguide.training.context import TrainingContext
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide.training.trainer import Trainer
 
 RECIPE = RECIPES["polarguide"]
 
@@ -67,13 +68,14 @@ def train_on(job: Job, name: str, steps: int, folder: Path) -> dict[str, Any]:
     there = (folder / CHECKPOINT).exists()
     state = load_checkpoint(folder, RECIPE, job.backend.device) if there else None
     scene = job.scene(name)
-    trainer = Trainer(scene, RECIPE, resolve(TrainSettings(steps, 0), scene, RECIPE), job.backend, state)
+    settings = resolve(TrainSettings(steps, 0), scene, RECIPE)
+    trainer, _ = gaussian_training(TrainingContext(scene, RECIPE, settings, job.backend), state)
 
     def busy() -> bool:
         return trainer.state.step < steps and time.perf_counter() - begin < job.seconds
 
     while busy():
-        trainer.run(lambda _: None, until=min(steps, trainer.state.step + 100))
+        trainer.run(min(steps, trainer.state.step + 100))
         wait(job.backend.device)
     spent += time.perf_counter() - begin
     save_checkpoint(folder, trainer.state)

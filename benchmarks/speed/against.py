@@ -44,7 +44,13 @@ try:
     from polarguide.training.settings import TrainSettings
 except ImportError:
     from polarguide.training.trainer import TrainSettings
-from polarguide.training.trainer import Trainer
+try:
+    from polarguide.training.angles.fits import gaussian_training
+    from polarguide.training.context import TrainingContext
+    def Trainer(*inputs):
+        return gaussian_training(TrainingContext(*inputs))[0]
+except ImportError:
+    from polarguide.training.trainer import Trainer
 
 scene, downscale, recipe, gaussians, threads = sys.argv[1:]
 keep_freed_memory()
@@ -59,8 +65,8 @@ for name in trained.names:
     if name in kept:
         trained.overwrite(name, torch.from_numpy(kept[name]))
 trainer.state.statistics.clear(count)
-longest = max(trainer.recipe.stages, key=lambda stage: stage.fraction)
-every = trainer.recipe.densification.every
+longest = max(RECIPES[recipe].stages, key=lambda stage: stage.fraction)
+every = RECIPES[recipe].densification.every
 calm = [
     step for step in range(1, 4999)
     if trainer.schedule.at(step).stage is longest and not trainer.schedule.at(step).actions and (step + 1) % every

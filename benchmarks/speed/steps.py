@@ -28,9 +28,11 @@ from polarguide.gaussians.gaussians import Trained
 from polarguide.raster import choose_backend, use_threads
 from polarguide.recipes import recipe_named
 from polarguide.runs.folder import CONFIGURATION, load_checkpoint, resolve
+from polarguide.training.angles.fits import gaussian_training
+from polarguide.training.context import TrainingContext
 from polarguide.training.feed import Feed
+from polarguide.training.loop import TrainingLoop
 from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import Trainer
 
 DEMO = Path(__file__).resolve().parents[2] / "src/polarguide/data/demo"
 PARTS = {
@@ -80,11 +82,11 @@ class Clock:
         return found
 
 
-def measured(trainer: Trainer, clock: Clock, steps: int) -> tuple[dict[str, float], float]:
+def measured(trainer: TrainingLoop, clock: Clock, steps: int) -> tuple[dict[str, float], float]:
     """Medians of the parts of a step in the longest stage, and of the priors of a view; milliseconds."""
     schedule, last = trainer.schedule, trainer.settings.steps
-    every, coarse = trainer.recipe.densification.every, trainer.recipe.coarse
-    largest = max(view.camera.width * view.camera.height for view in trainer.scene.train_views)
+    every, coarse = trainer.context.recipe.densification.every, trainer.context.recipe.coarse
+    largest = max(view.camera.width * view.camera.height for view in trainer.context.scene.train_views)
     # Pictures as they are: large ones are smaller in the first steps.
     first = math.ceil(coarse.share * last) if largest >= coarse.pixels else 1
     names = [schedule.at(step).stage.name for step in range(first, last - 1)]
@@ -144,7 +146,8 @@ def main() -> None:
             if state is not None:
                 state.frozen = None
             settings = resolve(TrainSettings(5000, 0), scene, recipe)
-            trainer = Trainer(scene, recipe, settings, choose_backend("cpu"), state)
+            context = TrainingContext(scene, recipe, settings, choose_backend("cpu"))
+            trainer, _ = gaussian_training(context, state)
             columns.append(measured(trainer, clock, options.steps))
             gaussians = len(trainer.state.gaussians)
         kind = "trained" if run is not None else "first"

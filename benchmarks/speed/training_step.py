@@ -25,9 +25,10 @@ from polarguide.capture import Scene, load_scene
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import resolve
+from polarguide.training.angles.fits import gaussian_training
+from polarguide.training.context import TrainingContext
 from polarguide.training.recipe import Recipe, Stage
 from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import Trainer
 
 SKIPPED, LAST = 100, 400
 PLAIN = RECIPES["3dgs"]
@@ -96,9 +97,8 @@ def main() -> None:
     rasterizer = Stopwatch()
     native = _native.Rasterizer
     native.forward, native.backward = rasterizer.timed(native.forward), rasterizer.timed(native.backward)
-    trainer = Trainer(
-        scene, recipe, resolve(TrainSettings(arguments.steps, 0), scene, recipe), choose_backend("cpu")
-    )
+    settings = resolve(TrainSettings(arguments.steps, 0), scene, recipe)
+    trainer, _ = gaussian_training(TrainingContext(scene, recipe, settings, choose_backend("cpu")))
     times = []
     for _ in range(arguments.steps):
         begin = time.perf_counter()

@@ -18,7 +18,8 @@ from polarguide.cli.app import run
 from polarguide.optics.color import srgb_decode
 from polarguide.results.evaluation.record import validate_metrics
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, LOG, PLY
-from polarguide.training.trainer import StepReport, Trainer
+from polarguide.training.loop import TrainingLoop
+from polarguide.training.settings import StepReport
 
 SIZE = (24, 32)  # the demo scene over 4
 TEST_VIEWS = ("v000", "v022", "v044", "v066")
@@ -240,16 +241,16 @@ def test_stopped_and_resumed_is_uninterrupted(
     number: signal.Signals,
 ) -> None:
     """Ctrl-C in the middle of step 17: the state is saved, and --resume ends with the same bits."""
-    straight = Trainer.step
+    straight = TrainingLoop.step
 
-    def stopped(self: Trainer) -> StepReport:
+    def stopped(self: TrainingLoop) -> StepReport:
         if self.state.step == 17:
             os.kill(os.getpid(), number)
         return straight(self)
 
     command = ["train", str(demo_scene), "--out", str(tmp_path / "run"), *short]
     with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "step", stopped)
+        patch.setattr(TrainingLoop, "step", stopped)
         assert run(command) == 130
     assert int(load_file(tmp_path / "run" / CHECKPOINT)["scalars"][0]) == 18
     assert not (tmp_path / "run" / PLY).exists()

@@ -14,9 +14,10 @@ from tiny import make_busy_recipe, make_scene
 
 from polarguide.raster import choose_backend
 from polarguide.runs.folder import load_checkpoint, resolve, save_checkpoint
+from polarguide.training.angles.fits import gaussian_training
+from polarguide.training.context import TrainingContext
 from polarguide.training.distributed import SeveralRanks
 from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import Trainer
 
 torch.set_num_threads(1)
 dist.init_process_group("gloo")
@@ -25,12 +26,11 @@ scene, recipe, backend = make_scene(), make_busy_recipe(), choose_backend("cpu")
 for job in json.loads(Path(sys.argv[1]).read_text()):
     settings = resolve(TrainSettings(job["steps"], 3, views_per_step=job["views"]), scene, recipe)
     state = load_checkpoint(Path(job["begun"]), recipe) if job["begun"] else None
-    trainer = Trainer(scene, recipe, settings, backend, state, ranks)
-    trainer.run(lambda _: None, until=job["until"])
-    trainer.exchange_statistics()
+    trainer, _ = gaussian_training(TrainingContext(scene, recipe, settings, backend, ranks), state)
+    trainer.run(job["until"])
     folder = Path(job["out"], str(ranks.rank))
     folder.mkdir(parents=True)
-    save_checkpoint(folder, trainer.state)
+    save_checkpoint(folder, trainer.saved_state())
     ranks.barrier()
 dist.destroy_process_group()
 # Threads of the group that outlive it may abort the interpreter as it ends.

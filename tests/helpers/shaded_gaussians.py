@@ -12,7 +12,7 @@ from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.result import RenderResult
-from polarguide.training.native_terms import S1_AND_S2, Polarization, Terms, pixel_terms
+from polarguide.training.native_terms import S1_AND_S2, PolarizationTerm, Terms, pixel_terms
 
 COUNT = 30
 RESOLUTION = 8
@@ -73,7 +73,7 @@ def compare_native_polarization(
             values[name].requires_grad_()
         result = rendered(shading, values)
         if native:
-            term = Polarization(measured, S1_AND_S2, weight, 0.7, shading.refractive_index, result.index)
+            term = PolarizationTerm(measured, S1_AND_S2, weight, 0.7, shading.refractive_index, result.index)
             with selected(instructions):
                 loss = pixel_terms(result, camera(), Terms(term, [], None))
         else:

@@ -9,13 +9,23 @@ from torch import Tensor
 from polarguide.capture import Scene
 from polarguide.raster import Backend, choose_backend
 from polarguide.runs.folder import resolve
-from polarguide.training.feed import ViewStore
+from polarguide.training.angles.fits import AngleFits, gaussian_training
+from polarguide.training.callback import Callback
+from polarguide.training.context import TrainingContext
+from polarguide.training.loop import Loop, TrainingLoop
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide.training.trainer import Trainer
+from polarguide.training.storage import ViewStore
 
 CPU = choose_backend("cpu")
+
+
+def context_of(
+    scene: Scene, recipe: Recipe, settings: TrainSettings, backend: Backend = CPU, **services: Any
+) -> TrainingContext:
+    """The context of a training. ``services``: further fields of it."""
+    return TrainingContext(scene, recipe, resolve(settings, scene, recipe), backend, **services)
 
 
 def make_trainer(
@@ -28,17 +38,35 @@ def make_trainer(
     store: ViewStore | None = None,
     seed: int = 3,
     **settings: Any,
-) -> Trainer:
-    """A trainer that has not begun, or goes on from a state. ``settings``: further fields of ``TrainSettings``."""
-    resolved = resolve(TrainSettings(steps, seed, **settings), scene, recipe)
-    return Trainer(scene, recipe, resolved, backend, state, store=store)
+) -> TrainingLoop:
+    """A training that has not begun, or resumes from a state. ``settings``: further fields of ``TrainSettings``."""
+    specified = TrainSettings(steps, seed, **settings)
+    context = context_of(scene, recipe, specified, backend, store=store or ViewStore())
+    return gaussian_training(context, state)[0]
 
 
-def run(trainer: Trainer, until: int | None = None) -> list[StepReport]:
+class Reports(Callback[Loop]):
+    """Keeps the reports of all steps."""
+
+    def __init__(self) -> None:
+        self.reports: list[StepReport] = []
+
+    def after_step(self, loop: Loop, report: StepReport) -> None:
+        self.reports.append(report)
+
+
+def run(trainer: Loop, until: int | None = None) -> list[StepReport]:
     """Train on; the reports of the steps."""
-    reports: list[StepReport] = []
-    trainer.run(reports.append, until=until)
-    return reports
+    kept = Reports()
+    trainer.observers.append(kept)
+    trainer.run(until)
+    trainer.observers.remove(kept)
+    return kept.reports
+
+
+def fits_of(trainer: TrainingLoop) -> AngleFits:
+    """The fits of polarizer angles of a training."""
+    return next(callback for callback in trainer.callbacks if isinstance(callback, AngleFits))
 
 
 def trained(

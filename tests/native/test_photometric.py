@@ -1,6 +1,7 @@
 """The photometric loss: kernel and reference implementation against scikit-image and finite differences; sRGB."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -11,8 +12,8 @@ from torch.testing import assert_close
 from polarguide import _native
 from polarguide.optics.color import srgb_decode, srgb_encode
 from polarguide.training.photometric import (
+    ExplicitPhotometric,
     photometric_loss,
-    photometric_loss_explicit,
     photometric_loss_reference,
     photometric_terms,
     photometric_terms_reference,
@@ -21,6 +22,11 @@ from polarguide.training.photometric import (
 sizes = pytest.mark.parametrize(
     ("height", "width"), [(1, 1), (1, 40), (40, 1), (3, 5), (7, 16), (12, 11), (33, 47), (64, 53)]
 )
+
+
+def explicit_loss(*given: Any) -> Tensor:
+    """``photometric_loss`` as other devices than the CPU compute it."""
+    return ExplicitPhotometric.apply(*given)[0]
 
 
 def pictures(height: int, width: int, low: float = -0.1, high: float = 1.1) -> tuple[Tensor, Tensor]:
@@ -75,7 +81,9 @@ def test_the_written_out_gradient_is_that_of_the_reference(
     """What other devices compute."""
     prediction, target = (t.double() for t in pictures(height, width))
     weight = some_weights(height, width).double() if weighted else None
-    found = loss_and_gradient(photometric_loss_explicit, prediction, target, weight, ssim_weight)
+    found = loss_and_gradient(
+        lambda *given: ExplicitPhotometric.apply(*given)[0], prediction, target, weight, ssim_weight
+    )
     exact = loss_and_gradient(photometric_loss_reference, prediction, target, weight, ssim_weight)
     assert_close(found[0], exact[0])
     assert relative_error(found[1], exact[1]) < 1e-9

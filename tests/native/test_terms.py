@@ -14,7 +14,7 @@ from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
 from polarguide.training.losses import Weights, normal_terms, normal_terms_reference
-from polarguide.training.native_terms import Polarization, Terms, pixel_terms
+from polarguide.training.native_terms import PolarizationTerm, Terms, pixel_terms
 from polarguide.training.targets import Step, StepTargets, ViewPriors, stokes_weight, surface_weight
 
 HEIGHT, WIDTH = 37, 70  # more than one block of pixels in a row, and more than one part
@@ -234,7 +234,7 @@ def test_intensities_behind_a_polarizer_at_any_angle() -> None:
         return 0.3 * (priors.stokes_weight[..., None] * (expected - seen).abs()).sum()
 
     def fused(result: RenderResult, priors: ViewPriors) -> Tensor:
-        polarization = Polarization(
+        polarization = PolarizationTerm(
             seen.float(), analyzers, priors.stokes_weight, 0.3, SHADING.refractive_index
         )
         return pixel_terms(result, camera(), Terms(polarization, (), None))

@@ -21,6 +21,7 @@ from polarguide.capture import Scene
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.recipes import RECIPES
+from polarguide.runs.callbacks import TrainingStopped
 from polarguide.runs.folder import (
     CHECKPOINT,
     CONFIGURATION,
@@ -31,7 +32,6 @@ from polarguide.runs.folder import (
     save_checkpoint,
     writing_to,
 )
-from polarguide.runs.loop import TrainingStopped
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import ResolvedSettings, TrainSettings
 from polarguide.training.state import TrainingState

@@ -23,7 +23,15 @@ from polarguide.core.progress import SILENT
 from polarguide.geometry.camera import Camera
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
-from polarguide.runs.health import HEALTH, Evidence, Health, Limits, Polarization, examine, warnings_of
+from polarguide.runs.health import (
+    HEALTH,
+    Health,
+    Limits,
+    PolarizationSupport,
+    TrainingEvidence,
+    examine,
+    warnings_of,
+)
 from polarguide.runs.model import GaussianModel
 from polarguide.shading.result import RenderResult
 from polarguide.training.angles.polarizers import Polarizers
@@ -72,8 +80,10 @@ class StandIn:
         return torch.full_like(depth, self.fog.get(self._views[id(camera)].name, 0.0))
 
 
-def evidence(scene: Scene, views: tuple[View, ...] | None = None) -> Evidence:
-    return Evidence(views or scene.train_views, Polarization(len(scene.views), 0, 0), filters=True)
+def evidence(scene: Scene, views: tuple[View, ...] | None = None) -> TrainingEvidence:
+    return TrainingEvidence(
+        views or scene.train_views, PolarizationSupport(len(scene.views), 0, 0), filters=True
+    )
 
 
 def examined(model: Any, scene: Scene, views: tuple[View, ...] | None = None) -> Health:
@@ -225,7 +235,7 @@ def test_the_word_says_what_most_views_tell_and_what_is_in_doubt() -> None:
     polarizers.take(polarizers.fit(lambda view: truth[view.name])[None])
 
     def told(views: tuple[View, ...], **reads: bool) -> str:
-        return Polarization.of(
+        return PolarizationSupport.of(
             views, polarizers.judgments(), **({"measured": True, "fitted": True} | reads)
         ).text
 
@@ -239,7 +249,7 @@ def test_the_word_says_what_most_views_tell_and_what_is_in_doubt() -> None:
     assert {view.exposures for view in WHOLE.train_views} == {FOUR}
     assert {view.exposures for view in plain.train_views} == {PLAIN}
     lost = tuple(view.with_exposures((Exposure(),)) for view in one.train_views)
-    assert Polarization.of(lost, (), measured=True, fitted=True).word == "none"
+    assert PolarizationSupport.of(lost, (), measured=True, fitted=True).word == "none"
 
 
 @pytest.mark.parametrize("data", [b"{", b'{"views": 3}', b"\x00" * 9, None])

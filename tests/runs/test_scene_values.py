@@ -19,8 +19,8 @@ from polarguide.core.progress import Reporter
 from polarguide.core.system import MemoryBound
 from polarguide.recipes import recipe_named
 from polarguide.runs import train as training
+from polarguide.runs.callbacks import TrainingStopped
 from polarguide.runs.folder import CONFIGURATION
-from polarguide.runs.loop import TrainingStopped
 from polarguide.training.recipe import Schedule
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.options import CompareOptions

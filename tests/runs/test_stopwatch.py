@@ -10,11 +10,11 @@ import pytest
 from polarguide.capture import Scene
 from polarguide.core.progress import Advance, Reporter
 from polarguide.runs import stopwatch
+from polarguide.runs.callbacks import Look
 from polarguide.runs.folder import RunLog
-from polarguide.runs.loop import Look
 from polarguide.runs.stopwatch import in_words
 from polarguide.runs.train import train
-from polarguide.training.angles.trainer import AngleTrainer
+from polarguide.training.loop import TrainingLoop
 from polarguide.training.settings import TrainSettings
 
 
@@ -54,7 +54,7 @@ def test_pauses_of_a_training_do_not_count(
     monkeypatch.setattr(stopwatch, "time", clock)
 
     @contextlib.contextmanager
-    def watch(trainer: AngleTrainer) -> Iterator[Look]:
+    def watch(trainer: TrainingLoop) -> Iterator[Look]:
         step = trainer.step
 
         def slow_step() -> object:

@@ -10,20 +10,19 @@ from shaded_gaussians import COUNT, RESOLUTION, camera, compare_native_polarizat
 from torch import Tensor
 from torch.nn.functional import normalize
 from torch.testing import assert_close
+from trainings import make_trainer
 
 from polarguide import optics
 from polarguide.capture import Scene
 from polarguide.raster import choose_backend
 from polarguide.raster.surface import surface_picture
 from polarguide.recipes import recipe_named
-from polarguide.runs.folder import resolve
 from polarguide.shading.deferred import INDEX_NOTE, DeferredShading
 from polarguide.shading.gbuffer import RenderRequest, render, splatting
 from polarguide.shading.model import PLAIN
 from polarguide.shading.result import RenderResult
 from polarguide.training.actions import outward_directions
-from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import Trainer
+from polarguide.training.loop import TrainingLoop
 
 SHADING = DeferredShading("fresnel", local=True, metal=True, indices=True)
 WITHOUT = DeferredShading("fresnel", local=True, metal=True)
@@ -128,30 +127,28 @@ def test_colors_attributes_and_the_page() -> None:
 
 
 @pytest.fixture(scope="module")
-def trainer(tiny_scene: Scene) -> Trainer:
+def trainer(tiny_scene: Scene) -> TrainingLoop:
     recipe = recipe_named("polarguide-stokes")
-    made = Trainer(
-        tiny_scene, recipe, resolve(TrainSettings(steps=60), tiny_scene, recipe), choose_backend("cpu")
-    )
-    made.run(lambda _: None, until=30)
+    made = make_trainer(tiny_scene, recipe, 60, seed=0)
+    made.run(30)
     return made
 
 
-def seen(trainer: Trainer, **asked: bool) -> RenderResult:
-    state, camera = trainer.state, trainer.scene.test_views[0].camera
+def seen(trainer: TrainingLoop, **asked: bool) -> RenderResult:
+    state, camera = trainer.state, trainer.context.scene.test_views[0].camera
     with torch.no_grad():
         return render(
             state.gaussians,
             camera,
-            trainer.backend.rasterize,
+            trainer.context.backend.rasterize,
             RenderRequest(**asked),
-            shading=trainer.shading,
+            shading=trainer.current.shading,
             light=state.light,
         )
 
 
-def test_the_layers_and_the_polarization_stay(trainer: Trainer) -> None:
-    camera = trainer.scene.test_views[0].camera
+def test_the_layers_and_the_polarization_stay(trainer: TrainingLoop) -> None:
+    camera = trainer.context.scene.test_views[0].camera
     blended, found = seen(trainer, depth=True), seen(trainer, depth=True, at_median_depth=True)
     for field in fields(RenderResult):
         one, other = (getattr(result, field.name) for result in (blended, found))
@@ -160,13 +157,13 @@ def test_the_layers_and_the_polarization_stay(trainer: Trainer) -> None:
     assert torch.equal(found.blended_normal, blended.normal)
     assert found.shaded_normal is found.blended_normal
     assert blended.shaded_normal is blended.normal
-    predicted = [trainer.shading.predicted_stokes(result, camera) for result in (blended, found)]
+    predicted = [trainer.current.shading.predicted_stokes(result, camera) for result in (blended, found)]
     assert torch.equal(*predicted)
 
 
-def test_normals_and_depth_are_those_around_the_median(trainer: Trainer) -> None:
+def test_normals_and_depth_are_those_around_the_median(trainer: TrainingLoop) -> None:
     found, gaussians = seen(trainer, depth=True, at_median_depth=True), trainer.state.gaussians
-    camera = trainer.scene.test_views[0].camera
+    camera = trainer.context.scene.test_views[0].camera
     with torch.no_grad():
         given, _ = splatting(gaussians, camera, PLAIN, sh_degree=0, normals=False, depth=False)
     assert torch.equal(found.depth, surface_picture(given, camera).depth)
@@ -175,13 +172,13 @@ def test_normals_and_depth_are_those_around_the_median(trainer: Trainer) -> None
     assert float((found.depth - blended.depth).abs().max()) > 1e-3, "they are not the same thing"
 
 
-def test_what_is_not_asked_for_is_not_there(trainer: Trainer) -> None:
+def test_what_is_not_asked_for_is_not_there(trainer: TrainingLoop) -> None:
     assert seen(trainer, at_median_depth=True).depth is None
-    state, camera = trainer.state, trainer.scene.test_views[0].camera
+    state, camera = trainer.state, trainer.context.scene.test_views[0].camera
     plain = render(
         state.gaussians,
         camera,
-        trainer.backend.rasterize,
+        trainer.context.backend.rasterize,
         RenderRequest(normals=False, depth=True, at_median_depth=True),
         shading=PLAIN,
     )

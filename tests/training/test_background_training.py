@@ -12,10 +12,10 @@ from polarguide.raster import Backend, rasterize_reference
 from polarguide.recipes import RECIPES
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.training.actions import LEAST_PIXELS, touched_pixels
+from polarguide.training.loop import TrainingLoop
 from polarguide.training.losses import Weights, coverage_loss
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import Trainer
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def black_scene(tiny_scene: Scene) -> Scene:
     return replace(tiny_scene, views=tuple(views))
 
 
-def trainer(scene: Scene, background: str, recipe: Recipe = RECIPES["3dgs"], steps: int = 60) -> Trainer:
+def trainer(scene: Scene, background: str, recipe: Recipe = RECIPES["3dgs"], steps: int = 60) -> TrainingLoop:
     return make_trainer(scene, recipe, steps, background=background)
 
 
@@ -40,7 +40,7 @@ def test_the_mode_is_found_from_the_pictures_unless_it_is_given(
     for scene, found in ((tiny_scene, False), (black_scene, True)):
         for background, black in (("auto", found), ("scene", False), ("black", True), ("masked", True)):
             made = trainer(scene, background)
-            assert made.black == black
+            assert made.context.black == black
             if background == "auto":
                 assert made.settings.background == ("black" if found else "scene")
 
@@ -86,13 +86,16 @@ def test_a_step_is_pulled_to_emptiness_where_the_background_is_black(black_scene
     assert losses[1] > losses[0]
 
 
-def summed_weights(made: Trainer, number: int) -> list[float]:
+def summed_weights(made: TrainingLoop, number: int) -> list[float]:
     """What one Gaussian adds to each training view, by pictures with it white among black ones."""
     given = splats(made.state.gaussians)
     features = torch.zeros(len(given.means), 1)
     features[number] = 1.0
     fixed = type(given)(*(tensor.detach() for tensor in given))._replace(features=features)
-    return [float(rasterize_reference(fixed, view.camera).features.sum()) for view in made.scene.train_views]
+    return [
+        float(rasterize_reference(fixed, view.camera).features.sum())
+        for view in made.context.scene.train_views
+    ]
 
 
 def test_pictures_that_a_gaussian_adds_to_are_counted(black_scene: Scene) -> None:

@@ -11,7 +11,7 @@ from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.interface import Rasterize
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.result import RenderResult
-from polarguide.training.trainer import shares_before, turned_behind
+from polarguide.training.behind import shares_before, turned_behind
 
 CAMERA = Camera(
     32, 24, 40.0, 40.0, 16.0, 12.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)

@@ -13,12 +13,13 @@ from faults import Fault
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from toy_shading import TOY, SkyShading
+from trainings import context_of
 
 import polarguide
 from polarguide.capture import Scene
 from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.recipes import RECIPES
-from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve
+from polarguide.runs.folder import CHECKPOINT, load_checkpoint
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
@@ -27,7 +28,7 @@ from polarguide.training.state import Environment, TrainingState, first_state
 
 def stepped(scene: Scene, recipe: Recipe) -> TrainingState:
     """A state with moments of everything, and the copy from which priors are computed."""
-    state = first_state(scene, recipe, resolve(TrainSettings(10, 0), scene, recipe))
+    state = first_state(context_of(scene, recipe, TrainSettings(10, 0)))
     for trained in (state.gaussians, state.environment):
         if trained is not None:
             for values in trained.trained():
@@ -255,4 +256,4 @@ def test_first_values_have_the_declared_shapes(
 ) -> None:
     scene = polarguide.load_scene(demo_scene, downscale=8)
     recipe = dataclasses.replace(TOY, shading=shading)
-    Fault(where, found=values).raised_by(first_state, scene, recipe, resolve(TrainSettings(4), scene, recipe))
+    Fault(where, found=values).raised_by(first_state, context_of(scene, recipe, TrainSettings(4)))

@@ -61,6 +61,7 @@ def priors() -> ViewPriors:
     plane = normalize(torch.linalg.cross(normal, unit(1)), dim=-1)
     weight = torch.rand(SIZE, generator=torch.Generator().manual_seed(2))
     return ViewPriors(
+        CAMERA,
         srgb_encode(picture(3)),
         srgb_encode(picture(4)),
         torch.ones(SIZE),
@@ -69,7 +70,6 @@ def priors() -> ViewPriors:
         weight,
         normal,
         weight.square(),
-        CAMERA,
         measured(1.0),
         stokes_weight(measured(1.0), torch.ones(SIZE)),
         weight,

@@ -12,25 +12,26 @@ import torch
 from heard import Heard
 from metal_balls import BODIES, METALS, gaussians_of_the_ball, measured, views_of
 from torch import Tensor
-from trainings import CPU, different, run
+from trainings import CPU, context_of, different, make_trainer, run
 
 from polarguide import optics
 from polarguide.capture import Scene, View
+from polarguide.core.progress import Reporter
 from polarguide.optics.fresnel import reflectances_from_cosine
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.recipes import RECIPES
-from polarguide.runs.folder import load_checkpoint, resolve, save_checkpoint
+from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.model import GaussianModel
 from polarguide.runs.reports import METALS_PICTURE, report_metals
 from polarguide.shading.metal import any_nonzero
-from polarguide.training.angles.trainer import AngleTrainer
+from polarguide.training.angles.fits import gaussian_training
+from polarguide.training.loop import TrainingLoop
 from polarguide.training.metals.cut import INFINITE, Graph, decide, minimum_cut, surfaces, unary
-from polarguide.training.metals.evidence import GOLD, LEVELS, Evidence, _tint_cost, errors, evidence
+from polarguide.training.metals.evidence import GOLD, LEVELS, MetalEvidence, _tint_cost, errors, evidence
 from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights, shares
-from polarguide.training.metals.search import SOFT_PRIORS, looks
+from polarguide.training.metals.search import SOFT_PRIORS, MetalSearch, looks, warn_of_unused_materials
 from polarguide.training.rules import MetalRules, MetalViews
 from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import Trainer, warn_of_unused_materials
 
 RULES, LIMITS = MetalRules(), MetalViews()
 
@@ -150,9 +151,9 @@ def test_a_piece_has_to_be_worth_a_surface() -> None:
         assert surfaces(metal, nats, line, least).nonzero()[0].tolist() == left
 
 
-def said(count: int, **values: Tensor) -> Evidence:
+def said(count: int, **values: Tensor) -> MetalEvidence:
     """Evidence that both explanations fit alike, but for what is given."""
-    given = Evidence(
+    given = MetalEvidence(
         ratio=torch.zeros(count),
         views=torch.full((count,), 5.0),
         reflectance=torch.full((count, 3), 0.6),
@@ -210,13 +211,20 @@ def with_materials(scene: Scene, kind: int) -> Scene:
     return dataclasses.replace(scene, views=views)
 
 
-def trainer_of(scene: Scene, settings: TrainSettings, warn: list[str]) -> Trainer:
+class Warnings(Reporter):
+    """Keeps warnings in a list."""
+
+    def __init__(self, kept: list[str]) -> None:
+        self.warn = kept.append  # type: ignore[method-assign]
+
+
+def trainer_of(scene: Scene, settings: TrainSettings, warn: list[str]) -> TrainingLoop:
     repeats = tuple(
         dataclasses.replace(stage, repeats=tuple(dataclasses.replace(r, minimum=1) for r in stage.repeats))
         for stage in RECIPE.stages
     )
     recipe = dataclasses.replace(RECIPE, stages=repeats)
-    return Trainer(scene, recipe, resolve(settings, scene, recipe), CPU, warn=warn.append)
+    return gaussian_training(context_of(scene, recipe, settings, reporter=Warnings(warn)))[0]
 
 
 def test_training_makes_metals_of_what_the_user_says(tiny_scene: Scene, tmp_path: Path) -> None:
@@ -240,7 +248,7 @@ def test_training_makes_metals_of_what_the_user_says(tiny_scene: Scene, tmp_path
 
 def test_dielectric_turns_the_search_off(tiny_scene: Scene) -> None:
     trainer = trainer_of(with_materials(tiny_scene, 2), TrainSettings(60, 3, materials="dielectric"), [])
-    trainer.run(lambda _: None)
+    trainer.run()
     assert not any_nonzero(trainer.state.gaussians["metalness"])
 
 
@@ -253,8 +261,7 @@ def test_too_few_steps_to_heed_materials_are_told_of(tiny_scene: Scene, minimum:
     )
     recipe, scene = dataclasses.replace(RECIPE, stages=stages), with_materials(tiny_scene, 2)
     for given in (scene, tiny_scene):
-        settings = resolve(TrainSettings(60, 3), given, recipe)
-        warn_of_unused_materials(given, recipe, settings, CPU, heard.append)
+        warn_of_unused_materials(context_of(given, recipe, TrainSettings(60, 3), reporter=Warnings(heard)))
     expected = [] if minimum == 1 else ["materials/ is read at refreshes of the priors"]
     assert [words.partition(" between")[0] for words in heard] == expected
 
@@ -269,7 +276,7 @@ def test_contradicting_files_are_named_once(tiny_scene: Scene) -> None:
         for view in scene.views
     )
     trainer = trainer_of(dataclasses.replace(scene, views=views), TrainSettings(60, 3), heard)
-    trainer.run(lambda _: None)
+    trainer.run()
     assert len(heard) == 1
     assert f"materials/{wrong.name}.png" in heard[0]
     assert "in one view, metal in another" in heard[0]
@@ -323,7 +330,7 @@ def test_the_users_words_need_no_polarization(tiny_scene: Scene) -> None:
 def test_only_the_last_look_decides_hard(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is likely is shaded as a mixture at first; at the last look the whole prior alone counts."""
     trainer = trainer_of(tiny_scene, TrainSettings(60, 3), [])
-    steps = looks(trainer.recipe, trainer.settings)
+    steps = looks(trainer.context.recipe, trainer.settings)
     assert len(steps) >= 3
     priors: list[Sequence[float]] = []
 
@@ -332,7 +339,7 @@ def test_only_the_last_look_decides_hard(tiny_scene: Scene, monkeypatch: pytest.
         return torch.zeros(len(trainer.state.gaussians))
 
     monkeypatch.setattr("polarguide.training.metals.search.decide", decided_with)
-    trainer.run(lambda _: None)
+    trainer.run()
     assert priors == [SOFT_PRIORS] * (len(steps) - 1) + [(1.0,)]
 
 
@@ -341,7 +348,7 @@ def test_what_the_prior_alone_decides_is_undecided(
 ) -> None:
     """A half of the Gaussians has evidence, but less than the prior; it is said, and drawn, until the user decides."""
     recipe, heard = RECIPE, Heard()
-    trainer = AngleTrainer(tiny_scene, recipe, resolve(TrainSettings(1500, 3), tiny_scene, recipe), CPU)
+    trainer = make_trainer(tiny_scene, recipe, 1500)
     gaussians = trainer.state.gaussians
     first = gaussians["means"][:, 0] > gaussians["means"][:, 0].median()
     values = {
@@ -350,17 +357,18 @@ def test_what_the_prior_alone_decides_is_undecided(
     }
     monkeypatch.setattr("polarguide.training.metals.search.evidence", lambda *_: said(len(first), **values))
     monkeypatch.setattr("polarguide.training.metals.search.far_away", lambda *_: torch.zeros_like(first))
-    model = GaussianModel(trainer.state, trainer.shading, CPU)
-    undecided = trainer.undecided()
+    model = GaussianModel(trainer.state, trainer.current.shading, CPU)
+    undecided = MetalSearch(trainer.current).undecided(trainer.state)
     assert undecided is not None
     torch.testing.assert_close(undecided, first)
-    report_metals(tmp_path, trainer, model, heard)
+    report_metals(tmp_path, tiny_scene, undecided, model, heard)
     assert "undecided" in heard.said[0]
     assert (tmp_path / METALS_PICTURE).exists()
     labels = torch.zeros(len(first), 2)
     labels[:, 0] = 1.0
     values["labels"] = labels
-    report_metals(tmp_path, trainer, model, heard)
+    undecided = MetalSearch(trainer.current).undecided(trainer.state)
+    report_metals(tmp_path, tiny_scene, undecided, model, heard)
     assert not (tmp_path / METALS_PICTURE).exists()
 
 

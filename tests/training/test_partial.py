@@ -257,9 +257,9 @@ def test_blocked_light_does_not_run_away() -> None:
     state, errors = trainer.state, {}
     for view in scene.views:
         with torch.no_grad():
-            rasterize = trainer.backend.rasterize
+            rasterize = trainer.context.backend.rasterize
             final = render(
-                state.gaussians, view.camera, rasterize, shading=trainer.shading, light=state.light
+                state.gaussians, view.camera, rasterize, shading=trainer.current.shading, light=state.light
             ).final
         true = sum(radiance(view.camera))
         errors[view.name] = float((final - true).abs().mean() / true.mean())

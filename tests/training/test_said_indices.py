@@ -11,16 +11,16 @@ import pytest
 import torch
 from faults import Fault
 from heard import Heard
+from trainings import context_of
 
 import polarguide
 from polarguide.capture import load_scene
 from polarguide.core.options import SceneOptions
-from polarguide.raster import choose_backend
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.recipes import RECIPES
+from polarguide.runs.callbacks import TrainingStopped
 from polarguide.runs.folder import CHECKPOINT
-from polarguide.runs.loop import TrainingStopped
-from polarguide.training.feed import Feed, ViewStore
+from polarguide.training.feed import Feed
 from polarguide.training.metals.observations import index_offsets, index_picture
 from polarguide.training.settings import TrainSettings
 
@@ -123,7 +123,8 @@ def test_what_was_measured_is_separated_with_the_index_of_each_pixel(run: polarg
     gaussians = {name: values.detach() for name, values in run.gaussians.items()}
 
     def separated(index: float, offset: float) -> torch.Tensor:
-        feed = Feed(choose_backend("cpu"), recipe, index, ViewStore(), [view], 60, black=False)
+        settings = TrainSettings(60, background="scene", refractive_index=index)
+        feed = Feed(context_of(run.scene, recipe, settings))
         own = {**gaussians, "index_offset": torch.full_like(gaussians["index_offset"], offset)}
         priors = feed.targets(59, view, stage.weights, own).priors
         return priors.diffuse[run.result(view.name).alpha > 0.99]

@@ -14,8 +14,9 @@ from polarguide.gaussians.ply import read_ply
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
 from polarguide.runs.model import write_run_ply
+from polarguide.training.callbacks import NormalOrientation
+from polarguide.training.loop import TrainingLoop
 from polarguide.training.recipe import Recipe
-from polarguide.training.trainer import Trainer
 
 OF_GAUSSIANS = [name for name, recipe in RECIPES.items() if isinstance(recipe, Recipe)]
 STEPS, HALF = 20, 9
@@ -26,7 +27,7 @@ def plain_adam(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("polarguide.gaussians.adam.adam", unfused_adam)
 
 
-def checkpoint(folder: Path, trainer: Trainer) -> dict[str, Tensor]:
+def checkpoint(folder: Path, trainer: TrainingLoop) -> dict[str, Tensor]:
     folder.mkdir(exist_ok=True)
     save_checkpoint(folder, trainer.state)
     return load_file(folder / CHECKPOINT)
@@ -44,11 +45,8 @@ def test_a_step_of_every_stage_stays_there_and_waits_for_nothing(tiny_scene: Sce
         for step in stages.values():
             for again in (False, True):
                 trainer.state.step, before = step, device.waits
-                stage = trainer.schedule.at(step).stage
-                trainer._act((), stage)
-                trainer._backpropagate(0, stage, True)
-                trainer._join_gradients(idle=False)
-                trainer._optimize()
+                trainer.prepare()
+                trainer.optimize()
                 assert not again or device.waits == before, step
 
 
@@ -98,9 +96,9 @@ def test_what_a_recipe_begins_and_ends_with(tiny_scene: Scene, tmp_path: Path, n
         with OtherDevice():
             trainer = make_trainer(tiny_scene, RECIPES[name], STEPS, backend=backend)
             if RECIPES[name].oriented:
-                trainer._act(("orient_normals",), RECIPES[name].stages[0])
+                NormalOrientation().act(trainer)
                 outward.append(trainer.state.gaussians["outward"].detach().to("cpu"))
-            write_run_ply(tmp_path / "run.ply", trainer.state, trainer.shading)
+            write_run_ply(tmp_path / "run.ply", trainer.state, trainer.current.shading)
         written.append(read_ply(tmp_path / "run.ply"))
     assert bool(outward) == RECIPES[name].oriented
     if outward:

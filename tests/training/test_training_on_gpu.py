@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from trainings import make_trainer, run
 
 from polarguide.capture import Scene
 from polarguide.raster import Backend, Rasterized, choose_backend
@@ -13,7 +14,6 @@ from polarguide.recipes import RECIPES
 from polarguide.runs.folder import load_checkpoint, resolve, save_checkpoint
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
-from polarguide.training.trainer import Trainer
 
 OF_GAUSSIANS = [name for name, recipe in RECIPES.items() if isinstance(recipe, Recipe)]
 
@@ -27,9 +27,8 @@ pytestmark = [
 
 
 def final_psnr(scene: Scene, recipe: Recipe, backend: Backend, steps: int = 200) -> float:
-    reports: list[float] = []
-    trainer = Trainer(scene, recipe, resolve(TrainSettings(steps, 3), scene, recipe), backend)
-    trainer.run(lambda report: reports.append(report.psnr))
+    trainer = make_trainer(scene, recipe, steps, backend=backend)
+    reports = [float(report.measured[1]) for report in run(trainer)]
     return sum(reports[-20:]) / 20
 
 
@@ -40,14 +39,8 @@ def test_every_recipe_learns_what_the_cpu_learns(tiny_scene: Scene, name: str) -
 
 
 def test_all_that_can_happen_happens(tiny_scene: Scene, busy_recipe: Recipe) -> None:
-    counts: list[int] = []
-    trainer = Trainer(
-        tiny_scene,
-        busy_recipe,
-        resolve(TrainSettings(60, 3), tiny_scene, busy_recipe),
-        choose_backend("cuda"),
-    )
-    trainer.run(lambda report: counts.append(report.gaussians))
+    trainer = make_trainer(tiny_scene, busy_recipe, 60, backend=choose_backend("cuda"))
+    counts = [report.gaussians for report in run(trainer)]
     assert len(set(counts)) > 3
     state = trainer.state.tensors()
     assert all(t.device.type == "cuda" for name, t in state.items() if name != "scalars")
@@ -58,13 +51,12 @@ def test_all_that_can_happen_happens(tiny_scene: Scene, busy_recipe: Recipe) -> 
 def test_a_checkpoint_goes_on_elsewhere(
     tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path, first: Any, second: Any
 ) -> None:
-    settings = resolve(TrainSettings(60, 3), tiny_scene, busy_recipe)
-    begun = Trainer(tiny_scene, busy_recipe, settings, choose_backend(first))
-    begun.run(lambda _: None, until=30)
+    begun = make_trainer(tiny_scene, busy_recipe, 60, backend=choose_backend(first))
+    begun.run(30)
     save_checkpoint(tmp_path, begun.state)
     backend = choose_backend(second)
     state = load_checkpoint(tmp_path, busy_recipe, backend.device)
-    Trainer(tiny_scene, busy_recipe, settings, backend, state).run(lambda _: None)
+    make_trainer(tiny_scene, busy_recipe, 60, state, backend=backend).run()
     assert state.step == 60
 
 
@@ -82,7 +74,8 @@ def test_a_plain_step_waits_for_nothing_of_its_own(tiny_scene: Scene, name: str)
             torch.cuda.set_sync_debug_mode("error" if strict else "default")
 
     settings = resolve(TrainSettings(10_000, 0), tiny_scene, RECIPES[name])
-    trainer = Trainer(tiny_scene, RECIPES[name], settings, backend._replace(rasterize=rasterize))
+    watched = backend._replace(rasterize=rasterize)
+    trainer = make_trainer(tiny_scene, RECIPES[name], 10_000, backend=watched, seed=0)
     views, begin = len(tiny_scene.train_views), 1
     for stage in RECIPES[name].stages:
         trainer.state.step = begin
@@ -92,8 +85,8 @@ def test_a_plain_step_waits_for_nothing_of_its_own(tiny_scene: Scene, name: str)
         strict = True
         try:
             for slot in range(views):
-                trainer._backpropagate(slot, stage, True)
-                trainer._optimize()
+                trainer.backpropagate(slot)
+                trainer.update_parameters()
         finally:
             strict = False
             torch.cuda.set_sync_debug_mode("default")

@@ -5,7 +5,7 @@ Nothing here prints or installs signal handlers: progress and messages go to a `
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from polarguide.results.export import formats, web_page
 from polarguide.results.rendering import film, pictures, relight
 from polarguide.runs import train as training
 from polarguide.runs.opened import OpenedRun
+from polarguide.training.callback import AnyCallback
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.viewer import server
@@ -91,6 +92,7 @@ def train(
     resume: bool = False,
     reporter: Reporter = SILENT,
     should_stop: Callable[[], bool] = lambda: False,
+    callbacks: Sequence[AnyCallback] = (),
 ) -> Run:
     """Train a recipe on a scene, into a run folder; see ``runs.train.train`` for all arguments.
 
@@ -122,6 +124,7 @@ def train(
         reporter=reporter,
         should_stop=should_stop,
         watch=looking if session.viewer else None,
+        callbacks=callbacks,
     )
     return Run.of(opened)
 

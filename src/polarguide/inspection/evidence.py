@@ -39,7 +39,8 @@ from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint
 from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.training.angles.trainer import AngleTrainer
+from polarguide.training.angles.fits import gaussian_training
+from polarguide.training.context import TrainingContext
 from polarguide.training.losses import depth_normals
 from polarguide.training.priors import guide_normals
 from polarguide.training.recipe import Priors, Recipe
@@ -399,21 +400,21 @@ def short_run(
     }
     until = until or steps
     state = load_checkpoint(folder, recipe, backend.device) if _same(folder, wanted) else None
-    trainer = AngleTrainer(scene, recipe, settings, backend, state)
+    loop, _ = gaussian_training(TrainingContext(scene, recipe, settings, backend), state)
     if state is None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / CHECKPOINT).unlink(missing_ok=True)
         write_text(folder / KEY, json.dumps(wanted))
     try:
-        while trainer.state.step < until:
-            on_step(trainer.step())
-            if trainer.state.step % SAVE_EVERY == 0 or trainer.state.step == until:
-                save_checkpoint(folder, trainer.state)
+        while loop.state.step < until:
+            on_step(loop.step())
+            if loop.state.step % SAVE_EVERY == 0 or loop.state.step == until:
+                save_checkpoint(folder, loop.state)
     except KeyboardInterrupt:
-        if trainer.whole:
-            save_checkpoint(folder, trainer.state)
+        if loop.whole:
+            save_checkpoint(folder, loop.state)
         raise
-    return trainer.state
+    return loop.state
 
 
 def _same(folder: Path, wanted: dict[str, object]) -> bool:

@@ -25,7 +25,7 @@ from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers
 from polarguide.training.recipe import Recipe
-from polarguide.training.trainer import StepReport
+from polarguide.training.settings import StepReport
 
 RECIPE = "polarguide-stokes"
 CERTAIN = 0.6

@@ -16,7 +16,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import msgspec
 import torch
@@ -36,28 +36,15 @@ from polarguide.core.records import LARGEST_RECORD, decode
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import STEPS, ResolvedSettings, TrainSettings
-from polarguide.training.state import TrainingState
+from polarguide.training.state import SavedState, TrainingState
 
 CONFIGURATION = "run.json"
 CHECKPOINT = "checkpoint.safetensors"
 LOG = "log.jsonl"
 LOCK = ".lock"
 PLY = "point_cloud.ply"
-FOR_STEPS = {"adam", "frozen"}
+FOR_STEPS = {"adam", "frozen", "callback"}
 """Parts of the names of tensors that only further steps read."""
-
-
-class SavedState(Protocol):
-    """The state of a training as far as a checkpoint holds it.
-
-    Attributes:
-        step: number of finished steps.
-    """
-
-    step: int
-
-    def tensors(self) -> dict[str, Tensor]:
-        """All tensors by name."""
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ Count = Annotated[int, msgspec.Meta(ge=0)]
 
 
 @dataclass(frozen=True)
-class Polarization:
+class PolarizationSupport:
     """How far the layers and normals of a run rest on polarization.
 
     Attributes:
@@ -58,7 +58,7 @@ class Polarization:
     @classmethod
     def of(
         cls, views: Sequence[View], judgments: Sequence[Judgment], *, measured: bool, fitted: bool
-    ) -> Polarization:
+    ) -> PolarizationSupport:
         """Count the training views of a run.
 
         Args:
@@ -173,7 +173,7 @@ class Health:
             was too short to look at enough views.
     """
 
-    polarization: Polarization
+    polarization: PolarizationSupport
     warnings: tuple[str, ...] = ()
     views: dict[str, ViewHealth] = dataclasses.field(default_factory=dict)
     brightest: float | None = None
@@ -210,7 +210,7 @@ class Health:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class TrainingEvidence:
     """The evidence by which a finished training is examined.
 
     Attributes:
@@ -219,7 +219,7 @@ class Evidence:
     """
 
     views: Sequence[View]
-    polarization: Polarization
+    polarization: PolarizationSupport
     filters: bool
 
     def chosen(self, steps: int) -> list[View]:
@@ -231,7 +231,7 @@ class Evidence:
 
 @torch.no_grad()
 def examine(
-    model: GaussianModel, evidence: Evidence, points: Tensor, steps: int, reporter: Reporter
+    model: GaussianModel, evidence: TrainingEvidence, points: Tensor, steps: int, reporter: Reporter
 ) -> Health:
     """Look at training views; changes nothing of the model.
 

@@ -29,6 +29,7 @@ from polarguide.runs.health import Health
 from polarguide.runs.model import GaussianModel, Within
 from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
 from polarguide.training.recipe import Recipe
+from polarguide.training.settings import TrainSettings
 
 Opened = TypeVar("Opened", bound="OpenedRun")
 
@@ -176,8 +177,7 @@ class OpenedRun:
         if recorded != scene.test_names:
             names = {view.name for view in scene.views}
             scene = replace(scene, test_names=tuple(name for name in recorded if name in names))
-        scene = select_exposures(scene, configuration.settings.exposures)
-        return mask_background(scene) if configuration.settings.background == "masked" else scene
+        return trained_scene(scene, configuration.settings)
 
     @property
     def scene_folder(self) -> Path:
@@ -405,6 +405,12 @@ def read_scene(
     for warning in scene.warnings:
         reporter.warn(warning)
     return scene
+
+
+def trained_scene(scene: Scene, settings: TrainSettings) -> Scene:
+    """The scene with the exposures and the background that a training with these settings uses."""
+    chosen = select_exposures(scene, settings.exposures)
+    return mask_background(chosen) if settings.background == "masked" else chosen
 
 
 def _warn(text: str) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from polarguide.capture import Scene
 from polarguide.capture.exposures import TABLE, Exposure, table_text
@@ -17,7 +18,6 @@ from polarguide.core.progress import Reporter
 from polarguide.core.text import command
 from polarguide.runs.model import GaussianModel
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers
-from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.metals.observations import blended, evenly
 from polarguide.visualization.figures import contact_sheet, radiance_to_rgb, scalar_to_rgb, write_png
 
@@ -39,7 +39,7 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
     judgments = polarizers.judgments()
     if not judgments:
         return
-    names = picture_names(scene)
+    names = picture_files(scene)
     of = {(judgment.view, judgment.number): judgment for judgment in judgments}
     lines: list[tuple[str, str, Exposure, float | None, str]] = []
     for view in scene.views:
@@ -67,23 +67,31 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
         if 2 * doubtful > len(sought):
             reporter.warn(f"Most angles are doubtful, and so are the layers and normals. {REMEDY}")
     vague = [judgment for judgment in sought if judgment.vague]
-    if guessed := [judgment for judgment in vague if judgment.guesses]:
-        reporter.warn(f"{named(guessed)} hardly determine their angle; the most likely one is used.")
-    if lost := [judgment for judgment in vague if not judgment.guesses]:
-        reporter.warn(f"{named(lost)} do not determine their angle and are used as photographs.")
-    if unsettled := [judgment for judgment in sought if judgment.unsettled]:
-        reporter.warn(
-            f"{named(unsettled)} may be at another angle: the fits of the training do not agree on it."
-        )
-    if poor := [judgment for judgment in sought if judgment.poorly_explained and not judgment.unsettled]:
-        reporter.warn(
-            f"{named(poor)} may be at another angle: the scene explains them worse than the others, and hardly better "
-            "than a filter turned by 90 degrees would."
-        )
-    if plain := [judgment for judgment in judgments if judgment.unfiltered]:
-        reporter.warn(
-            f"{named(plain)} look as if taken without a filter, or through a circular one mounted the wrong way round."
-        )
+    for chosen, fault in (
+        (
+            [judgment for judgment in vague if judgment.guesses],
+            "hardly determine their angle; the most likely one is used.",
+        ),
+        (
+            [judgment for judgment in vague if not judgment.guesses],
+            "do not determine their angle and are used as photographs.",
+        ),
+        (
+            [judgment for judgment in sought if judgment.unsettled],
+            "may be at another angle: the fits of the training do not agree on it.",
+        ),
+        (
+            [judgment for judgment in sought if judgment.poorly_explained and not judgment.unsettled],
+            "may be at another angle: the scene explains them worse than the others, and hardly better than a filter "
+            "turned by 90 degrees would.",
+        ),
+        (
+            [judgment for judgment in judgments if judgment.unfiltered],
+            "look as if taken without a filter, or through a circular one mounted the wrong way round.",
+        ),
+    ):
+        if chosen:
+            reporter.warn(f"{named(chosen)} {fault}")
     specified = [judgment for judgment in judgments if judgment.specified.angle is not None]
     if specified and all(judgment.limit >= ANY for judgment in specified):
         reporter.say(
@@ -100,14 +108,20 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
         )
 
 
-def report_metals(out: Path, trainer: AngleTrainer, model: GaussianModel, reporter: Reporter) -> None:
-    """Say what is metal and of what polarization cannot tell, and write ``metals.png`` with both."""
-    undecided = trainer.undecided()
+def report_metals(
+    out: Path, scene: Scene, undecided: Tensor | None, model: GaussianModel, reporter: Reporter
+) -> None:
+    """Say what is metal and of what polarization cannot tell, and write ``metals.png`` with both.
+
+    Args:
+        out: the run folder. scene: the capture. undecided: see ``MetalSearch.undecided``; None: no report.
+        model: the trained Gaussians. reporter: receives a summary.
+    """
     if undecided is None:
         return
     gaussians = model.state.gaussians
     rasterize = model.backend.rasterize
-    views = evenly(trainer.scene.train_views, METAL_VIEWS)
+    views = evenly(scene.train_views, METAL_VIEWS)
     kinds = [
         [blended(gaussians, values, view.camera, rasterize).cpu() for view in views]
         for values in (gaussians["metalness"], undecided.float())
@@ -131,7 +145,7 @@ def report_metals(out: Path, trainer: AngleTrainer, model: GaussianModel, report
     )
 
 
-def picture_names(scene: Scene) -> dict[str, list[str]]:
+def picture_files(scene: Scene) -> dict[str, list[str]]:
     """The files of each view's pictures; where the scene was not read from such files, the view and a number."""
     try:
         layout = find_layout(scene.root)

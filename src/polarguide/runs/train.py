@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +14,6 @@ import torch
 
 from polarguide.capture import Scene
 from polarguide.capture.layout import refuse_scene
-from polarguide.capture.variants import mask_background, select_exposures
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import check_out, make_folder
 from polarguide.core.options import PathLike, SceneOptions, SessionOptions
@@ -23,6 +22,7 @@ from polarguide.core.records import first_difference
 from polarguide.core.system import MEBIBYTE, MemoryBound, peak_memory_mib, return_freed_memory
 from polarguide.raster import Backend, use_threads
 from polarguide.recipes import recipe_named
+from polarguide.runs.callbacks import Ends, Look, run_to_the_end
 from polarguide.runs.folder import (
     CHECKPOINT,
     CONFIGURATION,
@@ -34,23 +34,24 @@ from polarguide.runs.folder import (
     save_checkpoint,
     writing_to,
 )
-from polarguide.runs.health import Evidence, Polarization, examine
-from polarguide.runs.loop import Ends, Look, TrainingLoop
+from polarguide.runs.health import PolarizationSupport, TrainingEvidence, examine
 from polarguide.runs.memory_plan import MemoryPlan, in_gigabytes, pixels_of, plan_memory
 from polarguide.runs.model import GaussianModel, write_run_ply
-from polarguide.runs.opened import OpenedRun, read_scene
+from polarguide.runs.opened import OpenedRun, read_scene, trained_scene
 from polarguide.runs.painted import FOLDER, read_painted
 from polarguide.runs.reports import report_metals, report_polarizers
 from polarguide.runs.stopwatch import in_words
-from polarguide.training.angles.polarizers import predicts_filters
-from polarguide.training.angles.trainer import AngleTrainer
+from polarguide.training.angles.fits import gaussian_training
+from polarguide.training.angles.polarizers import Polarizers, predicts_filters
+from polarguide.training.callback import AnyCallback
+from polarguide.training.context import TrainingContext
 from polarguide.training.distributed import Ranks, backend_of, process_group
-from polarguide.training.feed import ViewStore
-from polarguide.training.metals.search import looks
+from polarguide.training.loop import TrainingLoop
+from polarguide.training.metals.search import MetalSearch, looks, warn_of_unused_materials
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import ResolvedSettings, TrainSettings
 from polarguide.training.state import TrainingState
-from polarguide.training.trainer import warn_of_unused_materials
+from polarguide.training.storage import ViewStore
 
 
 def train(
@@ -64,7 +65,8 @@ def train(
     resume: bool = False,
     reporter: Reporter = SILENT,
     should_stop: Ends = lambda: False,
-    watch: Callable[[AngleTrainer], AbstractContextManager[Look]] | None = None,
+    watch: Callable[[TrainingLoop], AbstractContextManager[Look]] | None = None,
+    callbacks: Sequence[AnyCallback] = (),
 ) -> OpenedRun:
     """Train a recipe on a scene, into a run folder.
 
@@ -80,7 +82,8 @@ def train(
         resume: go on with the run in ``out``, to the same result.
         reporter: receives progress.
         should_stop: asked between steps.
-        watch: gives, for the trainer, a context with what is to be called between steps.
+        watch: gives, for the loop, a context with what is to be called between steps.
+        callbacks: further callbacks, see ``training.callback.Callback``; they come after those of the method.
 
     Raises:
         PolarguideError: wrong input, a folder that does not suit, or a loss that is not finite.
@@ -97,9 +100,7 @@ def train(
         earlier = RunConfiguration.load(out).settings if resume else None
         plan = _planned(scene, chosen, settings, earlier, reading)
         whole = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter, hold=plan.hold)
-        loaded = select_exposures(whole, settings.exposures)
-        if settings.background == "masked":
-            loaded = mask_background(loaded)
+        loaded = trained_scene(whole, settings)
         check_trainable(loaded)
         if settings.refractive_index is None and not resume and loaded.refractive_index is not None:
             reporter.say(f"refractive index {loaded.refractive_index:g}, as scene.json says")
@@ -107,7 +108,7 @@ def train(
         if resolved.views_per_step < ranks.world:
             idle = ranks.world - resolved.views_per_step
             reporter.warn(f"{idle} of {ranks.world} processes have no view to look at")
-        if settings.background == "auto" and resolved.background == "black" and leads:
+        if settings.background == "auto" and resolved.background == "black":
             reporter.say("the edges of the pictures are black: nothing is taken to be behind the subject")
         painted = read_painted(out, loaded) if resume else None
         if painted is not None:
@@ -120,25 +121,16 @@ def train(
         if resume:
             if leads:
                 locked.enter_context(writing_to(out))
-            recorded = RunConfiguration.load(out)
-            check_same_run(recorded, configuration, out)
-            if os.path.lexists(out / CHECKPOINT):  # a link to nowhere is no absence
-                state = load_checkpoint(out, chosen, backend.device)
-                _check_state(state, resolved, out)
-            else:
-                reporter.say(f"{out} has no checkpoint: the training begins at step 0")
-            if recorded.painted != digest:
-                _go_back(state, chosen, resolved, out, reporter)
-                if state is not None and leads:
-                    save_checkpoint(out, state)  # before run.json says that what was painted is in it
+            state = _resumed_state(out, chosen, configuration, reporter, leads=leads)
         return_freed_memory()  # of decoded files
         store = locked.enter_context(closing(view_store(plan, backend, out, reporter)))
         bound = MemoryBound(plan.peak)
-        warn_of_unused_materials(loaded, chosen, resolved, backend, reporter.warn)
-        trainer = AngleTrainer(loaded, chosen, resolved, backend, state, ranks, store, reporter.warn, bound)
-        if trainer.polarizers.ignored:
+        context = TrainingContext(loaded, chosen, resolved, backend, ranks, store, bound, reporter)
+        warn_of_unused_materials(context)
+        loop, fits = gaussian_training(context, state, callbacks)
+        if fits.polarizers.ignored:
             reporter.warn(ignored_filters(chosen.name))
-        with watch(trainer) if watch is not None else nullcontext() as look:
+        with watch(loop) if watch is not None else nullcontext() as look:
             ranks.barrier()
             if leads:
                 if not resume:
@@ -146,22 +138,60 @@ def train(
                     if problem := unsuitable_folder(out, resume):  # another training has begun meanwhile
                         raise problem
                 configuration.save(out)
-            seconds = TrainingLoop(trainer, out, session, reporter, should_stop, look, bound).run()
-        model = GaussianModel.of(trainer.state, chosen, resolved, backend)
+            seconds = run_to_the_end(loop, out, session, reporter, should_stop, look, bound)
+        model = GaussianModel.of(loop.state, chosen, resolved, backend)
         reporter.say(resources_used(seconds, plan.peak))
         if leads:
-            finished = _Warned(reporter)
-            report_polarizers(out, loaded, trainer.polarizers, finished)
-            report_metals(out, trainer, model, finished)
-            centers = torch.stack([view.camera.center for view in loaded.views])
-            write_run_ply(out / PLY, model.state, model.shading, centers)
-            health = examine(model, _evidence(trainer, chosen), loaded.points, resolved.steps, reporter)
-            for warning in health.warnings:
-                reporter.warn(warning)
-            health = replace(health, warnings=(*health.warnings, *finished.warnings))
-            health.save(out)
-            reporter.say(f"{health.summary}; polarization: {health.polarization.text}")
+            _finish(out, loop, model, fits.polarizers)
     return OpenedRun(out, configuration, chosen, model, scene=whole, reporter=reporter)
+
+
+def _resumed_state(
+    out: Path, recipe: Recipe, configuration: RunConfiguration, reporter: Reporter, *, leads: bool
+) -> TrainingState | None:
+    """Read the state to resume from; None if the run has no checkpoint.
+
+    Where other materials are painted over the run than it was trained with, the state goes back to the last step that
+    decides on metals.
+    """
+    settings = configuration.settings
+    recorded = RunConfiguration.load(out)
+    check_same_run(recorded, configuration, out)
+    state = None
+    if os.path.lexists(out / CHECKPOINT):  # a link to nowhere is no absence
+        state = load_checkpoint(out, recipe, torch.device(configuration.device))
+        _check_state(state, settings, out)
+    else:
+        reporter.say(f"{out} has no checkpoint: the training begins at step 0")
+    if recorded.painted != configuration.painted:
+        _go_back(state, recipe, settings, out, reporter)
+        if state is not None and leads:
+            save_checkpoint(out, state)  # before run.json records the painted materials
+    return state
+
+
+def _finish(out: Path, loop: TrainingLoop, model: GaussianModel, polarizers: Polarizers) -> None:
+    """Write the files of a finished training beside its checkpoint: reports, PLY, and health."""
+    context = loop.context
+    scene = context.scene
+    recipe = context.recipe
+    reporter = context.reporter
+    noted = NotedWarnings(reporter)
+    report_polarizers(out, scene, polarizers, noted)
+    report_metals(out, scene, MetalSearch(loop.current).undecided(loop.state), model, noted)
+    centers = torch.stack([view.camera.center for view in scene.views])
+    write_run_ply(out / PLY, model.state, model.shading, centers)
+    views = [polarizers.believed(view) for view in context.views]
+    filters = predicts_filters(recipe)
+    priors = any(stage.weights.priors for stage in recipe.stages)
+    support = PolarizationSupport.of(views, polarizers.judgments(), measured=priors, fitted=filters)
+    evidence = TrainingEvidence(views, support, filters=filters)
+    health = examine(model, evidence, scene.points, context.settings.steps, reporter)
+    for warning in health.warnings:
+        reporter.warn(warning)
+    health = replace(health, warnings=(*health.warnings, *noted.warnings))
+    health.save(out)
+    reporter.say(f"{health.summary}; polarization: {health.polarization.text}")
 
 
 def resources_used(seconds: float, planned: int) -> str:
@@ -171,14 +201,16 @@ def resources_used(seconds: float, planned: int) -> str:
     return f"took {in_words(seconds)}{memory} (planned: up to {in_gigabytes(planned)})"
 
 
-class _Warned(Reporter):
+class NotedWarnings(Reporter):
     """Hands messages on to another reporter, and keeps the warnings."""
 
     def __init__(self, to: Reporter) -> None:
-        self.say = to.say  # type: ignore[method-assign]
-        self.track = to.track  # type: ignore[method-assign]
         self._to = to
         self.warnings = list[str]()
+
+    def say(self, text: str) -> None:
+        """See ``Reporter``."""
+        self._to.say(text)
 
     def warn(self, text: str) -> None:
         """See ``Reporter``."""
@@ -328,16 +360,6 @@ def _go_back(
         state.step = last
         state.frozen = None
         state.footprints = None
-
-
-def _evidence(trainer: AngleTrainer, recipe: Recipe) -> Evidence:
-    """The evidence by which a finished training is examined."""
-    views = [trainer.polarizers.believed(view) for view in trainer.scene.train_views]
-    filters = predicts_filters(recipe)
-    priors = any(stage.weights.priors for stage in recipe.stages)
-    judgments = trainer.polarizers.judgments()
-    polarization = Polarization.of(views, judgments, measured=priors, fitted=filters)
-    return Evidence(views, polarization, filters=filters)
 
 
 def ignored_filters(recipe: str) -> str:

@@ -1,26 +1,22 @@
-"""Changes of Gaussians between steps: density control, resets, normal propagation, and the search for outer sides."""
+"""Changes of Gaussians between steps: resets, normal propagation, outward directions, pixel counts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from polarguide.capture import Scene, View
-from polarguide.core.system import MemoryBound
-from polarguide.gaussians.densify import densify, free_space
-from polarguide.gaussians.initialize import scene_extent
+from polarguide.capture import View
 from polarguide.geometry.camera import Camera, seen_at
 from polarguide.geometry.vectors import unit
-from polarguide.raster import Backend, Rasterize
+from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.model import Parameters, ShadingModel
 from polarguide.training.distributed import Ranks
-from polarguide.training.recipe import Propagation, Recipe
-from polarguide.training.settings import ResolvedSettings
-from polarguide.training.state import TrainingState, seeded
+from polarguide.training.recipe import Propagation
+from polarguide.training.state import TrainingState
 
 
 def _logit(value: float) -> float:
@@ -136,90 +132,7 @@ def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: 
     return PixelCounts(views, most)
 
 
-class DensityControl:
-    """Adds and removes Gaussians, by what all ranks have seen.
-
-    Args:
-        scene: the capture. recipe: the method. settings: the user's choices.
-        backend: device and rasterizer. ranks: the processes that share the views of each step.
-        memory: gives back what was freed between two views. black: whether nothing is behind the subject.
-
-    Attributes:
-        extent: extent of the scene, to which distances are relative.
-    """
-
-    def __init__(
-        self,
-        scene: Scene,
-        recipe: Recipe,
-        settings: ResolvedSettings,
-        backend: Backend,
-        ranks: Ranks,
-        memory: MemoryBound,
-        *,
-        black: bool,
-    ) -> None:
-        self._settings = settings
-        self._backend = backend
-        self._ranks = ranks
-        self._memory = memory
-        self._densification = recipe.densification
-        self._black = black
-        self._views: Sequence[View] = scene.train_views
-        centers = torch.stack([view.camera.center for view in self._views])
-        self.extent = scene_extent(centers)
-        self._middle = centers.mean(dim=0).float().to(backend.device)
-        cameras = [view.camera for view in self._views]
-        density = self._densification
-        empty = free_space(scene.points, cameras, density.free_share, density.free_quantile)
-        self._empty = empty.to(backend.device)
-
-    def exchange_statistics(self, state: TrainingState) -> None:
-        """Let every rank know what all have seen since the last densification. All ranks have to call it."""
-        for sums in (state.statistics.gradient, state.statistics.seen):
-            self._ranks.exchange_slots(sums if sums.ndim == 2 else sums[None])
-
-    def after_step(self, state: TrainingState, *, last: bool) -> None:
-        """Density control after a step of a stage that has it.
-
-        Args:
-            last: whether the next step has no density control; Gaussians that show too little are then removed.
-        """
-        settings = self._settings
-        densification = self._densification
-        if state.step % densification.every == 0:
-            self.exchange_statistics(state)
-            densify(
-                state.gaussians,
-                state.statistics,
-                densification,
-                extent=self.extent,
-                middle=self._middle,
-                prune_large=densification.prunes_large(state.step, settings.steps),
-                empty=self._empty,
-                limit=settings.gaussians,
-                generator=seeded(settings.seed, 2, state.step),
-            )
-        if last:
-            self._prune_untouched(state)
-
-    def _prune_untouched(self, state: TrainingState) -> None:
-        """Remove Gaussians that show too little.
-
-        Before nothing, those that too few training views can tell anything about: in new views they are fog. And those
-        that are faint in all training views, where the recipe says how faint.
-        """
-        faint = self._densification.faint_pixels
-        if not (self._black or faint):
-            return
-        cameras = self._memory.between(view.camera for view in self._views)
-        touched = touched_pixels(state.gaussians, cameras, self._backend.rasterize)
-        for values in touched:
-            self._ranks.broadcast(values)
-        keep = touched.most >= faint
-        if self._black:
-            enough = len(self._views) >= self._densification.enough_views
-            keep &= touched.views >= (2 if enough else 1)
-        if bool(keep.any()):
-            state.gaussians.keep(keep)
-            state.statistics.clear(len(state.gaussians))
+def exchange_statistics(state: TrainingState, ranks: Ranks) -> None:
+    """Let every rank know what all have seen since the last densification. Every rank calls it."""
+    for sums in (state.statistics.gradient, state.statistics.seen):
+        ranks.exchange_slots(sums if sums.ndim == 2 else sums[None])

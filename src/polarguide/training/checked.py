@@ -1,12 +1,14 @@
 """Checks of a checkpoint: every tensor is checked here before anything computes with it.
 
-The kernels and the fused optimizer take shapes at their word, so a tensor that does not fit would be read or written
-beyond its end; one that is not finite would show as a picture of nothing.
+The kernels and the fused optimizer read and write as far as the shapes say, so a tensor of another shape would be read
+beyond its end. A value that is not finite would show as an empty picture.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -15,144 +17,130 @@ from polarguide.gaussians.adam import MOMENTS
 from polarguide.training.recipe import Recipe
 from polarguide.training.state import ANGLE_COLUMNS
 
-LARGEST = {"means": 1e12, "log_scales": 1e4}
 LARGEST_VALUE = 1e8
-LARGEST_LOG_SCALE = 60.0
+"""Largest absolute value of a parameter without a range of its own."""
+RANGES = {"means": (-1e12, 1e12), "log_scales": (-1e4, 60.0)}
+"""Ranges of parameters."""
 MOST_SLOTS = 4096
+"""Largest number of views a step."""
+MOST_STEPS = 1 << 50
+"""Largest number of steps."""
+
+
+@dataclass(frozen=True)
+class TensorRule:
+    """Shape, type and range of a tensor; values have to be finite."""
+
+    shape: tuple[int, ...]
+    low: float = -sys.float_info.max
+    high: float = sys.float_info.max
+    dtype: torch.dtype = torch.float32
+
+    def check(self, name: str, values: Tensor) -> None:
+        """Check a tensor.
+
+        Raises:
+            ValueError: it has another shape, type or range; the message names it.
+        """
+        if values.dtype != self.dtype or tuple(values.shape) != self.shape:
+            found = f"{list(values.shape)}, {values.dtype}"
+            raise ValueError(f"{name} of shape {found}, not {list(self.shape)}, {self.dtype}")
+        if values.numel():
+            low, high = (float(end) for end in values.aminmax())
+            if not (low >= self.low and high <= self.high):  # false for NaN
+                raise ValueError(f"{name} with values from {low:g} to {high:g}")
+
+
+def check_tensors(tensors: Mapping[str, Tensor], rules: Mapping[str, TensorRule]) -> None:
+    """Check that tensors are those of the rules, and no others.
+
+    Raises:
+        ValueError: one is missing, is not known, or has another shape, type or range; the message names it.
+    """
+    for name, rule in rules.items():
+        rule.check(name, _tensor(tensors, name))
+    strangers = sorted(tensors.keys() - rules.keys())
+    if strangers:
+        raise ValueError(f"{strangers[0][:80]}, which is not known")
+
+
+def moment_rules(tensors: Mapping[str, Tensor], prefix: str, shape: tuple[int, ...]) -> dict[str, TensorRule]:
+    """Return the rules of Adam's moments of a tensor of this shape; none if no moment is stored."""
+    rules = {
+        "step": TensorRule((), 0.0),
+        "exp_avg": TensorRule(shape),
+        "exp_avg_sq": TensorRule(shape, 0.0),
+    }
+    assert rules.keys() == {*MOMENTS}
+    named = {prefix + key: rule for key, rule in rules.items()}
+    return {} if tensors.keys().isdisjoint(named) else named
 
 
 def refuse_foreign(tensors: Mapping[str, Tensor], recipe: Recipe) -> None:
     """Check that tensors are what a training of the recipe leaves.
 
-    Shapes are those that the recipe and its shading model state. Parameters and Adam's moments are finite float32 of
-    plausible size, rotations have a length, second moments and sums are not negative. The copy from which priors are
-    computed may have another number of Gaussians. No other tensors are allowed.
+    Shapes are those that the recipe and its shading model state. The copy from which priors are computed may have
+    another number of Gaussians. Tensors of further callbacks are theirs to check.
 
     Raises:
         ValueError: one is missing, is not known, or has another shape, type or range; the message names it.
     """
-    names = {"scalars", "statistics.gradient", "statistics.seen"}
     count = _count(tensors, "gaussians.means")
-    shapes = {name: (count, *shape) for name, shape in recipe.shapes.items()}
     light = {name: parameter.shape for name, parameter in recipe.shading.light_parameters.items()}
-    for kind, table, rates in (
-        ("gaussians", shapes, recipe.learning_rates),
-        ("environment", light, recipe.light_rates),
-    ):
-        for name, shape in table.items():
-            _check_values(tensors, f"{kind}.{name}", shape, name)
-            names.add(f"{kind}.{name}")
-            if name in rates:
-                names |= _check_moments(tensors, _moments(kind, name), shape)
+    kinds = {
+        "gaussians": {name: (count, *shape) for name, shape in recipe.shapes.items()},
+        "environment": light,
+    }
     if any(name.startswith("frozen.") for name in tensors):
         frozen = _count(tensors, "frozen.means")
-        for name, each in recipe.shapes.items():
-            _check_values(tensors, f"frozen.{name}", (frozen, *each), name)
-            names.add(f"frozen.{name}")
-    _check_statistics(tensors, count)
-    _check_scalars(tensors)
-    if "angles" in tensors:
-        _check_angles(tensors["angles"])
-        names.add("angles")
+        kinds["frozen"] = {name: (frozen, *shape) for name, shape in recipe.shapes.items()}
+    sums = TensorRule(_statistics_shape(tensors, count), 0.0)
+    rules = {
+        "statistics.gradient": sums,
+        "statistics.seen": sums,
+        "scalars": TensorRule((2,), 0, MOST_STEPS, torch.int64),
+    }
+    for kind, shapes in kinds.items():
+        for name, shape in shapes.items():
+            rules[f"{kind}.{name}"] = TensorRule(shape, *RANGES.get(name, (-LARGEST_VALUE, LARGEST_VALUE)))
+    for name in recipe.learning_rates:
+        rules |= moment_rules(tensors, f"adam.{name}.", kinds["gaussians"][name])
+    for name, shape in light.items():
+        prefix = "environment.adam." if name == "texels" else f"environment.adam.{name}."
+        rules |= moment_rules(tensors, prefix, shape)
     if "footprints" in tensors:
-        values = _shaped(tensors, "footprints", (count,))
-        if float(values.min()) < 0 or float(values.max()) > LARGEST["means"]:
-            raise ValueError(f"footprints from {float(values.min()):g} to {float(values.max()):g}")
-        names.add("footprints")
-    strangers = sorted(tensors.keys() - names)
-    if strangers:
-        raise ValueError(f"{strangers[0][:80]}, which is not known")
+        rules["footprints"] = TensorRule((count,), 0.0, RANGES["means"][1])
+    if "angles" in tensors:
+        fits, pictures = (tensors["angles"].shape + (0, 0))[:2]
+        rules["angles"] = TensorRule((fits, pictures, ANGLE_COLUMNS), 0.0, dtype=torch.float64)
+    check_tensors({n: t for n, t in tensors.items() if not n.startswith("callback.")}, rules)
+    _check_lengths(tensors, (f"{kind}.quaternions" for kind in kinds if kind != "environment"))
+    if "angles" in tensors and not (tensors["angles"][..., 1] > 0).all():
+        raise ValueError("angles with gains that are not positive")
 
 
-def _moments(kind: str, name: str) -> str:
-    """The prefix of the names of a tensor's moments, as ``Trained`` and ``Environment`` write them."""
-    if kind == "gaussians":
-        return f"adam.{name}."
-    return "environment.adam." if name == "texels" else f"environment.adam.{name}."
-
-
-def _count(tensors: Mapping[str, Tensor], name: str) -> int:
-    means = _given(tensors, name)
-    if means.ndim != 2:
-        raise ValueError(f"{name} of shape {list(means.shape)}, not [N, 3]")
-    if not len(means):  # densification always leaves one
-        raise ValueError(f"{name} of no Gaussian")
-    return int(means.shape[0])
-
-
-def _given(tensors: Mapping[str, Tensor], name: str) -> Tensor:
+def _tensor(tensors: Mapping[str, Tensor], name: str) -> Tensor:
     if name not in tensors:
         raise ValueError(f"no {name}")
     return tensors[name]
 
 
-def _shaped(tensors: Mapping[str, Tensor], name: str, shape: tuple[int, ...]) -> Tensor:
-    """A tensor of finite float32 in a shape."""
-    values = _given(tensors, name)
-    if values.dtype != torch.float32 or tuple(values.shape) != tuple(shape):
-        found = f"{list(values.shape)}, {values.dtype}"
-        raise ValueError(f"{name} of shape {found}, not {list(shape)}, torch.float32")
-    if not bool(torch.isfinite(values).all()):
-        raise ValueError(f"{name} with values that are not finite")
-    return values
+def _count(tensors: Mapping[str, Tensor], name: str) -> int:
+    means = _tensor(tensors, name)
+    if means.ndim != 2 or not len(means):  # densification always leaves one
+        raise ValueError(f"{name} of shape {list(means.shape)}, not [N, 3] with N > 0")
+    return len(means)
 
 
-def _check_values(tensors: Mapping[str, Tensor], full: str, shape: tuple[int, ...], name: str) -> None:
-    values = _shaped(tensors, full, shape)
-    most = LARGEST.get(name, LARGEST_VALUE)
-    if float(values.abs().max()) > most or (name == "log_scales" and float(values.max()) > LARGEST_LOG_SCALE):
-        raise ValueError(f"{full} with values as large as {float(values.abs().max()):g}")
-    if name == "quaternions" and float(values.abs().amax(dim=-1).min()) == 0:
-        raise ValueError(f"{full} with rotations of length zero")
+def _statistics_shape(tensors: Mapping[str, Tensor], count: int) -> tuple[int, ...]:
+    """Return the shape of the sums of the density control: [N], or [S, N] for S views a step."""
+    shape = tuple(_tensor(tensors, "statistics.gradient").shape)
+    if shape == (count,) or (len(shape) == 2 and shape[1] == count and 1 < shape[0] <= MOST_SLOTS):
+        return shape
+    raise ValueError(f"statistics.gradient of shape {list(shape)}, not [{count}] or [S, {count}]")
 
 
-def _check_moments(tensors: Mapping[str, Tensor], prefix: str, shape: tuple[int, ...]) -> set[str]:
-    """Check Adam's moments of one tensor, all of them or none; returns their names."""
-    names = {prefix + key for key in MOMENTS}
-    there = names & tensors.keys()
-    if not there:
-        return names
-    if there != names:
-        raise ValueError(f"no {min(names - there)}")
-    _shaped(tensors, prefix + "exp_avg", shape)
-    for key, of in (("exp_avg_sq", shape), ("step", ())):
-        values = _shaped(tensors, prefix + key, of)
-        if values.numel() and float(values.min()) < 0:
-            raise ValueError(f"{prefix}{key} with negative values")
-    return names
-
-
-def _check_statistics(tensors: Mapping[str, Tensor], count: int) -> None:
-    shape = tuple(_given(tensors, "statistics.gradient").shape)
-    if shape[-1:] != (count,) or len(shape) > 2 or (len(shape) == 2 and not 1 < shape[0] <= MOST_SLOTS):
-        raise ValueError(f"statistics.gradient of shape {list(shape)}, not [{count}] or [S, {count}]")
-    for name in ("statistics.gradient", "statistics.seen"):
-        values = _shaped(tensors, name, shape)
-        if values.numel() and float(values.min()) < 0:
-            raise ValueError(f"{name} with negative values")
-
-
-def _check_angles(values: Tensor) -> None:
-    """Check what was found of polarizers: rows of a float64 table, as ``Polarizers`` leaves it."""
-    if (
-        values.dtype != torch.float64
-        or values.ndim != 3
-        or values.shape[2] != ANGLE_COLUMNS
-        or not len(values)
-    ):
-        raise ValueError(
-            f"angles of shape {list(values.shape)}, {values.dtype}, not [F, P, {ANGLE_COLUMNS}], torch.float64"
-        )
-    if not bool(torch.isfinite(values).all()) or (values.numel() and float(values.min()) < 0):
-        raise ValueError("angles with values that are negative or not finite")
-    if values.numel() and float(values[..., 1].min()) <= 0:
-        raise ValueError("angles with gains that are not positive")
-
-
-def _check_scalars(tensors: Mapping[str, Tensor]) -> None:
-    scalars = _given(tensors, "scalars")
-    if scalars.dtype != torch.int64 or tuple(scalars.shape) != (2,):
-        raise ValueError(f"scalars of shape {list(scalars.shape)}, {scalars.dtype}, not [2], torch.int64")
-    step, frozen_until = scalars.tolist()
-    if min(step, frozen_until) < 0 or max(step, frozen_until) > 1 << 50:
-        raise ValueError(f"scalars {scalars.tolist()}")
+def _check_lengths(tensors: Mapping[str, Tensor], names: Iterable[str]) -> None:
+    for name in names:
+        if not bool(tensors[name].any(dim=-1).all()):
+            raise ValueError(f"{name} with rotations of length zero")

@@ -26,7 +26,7 @@ from polarguide.training.native_terms import (
     S1_AND_S2,
     Consistency,
     Directions,
-    Polarization,
+    PolarizationTerm,
     Terms,
     pixel_terms,
 )
@@ -370,7 +370,7 @@ def normal_terms(step: Step, weights: Weights) -> Tensor:
             measured = priors.stokes[1:]
             index = shading.refractive_index
             factor = weights.stokes / measured.numel()
-            stokes = Polarization(measured, S1_AND_S2, priors.stokes_weight, factor, index, result.index)
+            stokes = PolarizationTerm(measured, S1_AND_S2, priors.stokes_weight, factor, index, result.index)
     if weights.consistency:
         factor = weights.consistency / ((result.alpha.shape[0] - 2) * (result.alpha.shape[1] - 2))
         consistency = Consistency(None if priors is None else priors.surface, factor)

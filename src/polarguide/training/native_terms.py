@@ -20,7 +20,7 @@ S1_AND_S2 = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 """The analyzers of S1 and S2 themselves."""
 
 
-class Polarization(NamedTuple):
+class PolarizationTerm(NamedTuple):
     """``factor * sum(weight * |a . S - measured|)`` over K measurements, pixels and colors.
 
     S is the Stokes vector of the rendered layers on a smooth dielectric (``optics.predicted_stokes``).
@@ -74,7 +74,7 @@ class Terms(NamedTuple):
         polarization: needs both layers. directions: any number. consistency: needs the depth.
     """
 
-    polarization: Polarization | None
+    polarization: PolarizationTerm | None
     directions: Sequence[Directions]
     consistency: Consistency | None
 

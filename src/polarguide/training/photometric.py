@@ -132,7 +132,7 @@ class _Photometric(torch.autograd.Function):
         return gradient * grad, None, None, None
 
 
-class _Explicit(_Photometric):
+class ExplicitPhotometric(_Photometric):
     """The loss with its gradient, computed in the forward pass; for any device."""
 
     @staticmethod
@@ -174,14 +174,6 @@ class _Explicit(_Photometric):
         error = (share * difference.square()).sum()
         ctx.mark_non_differentiable(error)
         return loss, error
-
-
-def photometric_loss_explicit(
-    prediction: Tensor, target: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
-) -> Tensor:
-    """``photometric_loss`` as other devices than the CPU compute it."""
-    result: tuple[Tensor, Tensor] = _Explicit.apply(prediction, target, weight, ssim_weight)
-    return result[0]
 
 
 def _check(prediction: Tensor, target: Tensor, weight: Tensor | None) -> None:
@@ -232,7 +224,7 @@ def photometric_terms(
         return Photometric(*_Photometric.apply(prediction, target_shown, weight, ssim_weight))
     if prediction.device.type == "cpu":
         return photometric_terms_reference(prediction, target_shown, weight, ssim_weight)
-    return Photometric(*_Explicit.apply(prediction, target_shown, weight, ssim_weight))
+    return Photometric(*ExplicitPhotometric.apply(prediction, target_shown, weight, ssim_weight))
 
 
 def behind_analyzer(stokes: Tensor, analyzer: Tensor) -> Tensor:

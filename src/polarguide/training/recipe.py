@@ -21,7 +21,8 @@ from polarguide.shading.model import PLAIN, ShadingModel
 from polarguide.training.losses import Weights as Weights
 from polarguide.training.rules import AngleRules, FlatRules, MetalRules, MetalViews
 
-Action = Literal["reset_opacity", "propagate_normals", "refresh_priors", "orient_normals"]
+Action = str
+"""Name of an action: the ``action`` of a callback, see ``training.callback``."""
 Candidates = Literal["paper", "azimuths", "physical"]
 Separation = Literal["paper", "exact"]
 _REMEDY = "Correct the recipe."
@@ -86,7 +87,7 @@ class Stage:
             normals which follow them confirm their own errors.
         behind: where, in shares of the distance of the cameras from the middle of the points (nine tenths are nearer),
             terms on normals and depth begin to fade as movers of Gaussians, and from where on they only turn them
-            (``training.trainer``): behind the subject, surfaces that agree with their normals in place of the pictures
+            (``training.behind``): behind the subject, surfaces that agree with their normals in place of the pictures
             have grown from there. None: they move everything.
     """
 
@@ -279,6 +280,15 @@ class Recipe:
     def light_rates(self) -> dict[str, float]:
         """Learning rates of the learned light's parameters."""
         return {name: parameter.rate for name, parameter in self.shading.light_parameters.items()}
+
+    @property
+    def actions(self) -> set[Action]:
+        """Names of all actions that are due at some step."""
+        names = set[Action]()
+        for stage in self.stages:
+            names.update(stage.on_enter, (repeat.action for repeat in stage.repeats))
+            names.update(stage.rounds.actions if stage.rounds else ())
+        return names
 
     def data(self) -> dict[str, Any]:
         """All values as plain JSON types, for a run's folder."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from polarguide.core.errors import PolarguideError
-from polarguide.core.options import EXPOSURES, Exposures, check_choice, check_count
+from polarguide.core.options import EXPOSURES, MOST, Exposures, check_choice, check_count
 
 MOST_VIEWS = 4096
 MOST_SEEDS = 2**63 - 1
@@ -66,13 +66,14 @@ class TrainSettings:
     _LEAST_GAUSSIANS: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
-        if self.steps is not None:
-            check_count("steps", self.steps)
-        if self.gaussians is not None:
-            check_count("gaussians", self.gaussians, self._LEAST_GAUSSIANS)
-        if self.views_per_step is not None:
-            check_count("views_per_step", self.views_per_step, 1, MOST_VIEWS)
-        check_count("seed", self.seed, 0, MOST_SEEDS)
+        for name, least, most in (
+            ("steps", 1, MOST),
+            ("gaussians", self._LEAST_GAUSSIANS, MOST),
+            ("views_per_step", 1, MOST_VIEWS),
+            ("seed", 0, MOST_SEEDS),
+        ):
+            if getattr(self, name) is not None:
+                check_count(name, getattr(self, name), least, most)
         check_choice("background", self.background, BACKGROUNDS)
         check_choice("exposures", self.exposures, EXPOSURES)
         check_choice("materials", self.materials, MATERIALS)
@@ -132,19 +133,3 @@ class StepReport:
     gaussians: int | None
     measured: Tensor
     done: int
-
-    @property
-    def loss(self) -> float:
-        """The photometric loss."""
-        return float(self.measured[0])
-
-    @property
-    def psnr(self) -> float:
-        """In decibels."""
-        return float(self.measured[1])
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, StepReport):
-            return NotImplemented
-        plain = [(r.step, r.stage, r.gaussians, r.measured.tolist()) for r in (self, other)]
-        return plain[0] == plain[1]

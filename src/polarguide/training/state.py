@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from polarguide.capture import Scene
 from polarguide.core.errors import PolarguideError
 from polarguide.gaussians.densify import DensityStatistics
 from polarguide.gaussians.gaussians import ORIENTED_SHAPES, Gaussians, Trained
@@ -16,8 +16,8 @@ from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.initialize import far_away, initial_parameters
 from polarguide.optics.color import srgb_decode
 from polarguide.shading.model import Parameter, ShadingModel
+from polarguide.training.context import TrainingContext
 from polarguide.training.recipe import Recipe
-from polarguide.training.settings import ResolvedSettings
 
 ANGLE_COLUMNS = 8
 """Values of a fitted polarizer angle, see ``angles.fit.FittedAngle``, and whether there was anything to fit."""
@@ -50,6 +50,19 @@ class Environment(Trained):
         return "environment.adam." if name == "texels" else f"environment.adam.{name}."
 
 
+class SavedState(Protocol):
+    """The state of a training as far as a checkpoint holds it.
+
+    Attributes:
+        step: number of finished steps.
+    """
+
+    step: int
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by name."""
+
+
 @dataclass
 class TrainingState:
     """The complete state between two steps.
@@ -65,6 +78,7 @@ class TrainingState:
             ``angles.polarizers``; None before the first fit.
         footprints: [N] size of a training pixel at each Gaussian, see ``raster.magnification``; None before the end of
             the training.
+        extra: tensors of further callbacks, named ``callback.NAME.KEY``.
     """
 
     step: int
@@ -75,6 +89,7 @@ class TrainingState:
     opacity_frozen_until: int = 0
     angles: Tensor | None = None
     footprints: Tensor | None = None
+    extra: dict[str, Tensor] = field(default_factory=dict)
 
     @property
     def light(self) -> dict[str, Tensor]:
@@ -94,6 +109,7 @@ class TrainingState:
             out["angles"] = self.angles
         if self.footprints is not None:
             out["footprints"] = self.footprints
+        out.update(self.extra)
         out["scalars"] = torch.tensor([self.step, self.opacity_frozen_until], dtype=torch.int64)
         return out
 
@@ -116,6 +132,7 @@ class TrainingState:
             frozen_until,
             angles,
             tensors.get("footprints"),
+            {name: values for name, values in tensors.items() if name.startswith("callback.")},
         )
 
 
@@ -145,24 +162,18 @@ def _check_first_values(
             )
 
 
-def first_state(
-    scene: Scene,
-    recipe: Recipe,
-    settings: ResolvedSettings,
-    device: torch.device | str = "cpu",
-    *,
-    surroundings: bool = True,
-) -> TrainingState:
+def first_state(context: TrainingContext) -> TrainingState:
     """The state before the first step; drawn on the CPU, so that every device begins with the same.
 
-    Args:
-        scene, recipe, settings: those of the training.
-        device: device of the Gaussians.
-        surroundings: whether there are any, for which far Gaussians are added.
+    Far Gaussians are added unless nothing is behind the subject.
     """
-    initialization = recipe.initialization if surroundings else replace(recipe.initialization, shell=0)
+    scene = context.scene
+    recipe = context.recipe
+    settings = context.settings
+    device = context.backend.device
+    initialization = replace(recipe.initialization, shell=0) if context.black else recipe.initialization
     colors = srgb_decode(scene.point_colors.float() / 255)
-    centers = torch.stack([view.camera.center for view in scene.train_views])
+    centers = context.centers
     tensors = initial_parameters(scene.points, colors, centers, initialization, seed=settings.seed)
     count = tensors["means"].shape[0]
     if recipe.oriented:

@@ -16,12 +16,16 @@ from polarguide.optics.color import srgb_encode
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
 
+ABSENT = torch.tensor(torch.nan)
+"""Prior that was not computed: a loss that reads it is not finite, and is refused."""
+
 
 @dataclass(frozen=True, eq=False)
 class ViewPriors:
-    """Polarization targets of one view.
+    """Polarization targets of one view; those that no term reads are ``ABSENT``.
 
     Attributes:
+        camera: camera of the view.
         specular, diffuse: [H, W, 3] separated pictures as displayed (sRGB), on the scale of S0/2.
         separated: [H, W] weight of both: 1 where the separation is well conditioned.
         normal: [H, W, 3] disambiguated polarization normal, world axes.
@@ -29,7 +33,6 @@ class ViewPriors:
         weight: [H, W] weight of ``normal`` and ``plane``, in [0, 1].
         chromatic: [H, W, 3] normal from the polarization of color differences, world axes, or of a flat surface.
         chromatic_weight: [H, W] its weight, in [0, 1]; 0 where the settings do not ask for it.
-        camera: camera of the view.
         stokes: [3, H, W, 3] as measured.
         stokes_weight: [H, W] weight of S1 and S2, see ``stokes_weight``.
         surface: [H, W] weight of the agreement of normals and depth, see ``surface_weight``.
@@ -37,18 +40,18 @@ class ViewPriors:
         azimuth_share, chromatic_share: least share of the pixels over which the terms on directions are averaged.
     """
 
-    specular: Tensor
-    diffuse: Tensor
-    separated: Tensor
-    normal: Tensor
-    plane: Tensor
-    weight: Tensor
-    chromatic: Tensor
-    chromatic_weight: Tensor
     camera: Camera
-    stokes: Tensor
-    stokes_weight: Tensor
-    surface: Tensor
+    specular: Tensor = ABSENT
+    diffuse: Tensor = ABSENT
+    separated: Tensor = ABSENT
+    normal: Tensor = ABSENT
+    plane: Tensor = ABSENT
+    weight: Tensor = ABSENT
+    chromatic: Tensor = ABSENT
+    chromatic_weight: Tensor = ABSENT
+    stokes: Tensor = ABSENT
+    stokes_weight: Tensor = ABSENT
+    surface: Tensor = ABSENT
     candidates: Tensor | None = None
     azimuth_share: float = 0.0
     chromatic_share: float = 0.0

@@ -20,7 +20,7 @@ from polarguide.runs.opened import OpenedRun
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
 from polarguide.shading.result import POLARIZED, RenderResult
-from polarguide.training.angles.trainer import AngleTrainer
+from polarguide.training.loop import TrainingLoop
 from polarguide.viewer.cameras import drawn_camera, letterbox
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
@@ -115,19 +115,19 @@ def run_scenery(run: OpenedRun) -> Scenery:
     )
 
 
-def training_scenery(trainer: AngleTrainer) -> Scenery:
+def training_scenery(loop: TrainingLoop) -> Scenery:
     """A training as it is between two steps, Gaussians shaded as in its present stage."""
-    steps = trainer.settings.steps
-    state = trainer.state
-    stage = trainer.schedule.at(min(state.step, steps - 1)).stage
+    steps = loop.settings.steps
+    state = loop.state
+    stage = loop.schedule.at(min(state.step, steps - 1)).stage
     progress = f"step {state.step:,} of {steps:,} ({stage.name})"
-    status = f"{trainer.recipe.name}, {progress}; {len(state.gaussians):,} Gaussians"
+    status = f"{loop.context.recipe.name}, {progress}; {len(state.gaussians):,} Gaussians"
     return Scenery(
         state.gaussians,
         state.light,
-        trainer.shading if stage.reflection else PLAIN,
-        trainer.backend.rasterize,
-        trainer.schedule.sh_degree(min(state.step, steps - 1)),
+        loop.current.shading if stage.reflection else PLAIN,
+        loop.context.backend.rasterize,
+        loop.schedule.sh_degree(min(state.step, steps - 1)),
         status,
     )
 

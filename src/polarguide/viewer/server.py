@@ -38,7 +38,7 @@ from polarguide.runs.opened import OpenedRun
 from polarguide.runs.painted import FOLDER, read_painted, write_painted
 from polarguide.runs.train import Ends, Look
 from polarguide.shading.model import ShadingModel
-from polarguide.training.angles.trainer import AngleTrainer
+from polarguide.training.loop import TrainingLoop
 from polarguide.viewer.cameras import Photograph, photographs
 from polarguide.viewer.guard import Gate, guarded
 from polarguide.viewer.messages import Accepts, checked
@@ -389,7 +389,7 @@ def save_to_run(run: OpenedRun, chosen: Presentation) -> str:
 
 @contextmanager
 def watched(
-    trainer: AngleTrainer,
+    loop: TrainingLoop,
     host: str,
     port: int,
     visitors: VisitorOptions = VisitorOptions(),
@@ -400,14 +400,14 @@ def watched(
     Raises:
         PolarguideError: several processes train, or the address cannot be listened at.
     """
-    if trainer.ranks.world > 1:
+    if loop.ranks.world > 1:
         raise PolarguideError(
             "viewer",
             expected="one process",
-            found=f"{trainer.ranks.world}",
+            found=f"{loop.ranks.world}",
             remedy="Leave it out, and look at the checkpoints: polarguide view RUN.",
         )
-    scene = trainer.scene
+    scene = loop.context.scene
 
     def look(ends: Ends) -> None:
         viewer.refresh()
@@ -416,12 +416,12 @@ def watched(
             viewer.serve(PATIENCE)
 
     with _opened(
-        functools.partial(training_scenery, trainer),
+        functools.partial(training_scenery, loop),
         scene,
         reporter,
         host,
         name=scene.name,
-        shading=trainer.shading,
+        shading=loop.context.shading,
         port=port,
         visitors=visitors,
         presentation=read_presentation(scene.root),

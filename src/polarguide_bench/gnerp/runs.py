@@ -12,7 +12,6 @@ from typing import Any
 import torch
 
 from polarguide.capture import Scene
-from polarguide.capture.variants import mask_background, select_exposures
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import DeviceName, PathLike, SceneOptions, SessionOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
@@ -20,10 +19,10 @@ from polarguide.core.system import MemoryBound, return_freed_memory
 from polarguide.geometry.camera import Camera
 from polarguide.raster import choose_backend, use_threads
 from polarguide.results.rendering.mesh import RESOLUTION, Surface
+from polarguide.runs.callbacks import Ends, run_to_the_end
 from polarguide.runs.folder import CHECKPOINT, RunConfiguration, checkpoint_tensors, writing_to
-from polarguide.runs.loop import Ends, TrainingLoop
 from polarguide.runs.memory_plan import pixels_of
-from polarguide.runs.opened import read_scene
+from polarguide.runs.opened import read_scene, trained_scene
 from polarguide.runs.train import (
     check_same_run,
     check_step,
@@ -34,12 +33,12 @@ from polarguide.runs.train import (
     view_store,
 )
 from polarguide.training.settings import ResolvedSettings, TrainSettings
+from polarguide_bench.gnerp.loop import FieldLoop
 from polarguide_bench.gnerp.memory import plan_field_memory
 from polarguide_bench.gnerp.model import FieldModel
 from polarguide_bench.gnerp.recipe import NeuralRecipe
 from polarguide_bench.gnerp.state import FieldState
 from polarguide_bench.gnerp.surface import implicit_surface
-from polarguide_bench.gnerp.trainer import FieldTrainer
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +69,7 @@ class FieldRun:
         configuration = self.configuration
         reading = SceneOptions(configuration.downscale, configuration.transfer, split="every-8th")
         whole = read_scene(configuration.scene, reading, SILENT, configuration.test_views)
-        return _trained_on(whole, configuration.settings)
+        return trained_scene(whole, configuration.settings)
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -120,7 +119,7 @@ def train_field(
     earlier = RunConfiguration.load(out) if resume else None
     whole = read_scene(scene, reading, reporter, hold=plan.hold)
     resolved = resolve_field(settings, whole, recipe, None if earlier is None else earlier.settings)
-    loaded = _trained_on(whole, resolved)
+    loaded = trained_scene(whole, resolved)
     check_trainable(loaded)
     configuration = RunConfiguration.of(loaded, recipe.name, recipe.data(), resolved, backend.device)
     if not all(view.is_determined for view in loaded.train_views):
@@ -135,12 +134,12 @@ def train_field(
                 check_step(state.step, resolved, out)
             else:
                 reporter.say(f"{out} has no checkpoint: the training begins at step 0")
-        trainer = FieldTrainer(loaded, recipe, resolved, backend.device, state, store)
+        loop = FieldLoop(loaded, recipe, resolved, backend.device, state, store)
         configuration.save(out)
-        loop = TrainingLoop(trainer, out, session, reporter, should_stop, None, MemoryBound(plan.peak))
-        seconds = loop.run()
+        bound = MemoryBound(plan.peak)
+        seconds = run_to_the_end(loop, out, session, reporter, should_stop, None, bound)
     reporter.say(resources_used(seconds, plan.peak))
-    return FieldRun(out, configuration, recipe, FieldModel(trainer.state, recipe, backend.device))
+    return FieldRun(out, configuration, recipe, FieldModel(loop.state, recipe, backend.device))
 
 
 def open_field(folder: PathLike, recipe: NeuralRecipe, *, device: DeviceName = "auto") -> FieldRun:
@@ -202,9 +201,3 @@ def resolve_field(
                 remedy="Leave it out.",
             )
     return ResolvedSettings(**values)
-
-
-def _trained_on(scene: Scene, settings: ResolvedSettings) -> Scene:
-    """The scene with the pictures and the background that the training uses."""
-    chosen = select_exposures(scene, settings.exposures)
-    return mask_background(chosen) if settings.background == "masked" else chosen

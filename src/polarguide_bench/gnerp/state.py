@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from polarguide.gaussians.adam import MOMENTS, Adam
+from polarguide.gaussians.adam import Adam
 from polarguide.geometry.camera import Camera
+from polarguide.training.checked import MOST_STEPS, TensorRule, check_tensors, moment_rules
 from polarguide.training.state import seeded
 from polarguide_bench.gnerp.field import Field, GridField, NetworkField, Region
 from polarguide_bench.gnerp.recipe import NeuralRecipe
@@ -69,52 +70,30 @@ class FieldState:
         Raises:
             ValueError: something is missing, not known, or has another shape, type or range; the message names it.
         """
-        step = _step(_tensor_of(tensors, "scalars"))
-        region = _region(_tensor_of(tensors, "region"))
-        state = cls.around(step, recipe, region, 0, device)
-        own = {f"field.{name}": values for name, values in state.field.state_dict().items()}
-        loaded = {name: _like(values, _tensor_of(tensors, name), name) for name, values in own.items()}
-        state.field.load_state_dict({name.removeprefix("field."): t for name, t in loaded.items()})
-        names_known = {"scalars", "region", *own}
+        rules = {
+            "scalars": TensorRule((1,), 0, MOST_STEPS, torch.int64),
+            "region": TensorRule((5,), dtype=torch.float64),
+        }
+        for name, rule in rules.items():
+            check_tensors({name: tensors[name]} if name in tensors else {}, {name: rule})
+        state = cls.around(int(tensors["scalars"]), recipe, _region(tensors["region"]), 0, device)
+        for name, values in state.field.state_dict().items():
+            rules[f"field.{name}"] = TensorRule(tuple(values.shape), dtype=values.dtype)
+        moments = {}
         for name, values in state.field.named_parameters():
-            names = {key: f"adam.{name}.{key}" for key in MOMENTS}
-            names_known |= set(names.values())
-            if not tensors.keys().isdisjoint(names.values()):
-                state.optimizer.moments[name] = {
-                    key: _like(values if key != "step" else torch.zeros(()), _tensor_of(tensors, full), full)
-                    for key, full in names.items()
-                }
-        strangers = sorted(tensors.keys() - names_known)
-        if strangers:
-            raise ValueError(f"{strangers[0][:80]}, which is not known")
+            own = moment_rules(tensors, f"adam.{name}.", tuple(values.shape))
+            rules |= own
+            if own:
+                moments[name] = own
+        check_tensors(tensors, rules)
+        fields = {k.removeprefix("field."): t for k, t in tensors.items() if k.startswith("field.")}
+        state.field.load_state_dict(fields)
+        for name, own in moments.items():
+            state.optimizer.moments[name] = {k.rpartition(".")[2]: tensors[k].to(device) for k in own}
         return state
 
 
-def _tensor_of(tensors: Mapping[str, Tensor], name: str) -> Tensor:
-    if name not in tensors:
-        raise ValueError(f"no {name}")
-    return tensors[name]
-
-
-def _like(own: Tensor, values: Tensor, name: str) -> Tensor:
-    """The values, checked to be finite and of the shape and type that the recipe has."""
-    if values.shape != own.shape or values.dtype != own.dtype:
-        expected = f"{list(own.shape)}, {own.dtype}"
-        raise ValueError(f"{name} of shape {list(values.shape)}, {values.dtype}, not {expected}")
-    if not bool(torch.isfinite(values).all()):
-        raise ValueError(f"{name} with values that are not finite")
-    return values.to(own.device)
-
-
-def _step(scalars: Tensor) -> int:
-    if scalars.dtype != torch.int64 or scalars.shape != (1,) or not 0 <= int(scalars[0]) <= 1 << 50:
-        raise ValueError(f"scalars {scalars.tolist()}")
-    return int(scalars[0])
-
-
 def _region(values: Tensor) -> Region:
-    if values.dtype != torch.float64 or values.shape != (5,) or not bool(torch.isfinite(values).all()):
-        raise ValueError(f"region {values.tolist()}")
     x, y, z, unit, radius = values.tolist()
     if not (0 < unit < 1e12 and 1 <= radius < 1e6):
         raise ValueError(f"region {values.tolist()}")

@@ -20,17 +20,17 @@ from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.geometry.vectors import dot, unit
 from polarguide.results.evaluation.evaluate import evaluate
 from polarguide.runs import memory_plan
+from polarguide.runs.callbacks import TrainingStopped
 from polarguide.runs.folder import CHECKPOINT, save_checkpoint
-from polarguide.runs.loop import TrainingStopped
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.gnerp.field import NetworkField
+from polarguide_bench.gnerp.loop import FieldLoop, aolp_loss, color_loss, eikonal_loss, guidance_loss
 from polarguide_bench.gnerp.march import _strata
 from polarguide_bench.gnerp.memory import plan_field_memory
 from polarguide_bench.gnerp.model import FieldModel
 from polarguide_bench.gnerp.recipe import FieldShape, NeuralRecipe, Sampling
 from polarguide_bench.gnerp.runs import FieldRun, load_field, open_field, resolve_field, train_field
 from polarguide_bench.gnerp.state import FieldState
-from polarguide_bench.gnerp.trainer import FieldTrainer, aolp_loss, color_loss, eikonal_loss, guidance_loss
 from polarguide_bench.plan import trained_steps
 from polarguide_bench.recipes import ABLATIONS_GNERP, RECIPE_GNERP
 
@@ -43,9 +43,9 @@ def ball() -> Scene:
     return textured_ball(views=6, width=20, height=16, tests=1, radius=1.2, polarized=0.5)
 
 
-def trainer(scene: Scene, steps: int, recipe: NeuralRecipe | None = None) -> FieldTrainer:
+def trainer(scene: Scene, steps: int, recipe: NeuralRecipe | None = None) -> FieldLoop:
     recipe = recipe or small()
-    return FieldTrainer(scene, recipe, resolve_field(TrainSettings(steps=steps), scene, recipe), CPU)
+    return FieldLoop(scene, recipe, resolve_field(TrainSettings(steps=steps), scene, recipe), CPU)
 
 
 def normal_error(model: FieldModel, scene: Scene) -> float:
@@ -102,7 +102,7 @@ def test_resumed_is_uninterrupted(ball: Scene, tmp_path: Path) -> None:
         save_checkpoint(tmp_path, parts.state)
         state = load_field(tmp_path, small())
         assert isinstance(state, FieldState)
-        parts = FieldTrainer(ball, small(), resolve_field(TrainSettings(steps=40), ball, small()), CPU, state)
+        parts = FieldLoop(ball, small(), resolve_field(TrainSettings(steps=40), ball, small()), CPU, state)
         assert trained_steps(tmp_path) == stop
     assert bits(parts.state) == bits(whole.state)
 

@@ -248,7 +248,7 @@ def test_a_training_reaches_none_of_the_rooms_that_its_digest_leaves_out() -> No
     left_out = {f"polarguide.{name.removesuffix('.py')}" for name in NOT_TRAINING}
     code = "import sys, polarguide.runs.train; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert "polarguide.training.trainer" in loaded.split()
+    assert "polarguide.training.loop" in loaded.split()
     assert not {".".join(name.split(".")[:2]) for name in loaded.split()} & left_out
 
 

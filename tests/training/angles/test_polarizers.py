@@ -11,17 +11,17 @@ import torch
 from heard import Heard
 from tiny import make_scene
 from torch import Tensor
-from trainings import CPU, different, run
+from trainings import context_of, different, fits_of, run
 
 from polarguide.capture import Scene, View
 from polarguide.capture.exposures import FOUR, Exposure, read_table
 from polarguide.capture.variants import select_exposures
 from polarguide.recipes import RECIPES, recipe_named
-from polarguide.runs.folder import resolve
 from polarguide.runs.reports import report_polarizers
+from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.angles.polarizers import Polarizers, mean_angle
-from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.training.checked import refuse_foreign
+from polarguide.training.loop import TrainingLoop
 from polarguide.training.recipe import Recipe
 from polarguide.training.rules import AngleRules
 from polarguide.training.settings import TrainSettings
@@ -268,9 +268,9 @@ def test_exposure_times_are_found() -> None:
 
 def begun(
     scene: Scene, state: TrainingState | None = None, recipe: Recipe = STOKES, **settings: bool
-) -> AngleTrainer:
+) -> TrainingLoop:
     given = TrainSettings(steps=STEPS, background="scene", **settings)  # type: ignore[arg-type]
-    return AngleTrainer(scene, recipe, resolve(given, scene, recipe), CPU, state)
+    return gaussian_training(context_of(scene, recipe, given), state)[0]
 
 
 def trained(scene: Scene, until: int = STEPS, state: TrainingState | None = None) -> dict[str, Tensor]:
@@ -285,16 +285,16 @@ def test_it_begins_again_with_the_angles_that_it_found() -> None:
     trainer = begun(scene)
     first, second = round(0.65 * STEPS), round(RULES.again[-1] * STEPS)
     search = first + second
-    assert (trainer.begins_again, trainer.total) == (True, STEPS + search)
+    assert (fits_of(trainer).begins_again, trainer.total) == (True, STEPS + search)
     reports = run(trainer)
     assert [report.step for report in reports] == [*range(first), *range(second), *range(STEPS)]
     assert [report.done for report in reports] == [*range(1, STEPS + search + 1)]
     assert trainer.done == trainer.total
-    assert len(trainer.polarizers.table) == 4 + len(RULES.again)
+    assert len(fits_of(trainer).polarizers.table) == 4 + len(RULES.again)
 
     # After the searches it is a training that has been told these angles, and keeps to them.
     state, whole = begun(scene).state, trainer.state.tensors()
-    state.angles = trainer.polarizers.table
+    state.angles = fits_of(trainer).polarizers.table
     assert different(whole, trained(scene, state=state)) == []
 
     alongside = begun(scene, begin_again=False)
@@ -313,7 +313,7 @@ def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.Mo
     trainer = begun(scene, recipe=quick)
     assert trainer.total == STEPS + 13 + 19
     looked_at = set[int]()
-    fit = trainer.polarizers.fit
+    fit = fits_of(trainer).polarizers.fit
 
     def seen(predict: Callable[[View], Tensor]) -> Tensor:
         def watched(view: View) -> Tensor:
@@ -323,22 +323,22 @@ def test_angles_are_sought_in_few_steps_on_small_pictures(monkeypatch: pytest.Mo
 
         return fit(watched)
 
-    monkeypatch.setattr(trainer.polarizers, "fit", seen)
+    monkeypatch.setattr(fits_of(trainer).polarizers, "fit", seen)
     run(trainer)
     assert looked_at == {width // -(-width // 16)}
     assert trainer.done == trainer.total
     # What was found holds for the pictures in full size.
-    view = trainer.scene.train_views[0]
-    assert trainer.polarizers.believed(view).codes is view.codes
+    view = trainer.context.scene.train_views[0]
+    assert fits_of(trainer).polarizers.believed(view).codes is view.codes
     # On a schedule that tells nothing of a search, known angles are looked at three times.
-    known = begun(select_exposures(WHOLE, "one")).polarizers
+    known = fits_of(begun(select_exposures(WHOLE, "one"))).polarizers
     assert [step for step in range(STEPS) if known.due(step)] == [8, 12, 20]
 
 
 @pytest.mark.parametrize("exposures", ["one", "four", "none"])
 def test_where_all_angles_are_known_nothing_begins_again(exposures: str) -> None:
     trainer = begun(select_exposures(WHOLE, exposures))  # type: ignore[arg-type]
-    assert (trainer.begins_again, trainer.total) == (False, STEPS)
+    assert (fits_of(trainer).begins_again, trainer.total) == (False, STEPS)
 
 
 @pytest.mark.parametrize("until", [STEPS // 2, 23, 27, 39])

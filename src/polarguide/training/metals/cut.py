@@ -22,7 +22,7 @@ from torch import Tensor
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.geometry.vectors import dot
 from polarguide.shading.model import Parameters
-from polarguide.training.metals.evidence import Evidence
+from polarguide.training.metals.evidence import MetalEvidence
 from polarguide.training.metals.observations import LEAST_PIXELS
 from polarguide.training.rules import MetalRules
 
@@ -43,7 +43,7 @@ class Graph(NamedTuple):
     cost: NDArray[np.float64]
 
 
-def neighbor_graph(gaussians: Parameters, measured: Evidence, rules: MetalRules) -> Graph:
+def neighbor_graph(gaussians: Parameters, measured: MetalEvidence, rules: MetalRules) -> Graph:
     """The nearest neighbors of each Gaussian, tied by how alike they are turned and how alike their color is.
 
     The scene tells which colors are alike: the mean square of what neighbors differ by is 1.
@@ -68,7 +68,7 @@ def neighbor_graph(gaussians: Parameters, measured: Evidence, rules: MetalRules)
     )
 
 
-def unary(measured: Evidence, allowed: Tensor, rules: MetalRules) -> Tensor:
+def unary(measured: MetalEvidence, allowed: Tensor, rules: MetalRules) -> Tensor:
     """What metal is better than dielectric for each Gaussian by itself, in nats [N].
 
     Args:
@@ -116,7 +116,7 @@ def surfaces(
 
 
 def decide(
-    measured: Evidence,
+    measured: MetalEvidence,
     gaussians: Parameters,
     allowed: Tensor,
     rules: MetalRules,

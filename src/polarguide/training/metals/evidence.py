@@ -66,7 +66,7 @@ class Errors(NamedTuple):
     reflectance: Tensor
 
 
-class Evidence(NamedTuple):
+class MetalEvidence(NamedTuple):
     """Evidence of the views for N Gaussians.
 
     Attributes:
@@ -141,7 +141,7 @@ def evidence(
     rules: MetalRules,
     limits: MetalViews,
     memory: MemoryBound = UNBOUNDED,
-) -> Evidence:
+) -> MetalEvidence:
     """Evidence of the views for each Gaussian; see ``training.metals.evidence``.
 
     Views whose pictures do not determine the Stokes vector say what the user says of materials in them, no more.
@@ -151,7 +151,7 @@ def evidence(
     if not measured:
         none = labels.new_zeros(len(labels))
         gray = labels.new_full((len(labels), 3), FIRST_REFLECTANCE)
-        return Evidence(none, none, gray, torch.zeros_like(gray), labels)
+        return MetalEvidence(none, none, gray, torch.zeros_like(gray), labels)
     looks = view_sums(gaussians, memory.between(measured), rasterize, limits)
     result = of_views(looks, labels, refractive_index, rules, limits)
     del looks
@@ -161,7 +161,7 @@ def evidence(
 
 def of_views(
     looks: Sequence[Tensor], labels: Tensor, refractive_index: float, rules: MetalRules, limits: MetalViews
-) -> Evidence:
+) -> MetalEvidence:
     """Evidence of what views measured, as of ``view_sums``, and of the user's labels."""
     sums = torch.stack([look.sum(dim=0) for look in looks]).sum(dim=0)
     light = float(sums[1:4].mean() / sums[0].clamp(min=1e-6))
@@ -178,7 +178,7 @@ def of_views(
     typical = torch.minimum(dielectric, metal)[count > UNKNOWNS]
     error = typical.median().clamp(min=NOISE) if len(typical) else dielectric.new_tensor(1.0)
     ratio = ((error + dielectric) / (error + metal)).log() - _tint_cost(color, total, rules)
-    return Evidence(ratio, (count - UNKNOWNS).clamp(min=0), reflectance, color.clamp(min=0), labels)
+    return MetalEvidence(ratio, (count - UNKNOWNS).clamp(min=0), reflectance, color.clamp(min=0), labels)
 
 
 def _tint_cost(color: Tensor, weight: Tensor, rules: MetalRules) -> Tensor:

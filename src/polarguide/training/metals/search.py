@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from polarguide.capture import Scene, View
+from polarguide.capture import View
 from polarguide.capture.view import listed
 from polarguide.core.system import UNBOUNDED, MemoryBound
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.initialize import far_away
-from polarguide.raster import Backend, Rasterize
+from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import render
 from polarguide.shading.model import Light, ShadingModel
-from polarguide.training.distributed import Ranks
+from polarguide.training.context import TrainingContext
 from polarguide.training.metals.cut import decide
-from polarguide.training.metals.evidence import Evidence, evidence
-from polarguide.training.metals.observations import contradicted, evenly
+from polarguide.training.metals.evidence import MetalEvidence, evidence
+from polarguide.training.metals.observations import contradicted, evenly, numbers_in
 from polarguide.training.recipe import Recipe, Schedule
 from polarguide.training.rules import MetalViews
 from polarguide.training.settings import ResolvedSettings
@@ -71,125 +71,98 @@ def light_gain(
 
 
 class MetalSearch:
-    """Finds metals at the refreshes of the priors.
+    """Finds metals at the refreshes of the priors, within the share of the steps that the recipe specifies.
 
     Args:
-        scene: the capture. recipe: says between which shares of the steps metals are looked for.
-        settings: the user's choices. shading: the recipe's, for the run's refractive index.
-        backend: device and rasterizer. ranks: the processes that share the work.
-        warn: receives messages for the user. memory: gives back what was freed of each view that is looked at.
+        context: context of the training.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        recipe: Recipe,
-        settings: ResolvedSettings,
-        shading: ShadingModel,
-        backend: Backend,
-        ranks: Ranks,
-        warn: Callable[[str], None],
-        memory: MemoryBound,
-    ) -> None:
-        self._scene = scene
-        self._shading = shading
-        self._between = recipe.metals
-        self._rules = recipe.metal_rules
-        self._limits = recipe.metal_views
-        self._index = settings.refractive_index
-        self._backend = backend
-        self._ranks = ranks
-        self._warn = warn
-        self._memory = memory
-        self._on = shading.knows_metals and settings.materials == "auto"
-        self._told = False
-        self._steps = settings.steps
-        self._refreshes = refreshes(recipe, settings.steps)
-        self._looks = looks(recipe, settings)
+    def __init__(self, context: TrainingContext) -> None:
+        self._context = context
+        self._warned = False
+        self._looks = looks(context.recipe, context.settings)
 
     def is_due(self, step: int) -> bool:
         """Whether a refresh at this step looks for metals."""
-        return self._on and _within(self._between, step, self._steps)
-
-    def warn_if_never(self) -> None:
-        """Say so where the user names materials and no refresh is due.
-
-        Recipes that never refresh their priors, such as controls, do not look for metals and get no warning.
-        """
-        if not self._on or not any(_names_metals(view) for view in self._scene.train_views):
-            return
-        if self._refreshes and not self._looks:
-            first, last = (100 * share for share in self._between)
-            self._warn(
-                f"materials/ is read at refreshes of the priors between {first:.0f} and {last:.0f} % of the steps. "
-                "A training this short has none there, and takes everything for dielectric. Take more steps."
-            )
+        context = self._context
+        steps = context.settings.steps
+        return _searches(context.recipe, context.settings) and _within(context.recipe.metals, step, steps)
 
     @torch.no_grad()
-    def look(self, state: TrainingState, views: Sequence[View]) -> None:
+    def look(self, state: TrainingState) -> None:
         """Decide which Gaussians are metals, and begin with what was measured of those that are new."""
+        context = self._context
+        views = context.views
         if not any(view.is_determined or view.materials is not None for view in views):
             return
         gaussians = state.gaussians
-        rasterize = self._backend.rasterize
-        measured = self._measure(state, views)
-        if not self._told and (
-            wrong := contradicted(gaussians, views, rasterize, measured.labels, self._limits, self._memory)
-        ):
-            self._told = True
-            names = listed([f"materials/{name}.png" for name in wrong])
-            self._warn(
-                f"other views contradict {names} on {100 * max(wrong.values()):.0f} % of what is said there, at most: "
-                "dielectric in one view, metal in another. The larger part counts; look at these files."
-            )
-        metal = decide(
-            measured, gaussians, self._allowed(state, views), self._rules, self._priors(state.step)
-        )
+        rasterize = context.backend.rasterize
+        limits = context.recipe.metal_views
+        measured = self._measure(state)
+        if not self._warned:
+            self._warn_of_contradictions(gaussians, measured.labels)
+        priors = self._priors(state.step)
+        metal = decide(measured, gaussians, self._allowed(state), context.recipe.metal_rules, priors)
         reflectance = measured.reflectance
         for values in (metal, reflectance):
-            self._ranks.broadcast(values)
+            context.ranks.broadcast(values)
         determined = [view for view in views if view.is_determined]
         gain = partial(
-            light_gain,
-            gaussians,
-            state.light,
-            determined,
-            rasterize,
-            self._shading,
-            self._limits,
-            self._memory,
+            light_gain, gaussians, state.light, determined, rasterize, context.shading, limits, context.memory
         )
-        self._shading.become_metal(gaussians, state.light, metal, reflectance, gain)
+        context.shading.become_metal(gaussians, state.light, metal, reflectance, gain)
         del measured
-        self._memory.clear()
+        context.memory.clear()
+
+    def _warn_of_contradictions(self, gaussians: Gaussians, labels: Tensor) -> None:
+        """Warn once of files of materials that other views contradict."""
+        context = self._context
+        limits = context.recipe.metal_views
+        rasterize = context.backend.rasterize
+        wrong = contradicted(gaussians, context.views, rasterize, labels, limits, context.memory)
+        if not wrong:
+            return
+        self._warned = True
+        names = listed([f"materials/{name}.png" for name in wrong])
+        context.reporter.warn(
+            f"other views contradict {names} on {100 * max(wrong.values()):.0f} % of what is said there, at most: "
+            "dielectric in one view, metal in another. The larger part counts; look at these files."
+        )
 
     @torch.no_grad()
-    def undecided(self, state: TrainingState, views: Sequence[View]) -> Tensor | None:
+    def undecided(self, state: TrainingState) -> Tensor | None:
         """Gaussians [N] bool that are dielectrics by the prior alone: what was measured of them would make them metals.
 
         None where a training does not look for metals, or no view determines the Stokes vector.
         """
-        if not self._looks or not any(view.is_determined for view in views):
+        if not self._looks or not any(view.is_determined for view in self._context.views):
             return None
         gaussians = state.gaussians
-        measured = self._measure(state, views)
-        without = decide(measured, gaussians, self._allowed(state, views), self._rules, (0.0,))
+        rules = self._context.recipe.metal_rules
+        without = decide(self._measure(state), gaussians, self._allowed(state), rules, (0.0,))
         return (without > 0) & (gaussians["metalness"] == 0)
 
-    def _measure(self, state: TrainingState, views: Sequence[View]) -> Evidence:
-        rasterize = self._backend.rasterize
+    def _measure(self, state: TrainingState) -> MetalEvidence:
+        context = self._context
         return evidence(
-            state.gaussians, views, rasterize, self._index, self._rules, self._limits, self._memory
+            state.gaussians,
+            context.views,
+            context.backend.rasterize,
+            context.settings.refractive_index,
+            context.recipe.metal_rules,
+            context.recipe.metal_views,
+            context.memory,
         )
 
-    def _allowed(self, state: TrainingState, views: Sequence[View]) -> Tensor:
+    def _allowed(self, state: TrainingState) -> Tensor:
         """Gaussians [N] bool that may be metals unless the user says so: none where nothing tells how far a label
         reaches.
         """
+        context = self._context
         means = state.gaussians["means"].detach()
-        centers = torch.stack([view.camera.center for view in self._scene.train_views])
-        far = far_away(means.cpu(), self._scene.points, centers, self._limits.reach).to(means.device)
-        return ~far & any(view.is_determined for view in views)
+        reach = context.recipe.metal_views.reach
+        far = far_away(means.cpu(), context.scene.points, context.centers, reach).to(means.device)
+        return ~far & any(view.is_determined for view in context.views)
 
     def _priors(self, step: int) -> tuple[float, ...]:
         """Shares of the prior that decide at a step: several before the last look, so that metalness is soft first.
@@ -208,10 +181,44 @@ def refreshes(recipe: Recipe, steps: int) -> list[int]:
 
 def looks(recipe: Recipe, settings: ResolvedSettings) -> list[int]:
     """The steps at which a training decides what is metal; none: it takes everything for dielectric."""
-    if not recipe.shading.knows_metals or settings.materials != "auto":
+    if not _searches(recipe, settings):
         return []
     steps = settings.steps
     return [step for step in refreshes(recipe, steps) if _within(recipe.metals, step, steps)]
+
+
+def warn_of_unused_materials(context: TrainingContext) -> None:
+    """Warn if ``materials/``, or refractive indices of single materials, have no effect on a training.
+
+    Recipes that never refresh their priors, such as controls, do not look for metals and get no warning of these.
+    """
+    recipe = context.recipe
+    settings = context.settings
+    views = context.views
+    refreshed = refreshes(recipe, settings.steps)
+    searches = _searches(recipe, settings) and any(map(_names_metals, views))
+    if searches and refreshed and not looks(recipe, settings):
+        first, last = (100 * share for share in recipe.metals)
+        context.reporter.warn(
+            f"materials/ is read at refreshes of the priors between {first:.0f} and {last:.0f} % of the steps. "
+            "A training this short has none there, and takes everything for dielectric. Take more steps."
+        )
+    indices = context.scene.indices
+    if not indices:
+        return
+    if not (recipe.shading.knows_indices and refreshed):
+        why = f"the recipe {recipe.name} takes the run's for everything"
+    elif not any(numbers_in(view) & indices.keys() for view in views):
+        why = "no picture in materials/ of a training view has one of their numbers"
+    else:
+        return
+    context.reporter.warn(
+        f"the refractive indices that scene.json lists under materials are not used: {why}."
+    )
+
+
+def _searches(recipe: Recipe, settings: ResolvedSettings) -> bool:
+    return recipe.shading.knows_metals and settings.materials == "auto"
 
 
 def _within(shares: tuple[float, float], step: int, steps: int) -> bool:

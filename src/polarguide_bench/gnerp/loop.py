@@ -17,9 +17,10 @@ from polarguide.geometry.vectors import dot, unit
 from polarguide.optics import aolp, dolp, lens_frame, luminance
 from polarguide.optics.color import srgb_encode
 from polarguide.training.distributed import ALONE
-from polarguide.training.feed import Entry, Packed, ViewStore, packed, unpacked
-from polarguide.training.settings import ResolvedSettings, StepReport
+from polarguide.training.loop import Loop
+from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import seeded
+from polarguide.training.storage import Entry, Packed, ViewStore, packed, stored_values
 from polarguide_bench.gnerp.march import RaySamples, march
 from polarguide_bench.gnerp.recipe import NeuralRecipe
 from polarguide_bench.gnerp.state import FieldState
@@ -144,10 +145,10 @@ def target_of(view: View, store: ViewStore, device: torch.device) -> Target:
         return entry
 
     stored = store.get("target", view.name, make)
-    picture = unpacked(stored["picture"]).view(-1, 3)
+    picture = stored_values(stored["picture"]).view(-1, 3)
     nothing = torch.zeros(len(picture), device=device)
     degree, angle = (
-        unpacked(stored[name]).flatten() if name in stored else nothing for name in ("dolp", "aolp")
+        stored_values(stored[name]).flatten() if name in stored else nothing for name in ("dolp", "aolp")
     )
     valid = stored["valid"].codes.flatten() if "valid" in stored else nothing == 0
     return Target(picture, degree, torch.remainder(angle, torch.pi), valid.nonzero()[:, 0])
@@ -162,20 +163,17 @@ DIAGONAL = ((-1, -1), (-1, 1), (1, -1), (1, 1))
 """Neighbors of a pixel: rows and columns."""
 
 
-class FieldTrainer:
+class FieldLoop(Loop):
     """Trains a neural recipe on a scene.
 
     Args:
-        scene: the capture. recipe: the method. settings: the user's choices, one view a step.
+        scene: the capture. recipe: the method. settings: the user's settings, one view a step.
         device: to compute on.
-        state: where to go on from, on the device; None: from the beginning.
-        store: keeps what is computed of the views; None: in memory.
-
-    Attributes:
-        whole: whether the state is one between two steps. ranks: it is alone.
+        state: state to resume from, on the device; None: from the beginning.
+        store: cache of the targets of the views; None: in memory.
     """
 
-    ranks = ALONE
+    state: FieldState
 
     def __init__(
         self,
@@ -186,33 +184,19 @@ class FieldTrainer:
         state: FieldState | None = None,
         store: ViewStore | None = None,
     ) -> None:
+        super().__init__(settings, ALONE, ())
         self.scene = scene
         self.recipe = recipe
-        self.settings = settings
         self._device = device
         cameras = [view.camera for view in scene.train_views]
         self.state = state or FieldState.first(recipe, cameras, settings.seed, device)
         self._store = store or ViewStore()
-        self.whole = True
 
-    def exchange_statistics(self) -> None:
-        """Fields have no statistics to exchange."""
-
-    @property
-    def total(self) -> int:
-        """Steps in all."""
-        return self.settings.steps
-
-    @property
-    def done(self) -> int:
-        """Number of finished steps."""
-        return self.state.step
-
-    def step(self) -> StepReport:
-        """One optimizer step."""
+    def optimize(self) -> tuple[Tensor, str, None]:
+        """March some rays of a view, and change the field by their loss."""
         state = self.state
         settings = self.settings
-        field = self.state.field
+        field = state.field
         share = state.step / settings.steps
         generator = seeded(settings.seed, 9, state.step)
         view = self._view_of(state.step)
@@ -224,13 +208,8 @@ class FieldTrainer:
         drawn = torch.randint(len(target.valid), (self.recipe.sampling.rays,), generator=generator)
         pixels = target.valid[drawn.to(self._device)]
         origin, rays = self._rays(view.camera, pixels)
-        marched = march(
-            field,
-            origin,
-            view.camera.to_world(rays),
-            self.recipe.sampling,
-            generator=generator,
-        )
+        sampling = self.recipe.sampling
+        marched = march(field, origin, view.camera.to_world(rays), sampling, generator=generator)
         color = color_loss(marched.color, target.picture[pixels], target.dolp[pixels])
         loss = self._loss(color, marched, view.camera, rays, pixels, target, share)
         self._set_rates(share)
@@ -241,15 +220,10 @@ class FieldTrainer:
             field.log_sharpness.clamp_(min=field.first_log_sharpness)
             squared = (marched.color - target.picture[pixels]).square().mean()
             psnr = -10 * torch.log10(squared.clamp(min=1e-10))
-        stage = "color and angles" if share < self.recipe.weights.guided else "guided"
-        report = StepReport(
-            state.step, stage, None, torch.stack((color.detach(), psnr, loss.detach())), self.done + 1
-        )
-        state.step += 1
-        if state.step == settings.steps:
+        if state.step + 1 == settings.steps:
             field.map_distances()
-        self.whole = True
-        return report
+        stage = "color and angles" if share < self.recipe.weights.guided else "guided"
+        return torch.stack((color.detach(), psnr, loss.detach())), stage, None
 
     def _loss(
         self,

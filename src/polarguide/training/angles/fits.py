@@ -1,0 +1,124 @@
+"""Fits of polarizer angles between the steps of a training: unknown angles, and known ones to check them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from polarguide.capture import View
+from polarguide.capture.variants import smaller
+from polarguide.core.progress import SILENT
+from polarguide.shading.gbuffer import RenderRequest, render
+from polarguide.training.angles.polarizers import Polarizers, search_steps
+from polarguide.training.callback import AnyCallback, Callback
+from polarguide.training.callbacks import method_callbacks
+from polarguide.training.context import TrainingContext
+from polarguide.training.loop import TrainingLoop
+from polarguide.training.recipe import Position
+from polarguide.training.state import TrainingState
+from polarguide.training.storage import ViewStore
+
+
+class AngleFits(Callback[TrainingLoop]):
+    """Fits polarizer angles, and lets the loop begin again with those that a search has found.
+
+    Unknown angles are searched for in short trainings on small pictures. With ``TrainSettings.begin_again`` off there
+    is no search, and they are fitted between steps of the training. Known angles are compared with the pictures there.
+
+    Args:
+        context: context of the training.
+        table: table of all fits so far; None: no fit so far.
+
+    Attributes:
+        polarizers: fitted angles.
+        begins_again: whether the training begins, or has begun, after a search.
+        current: context of the schedule that is next: a search, or the training.
+    """
+
+    def __init__(self, context: TrainingContext, table: Tensor | None) -> None:
+        self._context = context
+        self._schedule_next(table)
+
+    def _schedule_next(self, table: Tensor | None) -> None:
+        """Choose the schedule of the next search, or of the training if all angles are found."""
+        context = self._context
+        scene = context.scene
+        steps = context.settings.steps
+        search = search_steps(context.recipe, context.settings)
+        self.polarizers = Polarizers(scene, context.recipe, steps, table, search)
+        self.begins_again = context.settings.begin_again and self.polarizers.search > 0
+        self._searches = self.begins_again and not self.polarizers.settled
+        self.current = context
+        if self._searches:
+            small = smaller(scene, context.recipe.angle_rules.search_size)
+            settings = replace(context.settings, steps=search)
+            self.current = replace(
+                context, scene=small, settings=settings, store=ViewStore(), reporter=SILENT
+            )
+            self.polarizers = Polarizers(small, context.recipe, search, table, search)
+        elif self.begins_again:
+            self.current = replace(context, scene=self.polarizers.resolved(scene))
+
+    def begin(self, loop: TrainingLoop) -> None:
+        """Apply the fits so far."""
+        loop.state.angles = self.polarizers.table
+        if self.begins_again:
+            loop.offset = self.polarizers.searched
+            loop.total = self._context.settings.steps + self.polarizers.search
+        if self._searches or not self.begins_again:
+            loop.set_exposures(self.polarizers.beliefs)
+
+    def before_step(self, loop: TrainingLoop, position: Position) -> None:
+        """Fit angles if that is due."""
+        if not self.polarizers.due(loop.state.step):
+            return
+        loop.whole = False
+        ended = self.polarizers.ended
+        self._fit(loop)
+        if self._searches and self.polarizers.ended > ended:
+            self._schedule_next(loop.state.angles)
+            loop.begin(self.current, None)
+        loop.whole = True
+
+    @torch.no_grad()
+    def _fit(self, loop: TrainingLoop) -> None:
+        """Fit all angles to the Stokes vectors that the current state predicts."""
+        state = loop.state
+        context = loop.current
+        request = RenderRequest(sh_degree=loop.schedule.sh_degree(state.step))
+
+        def predicted(view: View) -> Tensor:
+            context.memory.clear()
+            result = render(
+                state.gaussians,
+                view.camera,
+                context.backend.rasterize,
+                request,
+                shading=context.shading,
+                light=state.light,
+            )
+            return context.shading.predicted_stokes(result, view.camera)
+
+        table = self.polarizers.fit(predicted).to(context.backend.device)
+        loop.ranks.broadcast(table)
+        earlier = [] if state.angles is None else [*state.angles]
+        state.angles = torch.stack([*earlier, table.cpu()])
+        changed = self.polarizers.take(state.angles)
+        loop.set_exposures({name: self.polarizers.beliefs[name] for name in changed})
+
+
+def gaussian_training(
+    context: TrainingContext, state: TrainingState | None = None, callbacks: Iterable[AnyCallback] = ()
+) -> tuple[TrainingLoop, AngleFits]:
+    """Return the loop that trains Gaussians with fits of polarizer angles, and these fits.
+
+    Args:
+        context: context of the training.
+        state: state to resume from, also in the middle of a search; None: from the beginning.
+        callbacks: further callbacks, which come after those of the method.
+    """
+    fits = AngleFits(context, None if state is None else state.angles)
+    return TrainingLoop(context, [fits, *method_callbacks(), *callbacks], state, fits.current), fits

@@ -1,0 +1,71 @@
+"""The context of a training: all that stays the same from the first step to the last."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from polarguide.capture import Scene, View
+from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.system import UNBOUNDED, MemoryBound
+from polarguide.gaussians.initialize import scene_extent
+from polarguide.raster import Backend
+from polarguide.shading.model import ShadingModel
+from polarguide.training.distributed import ALONE, Ranks
+from polarguide.training.recipe import Recipe
+from polarguide.training.settings import ResolvedSettings
+from polarguide.training.storage import ViewStore
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingContext:
+    """Inputs and services of a training.
+
+    Attributes:
+        scene: the capture.
+        recipe: the method.
+        settings: the user's settings.
+        backend: device and rasterizer.
+        ranks: the processes that share the views of each step.
+        store: cache of computed targets of the views.
+        memory: returns freed memory to the system.
+        reporter: receives messages for the user.
+    """
+
+    scene: Scene
+    recipe: Recipe
+    settings: ResolvedSettings
+    backend: Backend
+    ranks: Ranks = ALONE
+    store: ViewStore = field(default_factory=ViewStore)
+    memory: MemoryBound = UNBOUNDED
+    reporter: Reporter = SILENT
+
+    @cached_property
+    def views(self) -> Sequence[View]:
+        """The training views."""
+        return self.scene.train_views
+
+    @cached_property
+    def centers(self) -> Tensor:
+        """Camera centers of the training views, [V, 3]."""
+        return torch.stack([view.camera.center for view in self.views])
+
+    @cached_property
+    def extent(self) -> float:
+        """Extent of the scene, to which distances are relative."""
+        return scene_extent(self.centers)
+
+    @cached_property
+    def shading(self) -> ShadingModel:
+        """Shading model of the recipe with the refractive index of the settings."""
+        return self.recipe.shading.bind(self.settings.refractive_index)
+
+    @property
+    def black(self) -> bool:
+        """True if nothing is behind the subject."""
+        return self.settings.background != "scene"
