@@ -73,7 +73,9 @@ def compare_native_polarization(
             values[name].requires_grad_()
         result = rendered(shading, values)
         if native:
-            term = Polarization(measured, S1_AND_S2, weight, 0.7, shading.refractive_index, result.index)
+            term = Polarization(
+                measured, S1_AND_S2, weight, 0.7, shading.refractive_index, result.layers.get("index")
+            )
             with selected(instructions):
                 loss = pixel_terms(result, camera(), Terms(term, [], None))
         else:

@@ -112,7 +112,7 @@ def test_layers_add_up_to_the_final_picture(gaussians: dict[str, Tensor]) -> Non
     )
     assert torch.equal(result.specular + result.diffuse, result.final)
     assert torch.equal(result.diffuse, result.base)
-    assert result.strength is result.reflection is None
+    assert result.layers.keys().isdisjoint({"strength", "reflection"})
     assert float(result.specular.min()) >= 0
     assert not result.specular[result.alpha < 0.04].any(), "light without a surface"
     assert bool((result.specular[result.alpha > 0.06] > 0).all())

@@ -122,7 +122,7 @@ class GaussianModel:
     @torch.no_grad()
     def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
         """The Stokes vectors [3, H, W, 3] that a rendered picture predicts; None without both layers and a normal."""
-        if any(layer is None for layer in (result.specular, result.diffuse, result.normal)):
+        if not result.is_polarized:
             return None
         return self.shading.predicted_stokes(result, camera)
 

@@ -48,7 +48,7 @@ from polarguide.shading.model import (
     mirrored,
 )
 from polarguide.shading.native import reflect_arguments, reflect_reference, shade_native
-from polarguide.shading.result import LAYERS, DetachedLayers
+from polarguide.shading.result import LAYERS
 from polarguide.shading.roughness import LEVELS, blended_roughness, ggx_alpha, gltf_roughness, light_levels
 
 Blend = Literal["lerp", "fresnel"]
@@ -316,14 +316,13 @@ class DeferredShading(ShadingModel):
 
     def shade_detached(
         self, splatted: GBuffer, light: Light, camera: Camera
-    ) -> tuple[dict[str, Any], DetachedLayers | None]:
+    ) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """As ``ShadingModel`` has it; on the CPU in float32 one native pass."""
         texels = light["texels"]
         if not fits(splatted.features, texels):
             return super().shade_detached(splatted, light, camera)
         layers = self._shade_native(splatted, texels, camera, detached=True)
-        again = layers.pop("detached specular"), layers.pop("detached diffuse")
-        return layers, (*again, layers.get("metal"))
+        return layers, {name: layers.pop(f"detached_{name}") for name in ("specular", "diffuse")}
 
     def _with_metals(self, layers: dict[str, Any], splatted: GBuffer, camera: Camera) -> dict[str, Any]:
         """The layers of dielectrics with what metals add to them; as they are where the model knows no metals."""

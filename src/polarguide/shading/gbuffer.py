@@ -225,11 +225,13 @@ def render(
     features, normal, camera_depth = split(picture.features, picture.alpha, layout)
     splatted = GBuffer(features, picture.alpha, layout)
     if request.layers_detached and normals:
-        layers, detached = shading.shade_detached(splatted, light, camera)
+        shaded, detached = shading.shade_detached(splatted, light, camera)
     else:
-        layers = shading.shade(splatted, light, camera)
-        detached = None
-    blended = None
+        shaded = shading.shade(splatted, light, camera)
+        detached = {}
+    metal = shaded.get("metal")
+    layers = {name: layer for name, layer in shaded.items() if isinstance(layer, Tensor)}
+    layers |= {"base": splatted["color"], "alpha": picture.alpha}
     if request.at_median_depth and (normals or depth):
         directions = (
             gaussian_splats.features[:, layout.channels("normal")]
@@ -237,26 +239,19 @@ def render(
             else torch.zeros_like(gaussian_splats.means)
         )
         surface = surface_picture(gaussian_splats._replace(features=directions), camera)
-        camera_depth = surface.depth if depth else None
-        if normals:
-            normal, blended = picture.alpha[..., None] * surface.directions, normal
-    return RenderResult(
-        final=layers["final"],
-        base=splatted["color"],
-        **{name: layers.get(name) for name in _LAYERS},
-        normal=normal,
-        depth=camera_depth,
-        alpha=picture.alpha,
-        radii=picture.radii,
-        detached_layers=detached,
-        rotation_only_normal=picture.still,
-        metal=layers.get("metal"),
-        index=layers.get("index"),
-        blended_normal=blended,
-    )
+        camera_depth = surface.depth
+        if normal is not None:
+            layers["shaded_normal"] = normal
+            normal = picture.alpha[..., None] * surface.directions
+    if normal is not None:
+        layers["normal"] = normal
+    if depth and camera_depth is not None:
+        layers["depth"] = camera_depth
+    training = {"radii": picture.radii, **{f"detached_{name}": layer for name, layer in detached.items()}}
+    if picture.still is not None:
+        training["rotation_only_normal"] = picture.still
+    return RenderResult(layers, metal, training)
 
-
-_LAYERS = ("specular", "diffuse", "reflection", "strength", "roughness", "metalness")
 
 Split = tuple[Tensor, Tensor | None, Tensor | None]
 

@@ -22,7 +22,7 @@ from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot
 from polarguide.shading.metal import metal_stokes
-from polarguide.shading.result import DetachedLayers, Layout, MetalPixels, RenderResult
+from polarguide.shading.result import Layout, MetalPixels, RenderResult
 
 # Brightest light of an environment with the exponential scale: e^5, about 150 times display white.
 MAXIMUM_LOG_LIGHT = 5.0
@@ -273,17 +273,17 @@ class ShadingModel(ABC):
 
     def shade_detached(
         self, splatted: GBuffer, light: Light, camera: Camera
-    ) -> tuple[dict[str, Any], DetachedLayers | None]:
-        """``shade``, and if it reflects ``specular`` and ``diffuse`` again, without a gradient on the normals but by
-        what metals mirror, and those metals.
+    ) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """``shade``, and the layers ``specular`` and ``diffuse`` of a model that reflects without a gradient on the
+        normals, other than by the light that metals mirror.
         """
         layers = self.shade(splatted, light, camera)
         if "specular" not in layers:
-            return layers, None
+            return layers, {}
         parts = [splatted[name].detach() if name == "normal" else splatted[name] for name in splatted.layout]
         features = torch.cat(parts, dim=-1)
         again = self.shade(replace(splatted, features=features, metal=layers.get("metal")), light, camera)
-        return layers, (again["specular"], again["diffuse"], again.get("metal"))
+        return layers, {name: again[name] for name in ("specular", "diffuse")}
 
     @property
     def smooth_dielectric(self) -> bool:
@@ -297,22 +297,20 @@ class ShadingModel(ABC):
             result: with the specular and diffuse layers and the normal.
         """
         normal = result.shaded_normal
-        assert result.specular is not None
-        assert result.diffuse is not None
-        assert normal is not None
+        own = result.layers.get("index")
         stokes = optics.predicted_stokes(
-            2 * result.specular,
-            2 * result.diffuse,
+            2 * result.layers["specular"],
+            2 * result.layers["diffuse"],
             camera.to_camera(normal),
             camera.rays(device=normal.device),
-            self.refractive_index if result.index is None else result.index,
+            self.refractive_index if own is None else own,
         )
         if result.metal is None:
             return stokes
-        index: float | Tensor = self.refractive_index
-        if result.index is not None:
-            index = result.index.flatten()[result.metal.pixels]
-        metal = metal_stokes(result.specular, result.diffuse, normal, result.metal, camera, index)
+        index = self.refractive_index if own is None else own.flatten()[result.metal.pixels]
+        metal = metal_stokes(
+            result.layers["specular"], result.layers["diffuse"], normal, result.metal, camera, index
+        )
         return stokes.flatten(1, 2).index_copy(1, result.metal.pixels, metal).view_as(stokes)
 
     # What exports need

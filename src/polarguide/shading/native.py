@@ -204,12 +204,12 @@ def shade_native(
 ) -> dict[str, Any]:
     """The layers of ``reflect_native`` by name, [H, W, 3] each.
 
-    If ``given.detached`` is set, ``detached specular`` and ``detached diffuse`` are among them: the same layers, whose
+    If ``given.detached`` is set, ``detached_specular`` and ``detached_diffuse`` are among them: the same layers, whose
     gradient does not reach the normals. ``metal`` is None if no Gaussian is a metal.
     """
     shaded = reflect_native(splatted.features.flatten(0, 1), world_rays_native(camera), textures, given)
     names = ["final", "specular", "diffuse", "reflection"]
-    names += ["detached specular", "detached diffuse"] if given.detached else []
+    names += ["detached_specular", "detached_diffuse"] if given.detached else []
     shape = splatted.features.shape[:2]
     layers = {name: layer.unflatten(0, shape) for name, layer in zip(names, shaded, strict=False)}
     metal = None if given.metal is None else MetalPixels(given.metal.pixels, *shaded[len(names) :])

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -173,9 +172,9 @@ class Trainer:
         loss = step_loss(step, stage.weights)
         loss.total.backward()
         gradient = statistic.gradient if statistic else None
-        if counts and gradient is not None and result.radii is not None:
+        if counts and gradient is not None:
             self.whole = False
-            state.statistics.add(gradient, result.radii, camera.width, camera.height, slot)
+            state.statistics.add(gradient, result.training["radii"], camera.width, camera.height, slot)
         psnr = -10 * torch.log10(loss.error.clamp(min=1e-10))
         return torch.stack((loss.photometric.detach(), psnr, loss.total.detach()))
 
@@ -327,15 +326,11 @@ def turned_behind(result: RenderResult, near: float, far: float) -> RenderResult
         result: with ``normal``, ``rotation_only_normal`` and ``depth``.
         near, far: camera depths, 0 < near < far.
     """
-    assert result.normal is not None
-    assert result.rotation_only_normal is not None
-    assert result.depth is not None
     depth = result.depth.detach()
     share = shares_before(depth, near, far)
-    return replace(
-        result,
-        normal=result.rotation_only_normal.lerp(result.normal, share[..., None]),
-        depth=depth.lerp(result.depth, share),
+    rotation_only = result.training["rotation_only_normal"]
+    return result.with_layers(
+        normal=rotation_only.lerp(result.normal, share[..., None]), depth=depth.lerp(result.depth, share)
     )
 
 

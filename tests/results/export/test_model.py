@@ -17,7 +17,6 @@ import torch
 from faults import Fault
 from random_runs import ring
 from scipy.ndimage import maximum_filter, minimum_filter
-from torch import Tensor
 
 from polarguide.capture.presentation import Crop, Presentation
 from polarguide.core.errors import install_package, require_package
@@ -237,9 +236,10 @@ def ball_view(camera: Camera, mirrored: float = 1.0) -> RenderResult:
     picture, alpha = diffuse.float(), hit.float()
     normal = torch.where(hit[..., None], points, 0.0).float()
     specular = 0.2 * alpha[..., None].expand_as(picture)
-    result = RenderResult(picture + specular, specular, picture, picture, 5 * mirrored * specular, 0.5 * alpha, normal,
-                          depth, alpha, Tensor())  # fmt: skip
-    return replace(result, roughness=0.3 * alpha)
+    lobes = {"final": picture + specular, "specular": specular, "diffuse": picture, "base": picture}
+    surface = {"normal": normal, "depth": depth, "alpha": alpha}
+    shaded = {"reflection": 5 * mirrored * specular, "strength": 0.5 * alpha, "roughness": 0.3 * alpha}
+    return RenderResult({**lobes, **surface, **shaded})
 
 
 def ball_run(light: float = 1.0) -> Any:
@@ -330,8 +330,8 @@ def test_light_that_gaussians_add_is_folded_in() -> None:
     cubemap = run.model.shading.radiance_cubemap
     run.light["texels"] = torch.full((6, 4, 4, 3), math.log(0.2))
     found = [cubemap.radiance(mirrored_light(run, cubemap, lambda *_: None))]
-    run.result = lambda camera: replace(
-        ball_view(camera), specular=torch.zeros(camera.height, camera.width, 3)
+    run.result = lambda camera: ball_view(camera).with_layers(
+        specular=torch.zeros(camera.height, camera.width, 3)
     )
     found.append(cubemap.radiance(mirrored_light(run, cubemap, lambda *_: None)))
     for values, expected in zip(found, (3.0, 0.2), strict=True):

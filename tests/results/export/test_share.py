@@ -20,6 +20,7 @@ from polarguide.results.export.share import BAKED, baked_page, harmonics_steps, 
 from polarguide.runs.model import gaussian_colors
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.model import PLAIN
+from polarguide.shading.result import RenderResult
 
 REFLECTING = ["final", "diffuse", "specular", "base", "strength", "normal"]
 LAYERS = {
@@ -175,9 +176,9 @@ def test_it_begins_at_the_best_view_and_brightens_dark_gloss() -> None:
     assert web_page._best_view(views, None, None).name == "a"
     alpha = torch.ones(10, 10)
     for brightest, times in ((0.2, 4.0), (1.5, 1.0), (1e-4, 16.0)):
-        result = SimpleNamespace(specular=torch.full((10, 10, 3), brightest), alpha=alpha)
+        result = RenderResult({"specular": torch.full((10, 10, 3), brightest), "alpha": alpha})
         assert web_page._gloss(result) == times
-    assert web_page._gloss(SimpleNamespace(specular=None, alpha=alpha)) == 1.0
+    assert web_page._gloss(RenderResult({"alpha": alpha})) == 1.0
 
 
 def test_the_same_run_gives_the_same_page() -> None:

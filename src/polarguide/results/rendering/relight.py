@@ -96,11 +96,12 @@ def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -
     views = run.scene.train_views
     for count, view in enumerate(views, 1):
         result = run.result(view.camera).to("cpu")
-        assert result.specular is not None
-        assert result.reflection is not None
-        assert result.normal is not None
-        light = result.reflection
-        share = (result.specular.sum(-1) / light.sum(-1).clamp(min=1e-6)).clamp(0, 1)[..., None].square()
+        light = result.layers["reflection"]
+        share = (
+            (result.layers["specular"].sum(-1) / light.sum(-1).clamp(min=1e-6))
+            .clamp(0, 1)[..., None]
+            .square()
+        )
         directions = mirrored(view.camera.world_rays(), unit(result.normal, 1e-3)).reshape(-1, 3)
         with torch.enable_grad():
             # The gradient of a look-up shares each pixel among the texels that it would read.

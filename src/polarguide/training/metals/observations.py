@@ -69,7 +69,6 @@ def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal:
     """Sums [N, 11] over a view's pixels: 1, S0, P, the polarization at 45 degrees to it and the cosine."""
     device = gaussians["means"].device
     normal = render(gaussians, view.camera, rasterize, RenderRequest(sh_degree=0)).normal
-    assert normal is not None
     view = view.to(device)
     rays = view.camera.rays(device=device)
     guide, reliable = guide_normals(view.camera.to_camera(normal), rays, least_normal)

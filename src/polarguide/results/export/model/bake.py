@@ -137,16 +137,15 @@ def _layers(model: GaussianModel, result: RenderResult, view: View, color: Color
     elif color == "final":
         colors = result.final / alpha
     else:
-        colors = (result.base if result.diffuse is None else result.diffuse) / alpha
+        colors = result.layers.get("diffuse", result.base) / alpha
     layers = {"color": colors}
     for name, constant in CONSTANTS.items():
-        values = getattr(result, name)
+        values = result.layers.get(name)
         layers[name] = torch.full((*size, 1), constant) if values is None else values[..., None]
     layers["strength"] = (layers["strength"] / alpha).clamp(max=1)
     layers["reflectance"] = _reflectance(model, view.camera)
-    index = torch.full(size, model.shading.refractive_index) if result.index is None else result.index
+    index = result.layers.get("index", torch.full(size, model.shading.refractive_index))
     layers["index"] = index[..., None]
-    assert result.normal is not None
     layers["normal"] = result.normal
     return layers
 
@@ -164,7 +163,6 @@ def _reflectance(model: GaussianModel, camera: Camera) -> Tensor:
 def _reliable_depth(result: RenderResult, view: View | None) -> Tensor:
     """Depth [H, W] of the surface; 0 where a pixel is translucent, on the outline of something, or, of photographs,
     invalid."""
-    assert result.depth is not None
     depth = result.depth
     far = max_pool2d(depth[None, None], 3, 1, 1)[0, 0]
     near = -max_pool2d(-depth[None, None], 3, 1, 1)[0, 0]
