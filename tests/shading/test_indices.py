@@ -14,8 +14,9 @@ from polarguide.capture import Scene
 from polarguide.raster import choose_backend
 from polarguide.raster.surface import surface_picture
 from polarguide.recipes import recipe_named
+from polarguide.results.export.adapters import INDEX_NOTE, page_shading, ply_fields
 from polarguide.runs.folder import resolve
-from polarguide.shading.deferred import INDEX_NOTE, DeferredShading
+from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import RenderRequest, render, splatting
 from polarguide.shading.model import PLAIN
 from polarguide.shading.result import RenderResult
@@ -111,10 +112,10 @@ def test_colors_attributes_and_the_page() -> None:
     other = values["index_offset"] != 0
     assert torch.equal(ours[~other], before[~other])
     assert bool((ours[other] != before[other]).any(dim=1).all())
-    assert_close(SHADING.fields(values)["refractive_index"], 1.5 + values["index_offset"])
-    assert "refractive_index" not in SHADING.fields(gaussians(others=0))
+    assert_close(ply_fields(SHADING, values)["refractive_index"], 1.5 + values["index_offset"])
+    assert "refractive_index" not in ply_fields(SHADING, gaussians(others=0))
     values["index_offset"].requires_grad_()  # as in a run that is opened
-    page, plain = SHADING.page(values, light), WITHOUT.page(values, light)
+    page, plain = (page_shading(model, values, light) for model in (SHADING, WITHOUT))
     values["index_offset"].requires_grad_(False)
     assert INDEX_NOTE in page.notes
     # Whatever the index that the page draws with, surfaces reflect as much at 45 degrees as with their own.

@@ -20,16 +20,16 @@ from shaded_gaussians import (
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.gaussians.gaussians import Gaussians
+from polarguide.gaussians.gaussians import Gaussians, any_nonzero
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.harmonics import evaluate_sh, sh_basis
 from polarguide.gaussians.ply import read_ply
 from polarguide.raster.cpu import rasterize_cpu
+from polarguide.results.export.adapters import ply_fields
 from polarguide.runs.model import gaussian_colors, write_run_ply
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import render
 from polarguide.shading.metal import (
-    any_nonzero,
     convert,
     metal_pixels,
     mirror_base,
@@ -134,7 +134,7 @@ def test_the_point_cloud_says_what_metals_are(tmp_path: Path) -> None:
     state, shading = random_state("polarguide-stokes", 40)
     metal = torch.arange(40) < 15
     state.gaussians.overwrite("metalness", metal.float())
-    write_run_ply(tmp_path / "run.ply", state, shading, own_fields=True)
+    write_run_ply(tmp_path / "run.ply", state, shading, own_fields=ply_fields(shading, state.gaussians))
     read = read_ply(tmp_path / "run.ply")["extra"]
     assert torch.equal(read["metalness"] > 0, metal)
     expected = reflectance(state.gaussians["reflectance_logits"]).detach()
@@ -244,13 +244,17 @@ def test_held_layers_send_normals_nothing() -> None:
 
 
 def test_whether_there_is_metal_follows_every_change() -> None:
-    metalness = torch.zeros(5)
-    assert not any_nonzero(metalness)
-    metalness[2] = 1
-    assert any_nonzero(metalness)
-    metalness.zero_()
-    assert not any_nonzero(metalness)
-    assert any_nonzero(torch.ones(5))
+    values = {"means": torch.zeros(5, 3), "metalness": torch.zeros(5)}
+    assert not any_nonzero(values, "metalness")
+    trained = Gaussians(values, {})
+    assert not any_nonzero(trained, "metalness")
+    trained.overwrite("metalness", torch.arange(5) / 4)
+    assert any_nonzero(trained, "metalness")
+    assert not any_nonzero(trained, "index_offset")
+    trained.keep(torch.tensor([0]))
+    assert not any_nonzero(trained, "metalness")
+    trained.append({"means": torch.zeros(1, 3), "metalness": torch.ones(1)})
+    assert any_nonzero(trained, "metalness")
 
 
 def test_reflectances_come_back_from_their_parameter() -> None:

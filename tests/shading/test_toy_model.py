@@ -20,6 +20,7 @@ from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.scores import score_view
 from polarguide.results.evaluation.target import ViewTarget
+from polarguide.results.export.adapters import ply_fields
 from polarguide.results.export.mesh import surface_points
 from polarguide.results.export.share import BAKED, share_page
 from polarguide.results.rendering.relight import needs_radiance
@@ -109,7 +110,12 @@ def test_it_renders_and_is_evaluated(trained: Trainer) -> None:
 
 
 def test_it_is_exported(trained: Trainer, tmp_path: Path) -> None:
-    write_run_ply(tmp_path / "run.ply", trained.state, trained.shading, own_fields=True)
+    write_run_ply(
+        tmp_path / "run.ply",
+        trained.state,
+        trained.shading,
+        own_fields=ply_fields(trained.shading, trained.state.gaussians),
+    )
     read = read_ply(tmp_path / "run.ply")
     assert set(read["extra"]) == {"linear_dc", "linear_rest"}
     # Display colors, reflections included: brighter than the base color alone.

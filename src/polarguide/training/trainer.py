@@ -274,7 +274,7 @@ class Trainer:
     def _set_indices(self) -> None:
         """Give Gaussians the refractive indices that the user specified for materials."""
         indices = self.scene.indices
-        if not indices or not self.shading.knows_indices:
+        if not indices or "index_offset" not in self.shading.parameters:
             return
         gaussians = self.state.gaussians
         rasterize = self.backend.rasterize
@@ -306,7 +306,7 @@ def warn_of_unused_materials(
     MetalSearch(scene, recipe, settings, shading, backend, ALONE, warn, UNBOUNDED).warn_if_never()
     if not scene.indices:
         return
-    if not (shading.knows_indices and refreshes(recipe, settings.steps)):
+    if not ("index_offset" in shading.parameters and refreshes(recipe, settings.steps)):
         why = f"the recipe {recipe.name} takes the run's for everything"
     elif not any(numbers_in(view) & scene.indices.keys() for view in scene.train_views):
         why = "no picture in materials/ of a training view has one of their numbers"

@@ -16,10 +16,11 @@ from random_runs import KINDS, random_state, ring
 from polarguide.capture.presentation import Presentation
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.results.export import web_page
+from polarguide.results.export.adapters import page_shading
 from polarguide.results.export.share import BAKED, baked_page, harmonics_steps, records, share_page
 from polarguide.runs.model import gaussian_colors
 from polarguide.shading.deferred import DeferredShading
-from polarguide.shading.model import PLAIN
+from polarguide.shading.model import PLAIN, Light, Parameters
 from polarguide.shading.result import RenderResult
 
 REFLECTING = ["final", "diffuse", "specular", "base", "strength", "normal"]
@@ -118,8 +119,10 @@ def test_each_kind_of_shading_has_its_data(recipe: str) -> None:
 class Unknown(DeferredShading):
     """A model that the page has no shaders for."""
 
-    def page(self, gaussians, light):
-        return None
+
+@page_shading.register
+def _(shading: Unknown, gaussians: Parameters, light: Light) -> None:
+    """None: colors are baked."""
 
 
 def test_a_model_without_shaders_is_baked_and_says_so() -> None:
@@ -188,7 +191,7 @@ def test_the_same_run_gives_the_same_page() -> None:
 @pytest.mark.parametrize("recipe", KINDS)
 def test_records_are_close_to_what_they_stand_for(recipe: str) -> None:
     state, shading = random_state(recipe)
-    page = shading.page(state.gaussians, state.light)
+    page = page_shading(shading, state.gaussians, state.light)
     assert page.kind == KINDS[recipe]
     data = records(state.gaussians, page.values)
     seen = torch.sigmoid(state.gaussians["opacity_logits"].detach()) >= 1 / 255

@@ -61,8 +61,8 @@ def relight(
         texels = texels_of(picture, cubemap, around, RELIT_RESOLUTION)
         light[cubemap.name] = texels.to(light[cubemap.name].device)
     light[cubemap.name] = turned_cubemap(light[cubemap.name].detach(), around.turn(degrees), RELIT_RESOLUTION)
-    if run.model.shading.local_note:
-        reporter.say(f"note: {run.model.shading.local_note}")
+    if cubemap.note:
+        reporter.say(f"note: {cubemap.note}")
 
 
 def needs_radiance(shading: ShadingModel, *, what: str) -> RadianceCubemap:

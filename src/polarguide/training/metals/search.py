@@ -15,6 +15,7 @@ from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.initialize import far_away
 from polarguide.raster import Backend, Rasterize
 from polarguide.shading.gbuffer import render
+from polarguide.shading.metal import become_metal
 from polarguide.shading.model import Light, ShadingModel
 from polarguide.training.distributed import Ranks
 from polarguide.training.metals.cut import decide
@@ -101,7 +102,7 @@ class MetalSearch:
         self._ranks = ranks
         self._warn = warn
         self._memory = memory
-        self._on = shading.knows_metals and settings.materials == "auto"
+        self._on = "metalness" in shading.parameters and settings.materials == "auto"
         self._told = False
         self._steps = settings.steps
         self._refreshes = refreshes(recipe, settings.steps)
@@ -159,7 +160,9 @@ class MetalSearch:
             self._limits,
             self._memory,
         )
-        self._shading.become_metal(gaussians, state.light, metal, reflectance, gain)
+        cubemap = self._shading.radiance_cubemap
+        if cubemap is not None:
+            become_metal(gaussians, state.light[cubemap.name], cubemap.radiance, metal, reflectance, gain)
         del measured
         self._memory.clear()
 
@@ -208,7 +211,7 @@ def refreshes(recipe: Recipe, steps: int) -> list[int]:
 
 def looks(recipe: Recipe, settings: ResolvedSettings) -> list[int]:
     """The steps at which a training decides what is metal; none: it takes everything for dielectric."""
-    if not recipe.shading.knows_metals or settings.materials != "auto":
+    if "metalness" not in recipe.shading.parameters or settings.materials != "auto":
         return []
     steps = settings.steps
     return [step for step in refreshes(recipe, steps) if _within(recipe.metals, step, steps)]

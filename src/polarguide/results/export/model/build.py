@@ -153,6 +153,10 @@ def textured_model(
     color, baked = _presented(baked, light, presentation.color, _index(run), reporter)
     axes = run.frame.panorama_axes().numpy()
     textures = _textures(run, baked, texels, options.albedo_scale * color, lit=not options.unlit)
+    added = []
+    for place, values in [] if options.unlit else baked.added:
+        rgb = np.broadcast_to(values, (len(values), 3))
+        added.append((place, linear_pixels(texels.texture(rgb))))
     return Textured(
         placement.scale * vertices @ axes,
         _unit(normals @ axes),
@@ -160,6 +164,7 @@ def textured_model(
         _drawn(unwrapped),
         *textures,
         _index(run),
+        added,
     )
 
 
