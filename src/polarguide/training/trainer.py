@@ -15,7 +15,7 @@ from torch import Tensor
 from polarguide.capture import Scene, View
 from polarguide.capture.exposures import Exposure
 from polarguide.core.system import UNBOUNDED, MemoryBound
-from polarguide.gaussians.initialize import orbit
+from polarguide.gaussians.initialize import camera_reach
 from polarguide.raster import Backend, ScreenStatistic
 from polarguide.raster.magnification import footprints
 from polarguide.shading.gbuffer import RenderRequest, render
@@ -95,7 +95,7 @@ class Trainer:
         self._density = DensityControl(scene, recipe, settings, backend, ranks, memory, black=self.black)
         self._metals = MetalSearch(scene, recipe, settings, self.shading, backend, ranks, warn, memory)
         centers = torch.stack([view.camera.center for view in self._views])
-        self._reach = orbit(scene.points.double().numpy(), centers.double().numpy())[1]
+        self._reach = camera_reach(scene.points.double().numpy(), centers.double().numpy())[1]
         self._rate = math.sqrt(settings.views_per_step)
         self._actions: Mapping[Action, Callable[[], None]] = {
             "reset_opacity": self._reset_opacity,
