@@ -165,9 +165,10 @@ class _Splatting(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        inputs: dict[str, Any] = dict(zip(_INPUTS, ctx.saved_tensors, strict=False))
+        saved = ctx.saved_tensors
+        inputs: dict[str, Any] = dict(zip(_INPUTS, saved, strict=False))
         results = ("scales", "opacities", "features", "mirrored")
-        outputs = dict(zip(results, ctx.saved_tensors[len(_INPUTS) :], strict=True))
+        outputs = dict(zip(results, saved[len(_INPUTS) :], strict=True))
         names = ("grad_means", "grad_quaternions", "grad_scales", "grad_opacities", "grad_features")
         by = {name: grad.contiguous() for name, grad in zip(names, grads, strict=True)}
         to: dict[str, Any] = {

@@ -143,7 +143,7 @@ class _Reflect(torch.autograd.Function):
         to_features = torch.empty_like(features)
         to_seen = torch.empty_like(seen)
         # Gradients through the detached layers reach the light, but not the normals by way of the directions.
-        to_texels = None if by_detached == [None, None] else torch.empty_like(seen)
+        to_texels = None if all(grad is None for grad in by_detached) else torch.empty_like(seen)
         to_light = by["reflection"]
         metal = given.metal
         if metal is not None:
