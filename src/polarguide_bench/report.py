@@ -341,11 +341,12 @@ def _tile(name: str, run: OpenedRun | FieldRun, view: View, scores: Mapping[str,
         picture = layer_picture(result, layer, view.camera)
         if picture is not None:
             pictures[layer] = picture
-    if result.metalness is not None and bool(result.metalness.any()):
-        pictures["metalness"] = figures.scalar_to_rgb(result.metalness, 0.0, 1.0, "inferno")
+    metalness = result.layers.get("metalness")
+    if metalness is not None and bool(metalness.any()):
+        pictures["metalness"] = figures.scalar_to_rgb(metalness, 0.0, 1.0, "inferno")
     pictures["error"] = figures.error_to_rgb(result.final, view.photograph(), ERROR_HIGH)
     ground_truth = view.ground_truth
-    if ground_truth is not None and ground_truth.normal is not None and result.normal is not None:
+    if ground_truth is not None and ground_truth.normal is not None and "normal" in result.layers:
         angles = normal_angles_deg(result.normal.cpu(), ground_truth.normal)
         if ground_truth.mask is not None:
             angles = torch.where(ground_truth.mask, angles, torch.nan)

@@ -1,7 +1,6 @@
 """A scene of two views of which everything is known, made of random numbers: for scores that loops can check."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -11,6 +10,7 @@ from torch import Tensor
 from polarguide.capture import GroundTruth, Scene, View
 from polarguide.capture.metadata import Material, SceneObject
 from polarguide.geometry.camera import Camera
+from polarguide.shading.result import RenderResult
 
 HEIGHT, WIDTH = 20, 26
 OBJECTS = (
@@ -70,7 +70,7 @@ def known_scene() -> Scene:
     )
 
 
-def rendered(view: View, seed: int) -> tuple[SimpleNamespace, Tensor, Tensor]:
+def rendered(view: View, seed: int) -> tuple[RenderResult, Tensor, Tensor]:
     """A rendering that is wrong everywhere, its Stokes vectors, and the weight in front of the surface."""
     generator = torch.Generator().manual_seed(seed)
     truth = view.ground_truth
@@ -87,4 +87,4 @@ def rendered(view: View, seed: int) -> tuple[SimpleNamespace, Tensor, Tensor]:
         "alpha": torch.rand(HEIGHT, WIDTH, generator=generator),
     }
     stokes = torch.rand(3, HEIGHT, WIDTH, 3, generator=generator) * 0.2 - 0.1
-    return SimpleNamespace(**layers), stokes, torch.rand(HEIGHT, WIDTH, generator=generator)
+    return RenderResult(layers), stokes, torch.rand(HEIGHT, WIDTH, generator=generator)

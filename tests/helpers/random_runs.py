@@ -36,8 +36,9 @@ def random_state(name: str, count: int = 300, *, metal: bool = False) -> tuple[T
     light: dict[str, Tensor] = {}
     if recipe.shading.reflects:
         model = replace(recipe.shading, environment_resolution=8, environment_spread=1.5)  # type: ignore[call-arg]
-        gaussians |= model.initial_parameters(0.5 + 0.28 * gaussians["sh_dc"], generator)
-        light = model.initial_light(generator)
+        near = torch.zeros(count, dtype=torch.bool)
+        first, light = model.initialize(0.5 + 0.28 * gaussians["sh_dc"], near, generator)
+        gaussians |= first
     for key, spread in {"strength_logits": 1.0, "local_dc": 0.3, "local_rest": 0.1}.items():
         if key in gaussians:
             gaussians[key] = spread * normal(*gaussians[key].shape)

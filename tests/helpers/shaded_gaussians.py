@@ -73,7 +73,8 @@ def compare_native_polarization(
             values[name].requires_grad_()
         result = rendered(shading, values)
         if native:
-            term = PolarizationTerm(measured, S1_AND_S2, weight, 0.7, shading.refractive_index, result.index)
+            index_layer = result.layers.get("index")
+            term = PolarizationTerm(measured, S1_AND_S2, weight, 0.7, shading.refractive_index, index_layer)
             with selected(instructions):
                 loss = pixel_terms(result, camera(), Terms(term, [], None))
         else:

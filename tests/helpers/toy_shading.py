@@ -41,12 +41,12 @@ class SkyShading(ShadingModel):
     def light_parameters(self) -> Mapping[str, Parameter]:
         return {"sky": Parameter((2, 3), self.sky_rate)}
 
-    def initial_parameters(self, colors: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+    def initialize(
+        self, colors: Tensor, far: Tensor, generator: torch.Generator
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         logit = torch.logit(torch.tensor(self.first_gloss))
-        return {"gloss_logits": logit.expand(len(colors)).clone(), "tint": torch.ones(len(colors), 3)}
-
-    def initial_light(self, generator: torch.Generator) -> dict[str, Tensor]:
-        return {"sky": 0.1 * torch.rand(2, 3, generator=generator) - 1}
+        first = {"gloss_logits": logit.expand(len(colors)).clone(), "tint": torch.ones(len(colors), 3)}
+        return first, {"sky": 0.1 * torch.rand(2, 3, generator=generator) - 1}
 
     @property
     def layers(self) -> tuple[str, ...]:

@@ -10,9 +10,10 @@ from torch.testing import assert_close
 from polarguide import _native
 from polarguide.geometry.camera import Camera
 from polarguide.shading.deferred import DeferredShading
+from polarguide.shading.gbuffer import shaded
 from polarguide.shading.metal import MINIMUM_SHARE, where_metal
 from polarguide.shading.model import GBuffer
-from polarguide.shading.native import MetalArguments, ReflectArguments, reflect_native
+from polarguide.shading.native import DETACHED, MetalArguments, ReflectArguments, reflect_native
 from polarguide.shading.result import Layout
 
 HEIGHT, WIDTH, RESOLUTION = 20, 24, 32
@@ -60,7 +61,7 @@ def buffers(shading: DeferredShading) -> tuple[Tensor, Tensor]:
 def layout(shading: DeferredShading, *, metal: bool = True) -> Layout:
     own = {"local": 3} if shading.local else {}
     return Layout(
-        {"color": 3, "normal": 3, "strength": 1, **own, "roughness": 1}
+        {"color": 3, "normal": 3, "strength": 1, **own, "blur": 1}
         | ({"metal": 4, "depth": 1} if metal else {})
     )
 
@@ -69,14 +70,11 @@ def results(shading: DeferredShading, dtype: torch.dtype, *, held: bool) -> list
     """Layers and what metals reflect, then the gradients of a random sum of them by features and texels."""
     features, texels = (t.to(dtype).requires_grad_() for t in buffers(shading))
     alpha = torch.linspace(0, 1, HEIGHT * WIDTH, dtype=dtype).reshape(HEIGHT, WIDTH)
-    splatted = GBuffer(features, alpha, layout(shading))
-    if held:
-        layers, again = shading.shade_detached(splatted, {"texels": texels}, camera())
-        assert again is not None
-    else:
-        layers, again = shading.shade(splatted, {"texels": texels}, camera()), None
+    splatted = GBuffer(features, alpha, layout(shading), detached=held)
+    layers = shaded(shading, splatted, {"texels": texels}, camera())
+    again = [layers[name] for name in DETACHED] if held else []
     metal: Any = layers["metal"]
-    shown = [layers["final"], layers["specular"], metal.specular, metal.slope, *((again or ())[:2])]
+    shown = [layers["final"], layers["specular"], metal.specular, metal.slope, *again]
     generator = torch.Generator().manual_seed(1)
     total = sum((t * torch.randn(t.shape, generator=generator).to(t)).sum() for t in shown)
     total.backward()

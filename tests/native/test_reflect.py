@@ -8,8 +8,15 @@ from torch.testing import assert_close
 from polarguide import _native
 from polarguide.geometry.camera import Camera
 from polarguide.shading.deferred import DeferredShading
-from polarguide.shading.model import GBuffer, ShadingModel
-from polarguide.shading.native import ReflectArguments, reflect_native, reflect_reference, world_rays_native
+from polarguide.shading.gbuffer import shaded
+from polarguide.shading.model import GBuffer
+from polarguide.shading.native import (
+    DETACHED,
+    ReflectArguments,
+    reflect_native,
+    reflect_reference,
+    world_rays_native,
+)
 from polarguide.shading.result import Layout
 
 HEIGHT, WIDTH, RESOLUTION = 20, 24, 8
@@ -139,13 +146,12 @@ def test_held_layers_are_those_of_normals_without_a_gradient(
     layout = Layout({"color": 3, "normal": 3, "strength": 1, "local": 3})
     grid = torch.linspace(-1, 2, HEIGHT * WIDTH * 3).reshape(HEIGHT, WIDTH, 3)
     results = []
-    for function in (DeferredShading.shade_detached, ShadingModel.shade_detached):
+    for native in (True, False):
         features, texels = (t.requires_grad_() for t in buffers())
-        splatted = GBuffer(features, torch.ones(HEIGHT, WIDTH), layout)
-        layers, held = function(shading, splatted, {"texels": texels}, camera())
-        assert held is not None
-        specular, diffuse, metal = held
-        assert metal is None
+        splatted = GBuffer(features, torch.ones(HEIGHT, WIDTH), layout, detached=True)
+        layers = shaded(shading, splatted, {"texels": texels}, camera(), native=native)
+        assert layers.pop("metal") is None
+        specular, diffuse = (layers.pop(name) for name in DETACHED)
         terms = (layers["final"], specular, diffuse, layers["specular"])
         total = (grid * layers["final"]).sum() + sum(
             ((i + 2) * grid.flip(0) * terms[i]).sum() for i in wanted

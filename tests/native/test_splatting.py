@@ -163,6 +163,9 @@ def test_not_a_number_and_too_much_are_not_hidden() -> None:
 
 def test_a_model_with_channels_of_its_own_is_asked_for_them() -> None:
     class Doubled(DeferredShading):
+        def channel_parameters(self, gaussians: Parameters) -> None:
+            return None
+
         def channels(
             self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int
         ) -> dict[str, Tensor]:
@@ -172,6 +175,11 @@ def test_a_model_with_channels_of_its_own_is_asked_for_them() -> None:
     given, how = gaussians(10), {"sh_degree": 3, "normals": True, "depth": False}
     twice, once = (splatting(given, CAMERA, model, **how)[0] for model in (Doubled(), DeferredShading()))
     assert_close(twice.features[:, :3], 2 * once.features[:, :3], rtol=1e-5, atol=3e-6)
+
+
+def test_a_model_that_replaces_its_channels_has_to_say_what_their_kernel_is() -> None:
+    with pytest.raises(TypeError, match="channel_parameters"):
+        type("Wrapped", (DeferredShading,), {"channels": DeferredShading.channels})
 
 
 def test_wrong_shapes_are_refused() -> None:

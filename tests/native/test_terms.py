@@ -54,17 +54,8 @@ def rendered() -> RenderResult:
     layers[0][11], layers[1][12] = 0.0, 0.0
     alpha = torch.sigmoid(random(10, *SIZE))
     alpha[13] = 0.0
-    return RenderResult(
-        final=layers[0],
-        base=layers[0],
-        reflection=None,
-        strength=None,
-        specular=layers[0],
-        diffuse=layers[1],
-        normal=normal,
-        depth=depth,
-        alpha=alpha,
-    )
+    lobes = {"final": layers[0], "base": layers[0], "specular": layers[0], "diffuse": layers[1]}
+    return RenderResult({**lobes, "normal": normal, "depth": depth, "alpha": alpha})
 
 
 def measured() -> ViewPriors:
@@ -92,6 +83,8 @@ def measured() -> ViewPriors:
 
 
 def cast(record, dtype: torch.dtype):
+    if isinstance(record, RenderResult):
+        return record.with_layers(**{name: layer.to(dtype) for name, layer in record.layers.items()})
     tensors = {f.name: getattr(record, f.name) for f in fields(record)}
     return replace(record, **{k: t.to(dtype) for k, t in tensors.items() if isinstance(t, Tensor)})
 
@@ -99,7 +92,7 @@ def cast(record, dtype: torch.dtype):
 def with_gradients(terms, dtype: torch.dtype) -> tuple[Tensor, dict[str, Tensor]]:
     """Value and gradients of ``terms(result, priors)`` for inputs of a dtype."""
     leaves = {name: getattr(rendered(), name).to(dtype).requires_grad_() for name in INPUTS}
-    value = 3 * terms(replace(cast(rendered(), dtype), **leaves), cast(measured(), dtype))
+    value = 3 * terms(cast(rendered(), dtype).with_layers(**leaves), cast(measured(), dtype))
     value.backward()
     zeros = {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
     return value.detach(), {k: zeros[k] if leaf.grad is None else leaf.grad for k, leaf in leaves.items()}
@@ -246,7 +239,7 @@ def test_no_weight_no_light_and_no_surface_cost_nothing() -> None:
     nothing = {name: torch.zeros(*SIZE, 3, requires_grad=True) for name in INPUTS[:3]}
     depth = torch.zeros(SIZE, requires_grad=True)
     flat = torch.zeros(SIZE)
-    result = replace(cast(rendered(), torch.float32), **nothing, depth=depth, alpha=flat)
+    result = cast(rendered(), torch.float32).with_layers(**nothing, depth=depth, alpha=flat)
     priors = cast(measured(), torch.float32)
     dark = replace(priors, weight=flat, chromatic_weight=flat, stokes=torch.zeros(3, *SIZE, 3), surface=flat)
     value = normal_terms(step(result, dark), ALL)
@@ -260,12 +253,12 @@ def test_not_a_number_is_not_hidden() -> None:
     for name in INPUTS[:3]:
         broken = getattr(rendered(), name).clone().float()
         broken[18, 33] = torch.nan
-        result = replace(cast(rendered(), torch.float32), **{name: broken})
+        result = cast(rendered(), torch.float32).with_layers(**{name: broken})
         value = normal_terms(step(result, cast(measured(), torch.float32)), ALL)
         assert not bool(torch.isfinite(value)), name
 
 
 def test_shapes_are_checked() -> None:
-    result = replace(cast(rendered(), torch.float32), specular=torch.zeros(3, 3, 3))
+    result = cast(rendered(), torch.float32).with_layers(specular=torch.zeros(3, 3, 3))
     with pytest.raises(ValueError, match="specular: "):
         normal_terms(step(result, cast(measured(), torch.float32)), ALL)

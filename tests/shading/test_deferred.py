@@ -82,26 +82,25 @@ def test_layers_add_up_to_the_final_picture(
 ) -> None:
     result = render(gaussians, camera(), rasterize, shading=shading, light={"texels": environment()})
     torch.testing.assert_close(result.specular + result.diffuse, result.final)
-    strength = result.strength[..., None]
+    strength = result.layers["strength"][..., None]
     assert 0 <= float(strength.min()) <= float(strength.max()) <= 1
-    assert float(result.reflection.min()) >= 0
+    assert float(result.layers["reflection"].min()) >= 0
     if shading is LERP:
-        torch.testing.assert_close(result.specular, strength * result.reflection)
+        torch.testing.assert_close(result.specular, strength * result.layers["reflection"])
         torch.testing.assert_close(result.diffuse, (1 - strength) * result.base)
-        assert float(result.reflection.max()) <= 1
+        assert float(result.layers["reflection"].max()) <= 1
     else:
         assert torch.equal(result.diffuse, result.base)
-        share = (result.specular / (strength * result.reflection))[strength[..., 0] > 0.05]
+        share = (result.specular / (strength * result.layers["reflection"]))[strength[..., 0] > 0.05]
         assert float(share.min()) > 0.0399, "Fresnel's reflectance of glass is 4 % at least"
         assert float(share.max()) <= 1.0001
 
 
 def test_without_environment_there_is_no_reflection(gaussians: dict[str, Tensor]) -> None:
     result = render(gaussians, camera(), rasterize_cpu)
-    assert result.specular is result.diffuse is result.reflection is result.strength is result.depth is None
+    assert result.layers.keys() == {"final", "base", "alpha", "normal"}
     assert torch.equal(result.final, result.base)
-    assert result.normal is not None
-    assert render(gaussians, camera(), rasterize_cpu, RenderRequest(normals=False)).normal is None
+    assert "normal" not in render(gaussians, camera(), rasterize_cpu, RenderRequest(normals=False)).layers
 
 
 def test_the_base_does_not_depend_on_what_else_is_splatted(gaussians: dict[str, Tensor]) -> None:
@@ -114,8 +113,9 @@ def test_the_base_does_not_depend_on_what_else_is_splatted(gaussians: dict[str, 
         shading=LERP,
         light={"texels": environment()},
     )
-    for name in ("base", "alpha", "radii"):
-        torch.testing.assert_close(getattr(plain, name), getattr(full, name))
+    for name in ("base", "alpha"):
+        torch.testing.assert_close(plain.layers[name], full.layers[name])
+    torch.testing.assert_close(plain.training["radii"], full.training["radii"])
 
 
 def test_strength_zero_shows_the_base_and_strength_one_the_mirror(gaussians: dict[str, Tensor]) -> None:
@@ -251,7 +251,9 @@ def test_local_light_adds_to_the_environments_before_fresnel(gaussians: dict[str
         gaussians, camera(), rasterize_reference, shading=FRESNEL, light={"texels": environment()}
     )
     with_it = render(gaussians, camera(), rasterize_reference, shading=LOCAL, light={"texels": environment()})
-    torch.testing.assert_close(with_it.reflection, without.reflection + 0.5 * without.alpha[..., None])
+    torch.testing.assert_close(
+        with_it.layers["reflection"], without.layers["reflection"] + 0.5 * without.alpha[..., None]
+    )
     torch.testing.assert_close(with_it.base, without.base)
 
 
@@ -308,15 +310,15 @@ def test_held_layers_are_the_layers_and_leave_rotations_alone(
         shading=shading,
         light={"texels": texels},
     )
-    assert torch.equal(result.detached_layers[0], result.specular)
-    assert torch.equal(result.detached_layers[1], result.diffuse)
+    assert torch.equal(result.training["detached_specular"], result.specular)
+    assert torch.equal(result.training["detached_diffuse"], result.diffuse)
 
     def gradients(layer: Tensor) -> dict[str, Tensor]:
         wanted = [leaves["strength_logits"], leaves["sh_dc"], texels, leaves["quaternions"]]
         found = torch.autograd.grad(layer.square().sum(), wanted, retain_graph=True, materialize_grads=True)
         return dict(zip(("strength", "base", "texels", "quaternions"), found, strict=True))
 
-    moved, held = gradients(result.specular), gradients(result.detached_layers[0])
+    moved, held = gradients(result.specular), gradients(result.training["detached_specular"])
     for name in ("strength", "base", "texels"):
         torch.testing.assert_close(held[name], moved[name])
     # Rotations shape the splats, too, so that what is left of their gradient is not zero: it is that of a picture whose
@@ -326,11 +328,13 @@ def test_held_layers_are_the_layers_and_leave_rotations_alone(
     still = render(
         frozen, camera(), rasterize_cpu, RenderRequest(depth=True), shading=shading, light={"texels": texels}
     )
-    assert torch.equal(still.specular, result.detached_layers[0])
+    assert torch.equal(still.specular, result.training["detached_specular"])
 
 
 def test_layers_are_held_only_where_asked_for(gaussians: dict[str, Tensor]) -> None:
     light = {"texels": environment()}
-    assert render(gaussians, camera(), rasterize_cpu, shading=FRESNEL, light=light).detached_layers is None
+    assert render(gaussians, camera(), rasterize_cpu, shading=FRESNEL, light=light).training.keys() == {
+        "radii"
+    }
     plain = render(gaussians, camera(), rasterize_cpu, RenderRequest(layers_detached=True), shading=PLAIN)
-    assert plain.detached_layers is None
+    assert plain.training.keys() == {"radii"}

@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from polarguide import _native
 from polarguide.geometry.camera import Camera
 from polarguide.raster.cpu import rasterize_cpu
+from polarguide.results.export.adapters import ply_fields
 from polarguide.shading.cubemap import box_mips, cubemap_lookup_reference, mip_lookup, mip_lookup_reference
 from polarguide.shading.directional import CHANNELS, FEATURES, DirectionalShading, albedo_of
 from polarguide.shading.gbuffer import RenderRequest, render
@@ -19,7 +20,7 @@ from polarguide.shading.model import MAXIMUM_LOG_LIGHT, PLAIN, GBuffer, harmonic
 from polarguide.shading.result import Layout
 
 SHADING = DirectionalShading(width=8, environment_resolution=8, environment_spread=1.0)
-LAYOUT = Layout({"color": 3, "normal": 3, "roughness": 1, "feature": FEATURES, "surface": 1})
+LAYOUT = Layout({"color": 3, "normal": 3, "blur": 1, "feature": FEATURES, "surface": 1})
 COUNT, RESOLUTION, LEVELS = 30, 8, 5
 
 
@@ -33,7 +34,8 @@ def normal(seed: int, *shape: int) -> Tensor:
 
 
 def light(dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
-    values = SHADING.initial_light(torch.Generator().manual_seed(0))
+    near = torch.zeros(0, dtype=torch.bool)
+    _, values = SHADING.initialize(torch.zeros(0, 3), near, torch.Generator().manual_seed(0))
     return {name: t.to(dtype) for name, t in values.items()}
 
 
@@ -47,7 +49,9 @@ def gaussians() -> dict[str, Tensor]:
         "sh_dc": 0.5 * normal(17, COUNT, 3),
         "sh_rest": 0.1 * normal(18, COUNT, 15, 3),
     }
-    return core | SHADING.initial_parameters(torch.rand(COUNT, 3), torch.Generator().manual_seed(5))
+    near = torch.zeros(COUNT, dtype=torch.bool)
+    first, _ = SHADING.initialize(torch.rand(COUNT, 3), near, torch.Generator().manual_seed(5))
+    return core | first
 
 
 def plainly(values: dict[str, Tensor], ray: Tensor, roughness: Tensor, feature: Tensor) -> Tensor:
@@ -112,7 +116,7 @@ def test_layers_add_up_to_the_final_picture(gaussians: dict[str, Tensor]) -> Non
     )
     assert torch.equal(result.specular + result.diffuse, result.final)
     assert torch.equal(result.diffuse, result.base)
-    assert result.strength is result.reflection is None
+    assert result.layers.keys().isdisjoint({"strength", "reflection"})
     assert float(result.specular.min()) >= 0
     assert not result.specular[result.alpha < 0.04].any(), "light without a surface"
     assert bool((result.specular[result.alpha > 0.06] > 0).all())
@@ -133,10 +137,10 @@ def test_first_values_are_those_asked_for() -> None:
         SHADING, first_albedo=0.4, first_roughness=0.3, first_light=0.1, environment_resolution=4
     )
     colors = torch.tensor([[0.5, 0.2, 0.1], [0.0, 1.0, 0.3]])
-    gaussians = shading.initial_parameters(colors, torch.Generator().manual_seed(0))
+    near = torch.zeros(2, dtype=torch.bool)
+    gaussians, values = shading.initialize(colors, near, torch.Generator().manual_seed(0))
     assert_close(albedo_of(gaussians), (0.4 * colors).clamp(min=1e-3))
     assert_close(torch.sigmoid(gaussians["roughness_logits"]), torch.full((2,), 0.3))
-    values = shading.initial_light(torch.Generator().manual_seed(0))
     assert values["texels"].shape == (6, 4, 4, CHANNELS)
     assert_close(values["mlp_bias_2"].exp(), torch.full((3,), 0.1))
     table = replace(shading, environment_rate=1.0).light_parameters
@@ -177,7 +181,7 @@ def test_a_gaussian_alone_is_its_albedo_and_the_light_in_its_mirror(gaussians: d
     rays = normalize(normal(15, COUNT, 3), dim=-1)
     normals = normalize(normal(16, COUNT, 3), dim=-1)
     normals = torch.where((normals * rays).sum(-1, keepdim=True) > 0, -normals, normals)
-    fields = SHADING.fields(gaussians)
+    fields = ply_fields(SHADING, gaussians)
     assert {name: tuple(t.shape[1:]) for name, t in fields.items()} == {
         "linear_dc": (3,),
         "linear_rest": (45,),
@@ -221,7 +225,8 @@ def test_a_pixel_reflects_by_the_share_of_its_alpha_that_has_a_surface() -> None
 
 def test_what_begins_beyond_the_cameras_has_no_surface() -> None:
     far = torch.tensor([False, True])
-    assert SHADING.placed_parameters(far)["surface"].tolist() == [1.0, 0.0]
+    first, _ = SHADING.initialize(torch.zeros(2, 3), far, torch.Generator())
+    assert first["surface"].tolist() == [1.0, 0.0]
 
 
 MIPS = 5  # of resolution 8: 8, 4, 2, 1, and the mean

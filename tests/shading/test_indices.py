@@ -1,7 +1,5 @@
 """Refractive indices of single Gaussians in the deferred shading model: what they change, and what they leave."""
 
-from dataclasses import fields
-
 import pytest
 import shaded_gaussians
 import torch
@@ -17,7 +15,8 @@ from polarguide.capture import Scene
 from polarguide.raster import choose_backend
 from polarguide.raster.surface import surface_picture
 from polarguide.recipes import recipe_named
-from polarguide.shading.deferred import INDEX_NOTE, DeferredShading
+from polarguide.results.export.adapters import INDEX_NOTE, page_shading, ply_fields
+from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import RenderRequest, render, splatting
 from polarguide.shading.model import PLAIN
 from polarguide.shading.result import RenderResult
@@ -54,7 +53,7 @@ def test_without_other_indices_every_bit_is_as_before(metals: int) -> None:
         "metalness",
     ):
         assert torch.equal(getattr(ours, name), getattr(before, name))
-    assert ours.index is None
+    assert "index" not in ours.layers
     assert torch.equal(SHADING.predicted_stokes(ours, camera()), WITHOUT.predicted_stokes(before, camera()))
 
 
@@ -68,13 +67,13 @@ def test_the_native_pass_agrees_with_the_reference(metals: int, held: bool, dept
         for name in TRAINED:
             values[name].requires_grad_()
         result = rendered(SHADING, values, layers_detached=held, depth=depth)
-        assert not result.index.requires_grad
+        assert not result.layers["index"].requires_grad
         loss = (result.final * result.final).sum() + result.specular.sum()
         if held:
-            loss = loss + 2 * result.detached_layers[0].sum()
+            loss = loss + 2 * result.training["detached_specular"].sum()
         loss = loss + SHADING.predicted_stokes(result, camera()).square().sum()
         loss.backward()
-        shown = [result.final, result.specular, result.index, loss]
+        shown = [result.final, result.specular, result.layers["index"], loss]
         found.append([t.detach().double() for t in (*shown, *(values[name].grad for name in TRAINED))])
     for ours, exact in zip(*found, strict=True):
         assert_close(ours, exact, rtol=5e-3, atol=5e-3)
@@ -84,13 +83,15 @@ def test_the_index_of_a_pixel_is_that_of_what_it_shows() -> None:
     values = gaussians(others=COUNT)
     values["index_offset"].fill_(-0.17)
     result = rendered(SHADING, values)
-    assert_close(result.index, 1.5 - 0.17 * result.alpha)
+    assert_close(result.layers["index"], 1.5 - 0.17 * result.alpha)
     # As bright as Fresnel's equations say: all that differs from the run's index is the reflectance.
     before = rendered(WITHOUT, values)
     cosine = (
         -(camera().world_rays() * torch.nn.functional.normalize(before.normal, dim=-1)).sum(-1).clamp(-1, 0)
     )
-    ours, theirs = (sum(optics.reflectances_from_cosine(cosine, index)) for index in (result.index, 1.5))
+    ours, theirs = (
+        sum(optics.reflectances_from_cosine(cosine, index)) for index in (result.layers["index"], 1.5)
+    )
     lit = (result.alpha > 0.1) & (before.specular.amin(dim=-1) > 1e-4)
     assert int(lit.sum()) > 20
     assert_close(result.specular[lit] / before.specular[lit], (ours / theirs)[lit][:, None].expand(-1, 3))
@@ -110,10 +111,10 @@ def test_colors_attributes_and_the_page() -> None:
     other = values["index_offset"] != 0
     assert torch.equal(ours[~other], before[~other])
     assert bool((ours[other] != before[other]).any(dim=1).all())
-    assert_close(SHADING.fields(values)["refractive_index"], 1.5 + values["index_offset"])
-    assert "refractive_index" not in SHADING.fields(gaussians(others=0))
+    assert_close(ply_fields(SHADING, values)["refractive_index"], 1.5 + values["index_offset"])
+    assert "refractive_index" not in ply_fields(SHADING, gaussians(others=0))
     values["index_offset"].requires_grad_()  # as in a run that is opened
-    page, plain = SHADING.page(values, light), WITHOUT.page(values, light)
+    page, plain = (page_shading(model, values, light) for model in (SHADING, WITHOUT))
     values["index_offset"].requires_grad_(False)
     assert INDEX_NOTE in page.notes
     # Whatever the index that the page draws with, surfaces reflect as much at 45 degrees as with their own.
@@ -150,12 +151,9 @@ def seen(trainer: TrainingLoop, **asked: bool) -> RenderResult:
 def test_the_layers_and_the_polarization_stay(trainer: TrainingLoop) -> None:
     camera = trainer.context.scene.test_views[0].camera
     blended, found = seen(trainer, depth=True), seen(trainer, depth=True, at_median_depth=True)
-    for field in fields(RenderResult):
-        one, other = (getattr(result, field.name) for result in (blended, found))
-        if field.name not in ("normal", "depth", "blended_normal") and isinstance(one, Tensor):
-            assert torch.equal(one, other), field.name
-    assert torch.equal(found.blended_normal, blended.normal)
-    assert found.shaded_normal is found.blended_normal
+    for name in blended.layers.keys() - {"normal", "depth"}:
+        assert torch.equal(blended.layers[name], found.layers[name]), name
+    assert torch.equal(found.shaded_normal, blended.normal)
     assert blended.shaded_normal is blended.normal
     predicted = [trainer.current.shading.predicted_stokes(result, camera) for result in (blended, found)]
     assert torch.equal(*predicted)
@@ -173,7 +171,7 @@ def test_normals_and_depth_are_those_around_the_median(trainer: TrainingLoop) ->
 
 
 def test_what_is_not_asked_for_is_not_there(trainer: TrainingLoop) -> None:
-    assert seen(trainer, at_median_depth=True).depth is None
+    assert "depth" not in seen(trainer, at_median_depth=True).layers
     state, camera = trainer.state, trainer.context.scene.test_views[0].camera
     plain = render(
         state.gaussians,
@@ -182,8 +180,8 @@ def test_what_is_not_asked_for_is_not_there(trainer: TrainingLoop) -> None:
         RenderRequest(normals=False, depth=True, at_median_depth=True),
         shading=PLAIN,
     )
-    assert plain.normal is None
-    assert plain.blended_normal is None
+    assert "normal" not in plain.layers
+    assert "shaded_normal" not in plain.layers
     assert not plain.depth.requires_grad
 
 

@@ -20,16 +20,16 @@ from shaded_gaussians import (
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.gaussians.gaussians import Gaussians
+from polarguide.gaussians.gaussians import Gaussians, any_nonzero
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.harmonics import evaluate_sh, sh_basis
 from polarguide.gaussians.ply import read_ply
 from polarguide.raster.cpu import rasterize_cpu
+from polarguide.results.export.adapters import ply_fields
 from polarguide.runs.model import gaussian_colors, write_run_ply
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import render
 from polarguide.shading.metal import (
-    any_nonzero,
     convert,
     metal_pixels,
     mirror_base,
@@ -52,8 +52,8 @@ def test_without_a_metal_every_bit_is_as_before() -> None:
     for name in ("final", "specular", "diffuse", "reflection", "strength", "normal", "depth", "alpha"):
         assert torch.equal(getattr(ours, name), getattr(before, name))
     assert ours.metal is None
-    assert not bool(ours.metalness.any())
-    assert before.metalness is None
+    assert not bool(ours.layers["metalness"].any())
+    assert "metalness" not in before.layers
 
 
 @pytest.mark.parametrize("depth", [False, True])
@@ -63,7 +63,7 @@ def test_layers_add_up_and_metals_have_no_body(depth: bool) -> None:
     torch.testing.assert_close(result.final, result.specular + result.diffuse)
     assert not bool(result.diffuse.any())
     shown = result.alpha > 0.02
-    torch.testing.assert_close(result.metalness[shown], result.alpha[shown])
+    torch.testing.assert_close(result.layers["metalness"][shown], result.alpha[shown])
     assert bool((result.specular[shown].amax(dim=-1) > 0).all())
 
 
@@ -77,7 +77,7 @@ def test_a_smooth_metal_shows_its_reflectance_times_the_light() -> None:
     facing = torch.nn.functional.normalize(result.normal, dim=-1)
     cosine = -(camera().world_rays() * facing).sum(-1, keepdim=True).clamp(-1, 0)
     mean, _ = optics.conductor(cosine, reflectance(torch.tensor([2.0, 0.0, -1.0])))
-    expected = result.alpha[..., None] * mean * result.reflection
+    expected = result.alpha[..., None] * mean * result.layers["reflection"]
     torch.testing.assert_close(result.specular[shown], expected[shown], rtol=1e-3, atol=1e-5)
 
 
@@ -93,11 +93,11 @@ def test_rough_surfaces_mirror_a_blurred_light(rough: bool, metals: int) -> None
         values["roughness_logits"].fill_(logit)
         result = rendered(shading, values)
         clear = result.alpha > 0.5
-        reflections.append(result.reflection)
-        spread.append(float(result.reflection[clear].std()))
+        reflections.append(result.layers["reflection"])
+        spread.append(float(result.layers["reflection"][clear].std()))
         alpha = float(ggx_alpha(torch.tensor(float(logit > 0 and (rough or metals > 0))), 128))
         torch.testing.assert_close(
-            result.roughness[clear], torch.full_like(result.roughness[clear], alpha**0.5)
+            result.layers["roughness"][clear], torch.full_like(result.layers["roughness"][clear], alpha**0.5)
         )
     if rough or metals:
         assert spread[1] < 0.5 * spread[0]
@@ -134,7 +134,7 @@ def test_the_point_cloud_says_what_metals_are(tmp_path: Path) -> None:
     state, shading = random_state("polarguide-stokes", 40)
     metal = torch.arange(40) < 15
     state.gaussians.overwrite("metalness", metal.float())
-    write_run_ply(tmp_path / "run.ply", state, shading, own_fields=True)
+    write_run_ply(tmp_path / "run.ply", state, shading, own_fields=ply_fields(shading, state.gaussians))
     read = read_ply(tmp_path / "run.ply")["extra"]
     assert torch.equal(read["metalness"] > 0, metal)
     expected = reflectance(state.gaussians["reflectance_logits"]).detach()
@@ -234,10 +234,9 @@ def test_held_layers_send_normals_nothing() -> None:
     values = gaussians()
     values["quaternions"].requires_grad_()
     result = rendered(SHADING, values, layers_detached=True)
-    assert result.detached_layers is not None
-    specular, diffuse, metal = result.detached_layers
+    specular, diffuse = (result.training[f"detached_{name}"] for name in ("specular", "diffuse"))
     assert torch.equal(specular, result.specular)
-    (specular.sum() + diffuse.sum() + metal.specular.sum()).backward()
+    (specular.sum() + diffuse.sum() + result.metal.specular.sum()).backward()
     rotated = values["quaternions"].grad
     values["quaternions"].grad = None
     rendered(SHADING, values).final.sum().backward()
@@ -245,13 +244,17 @@ def test_held_layers_send_normals_nothing() -> None:
 
 
 def test_whether_there_is_metal_follows_every_change() -> None:
-    metalness = torch.zeros(5)
-    assert not any_nonzero(metalness)
-    metalness[2] = 1
-    assert any_nonzero(metalness)
-    metalness.zero_()
-    assert not any_nonzero(metalness)
-    assert any_nonzero(torch.ones(5))
+    values = {"means": torch.zeros(5, 3), "metalness": torch.zeros(5)}
+    assert not any_nonzero(values, "metalness")
+    trained = Gaussians(values, {})
+    assert not any_nonzero(trained, "metalness")
+    trained.overwrite("metalness", torch.arange(5) / 4)
+    assert any_nonzero(trained, "metalness")
+    assert not any_nonzero(trained, "index_offset")
+    trained.keep(torch.tensor([0]))
+    assert not any_nonzero(trained, "metalness")
+    trained.append({"means": torch.zeros(1, 3), "metalness": torch.ones(1)})
+    assert any_nonzero(trained, "metalness")
 
 
 def test_reflectances_come_back_from_their_parameter() -> None:
@@ -294,7 +297,9 @@ def test_brighter_light_leaves_dielectrics_as_they_were() -> None:
     scale_light(values, seen["texels"], 1.3)
     after = render(values, camera(), rasterize_cpu, shading=SHADING, light=seen)
     torch.testing.assert_close(after.final, before.final, rtol=1e-3, atol=1e-4)
-    torch.testing.assert_close(after.reflection, 1.3 * before.reflection, rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(
+        after.layers["reflection"], 1.3 * before.layers["reflection"], rtol=1e-3, atol=1e-4
+    )
 
 
 def test_old_and_new_metals_are_told_apart() -> None:

@@ -20,6 +20,7 @@ from polarguide.geometry.scene_frame import scene_frame
 from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.scores import score_view
 from polarguide.results.evaluation.target import ViewTarget
+from polarguide.results.export.adapters import ply_fields
 from polarguide.results.export.mesh import surface_points
 from polarguide.results.export.share import BAKED, share_page
 from polarguide.results.rendering.relight import needs_radiance
@@ -100,9 +101,7 @@ def test_a_run_records_its_values_and_no_place_of_code(toy: Recipe) -> None:
 
 def test_it_renders_and_is_evaluated(trained: TrainingLoop) -> None:
     result, view = picture(trained, depth=True), trained.context.scene.train_views[0]
-    assert {name for name in LAYERS if getattr(result, name) is not None} == set(
-        trained.current.shading.layers
-    )
+    assert {name for name in LAYERS if name in result.layers} == set(trained.current.shading.layers)
     assert trained.current.shading.refractive_index == SETTINGS.refractive_index
     target = ViewTarget.of(view.photograph(), view.invalid, view.ground_truth, torch.device("cpu"))
     before = gaussian_training(trained.context)[0]
@@ -111,7 +110,9 @@ def test_it_renders_and_is_evaluated(trained: TrainingLoop) -> None:
 
 
 def test_it_is_exported(trained: TrainingLoop, tmp_path: Path) -> None:
-    write_run_ply(tmp_path / "run.ply", trained.state, trained.current.shading, own_fields=True)
+    shading = trained.current.shading
+    own_fields = ply_fields(shading, trained.state.gaussians)
+    write_run_ply(tmp_path / "run.ply", trained.state, shading, own_fields=own_fields)
     read = read_ply(tmp_path / "run.ply")
     assert set(read["extra"]) == {"linear_dc", "linear_rest"}
     # Display colors, reflections included: brighter than the base color alone.

@@ -97,11 +97,13 @@ def test_pictures_are_the_same_to_the_bit() -> None:
     of = gaussians(torch.float32)
     result = rendered(of, rasterize_cpu)
     turned = turned_behind(result, 3.0, 5.0)
-    assert torch.equal(result.rotation_only_normal, result.normal)
+    assert torch.equal(result.training["rotation_only_normal"], result.normal)
     assert torch.equal(turned.normal, result.normal)
     assert torch.equal(turned.depth, result.depth)
-    assert rendered(of, rasterize_cpu).rotation_only_normal is not None
-    assert render(of, CAMERA, rasterize_cpu, RenderRequest(sh_degree=0)).rotation_only_normal is None
+    assert "rotation_only_normal" in rendered(of, rasterize_cpu).training
+    assert (
+        "rotation_only_normal" not in render(of, CAMERA, rasterize_cpu, RenderRequest(sh_degree=0)).training
+    )
 
 
 def test_shares_by_depth() -> None:

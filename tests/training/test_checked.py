@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -237,14 +238,15 @@ def test_a_parameter_without_a_rate_is_refused() -> None:
 
 @dataclasses.dataclass(frozen=True)
 class _Undeclared(SkyShading):
-    def initial_parameters(self, colors: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        return super().initial_parameters(colors, generator) | {"tint": torch.ones(len(colors))}
+    def initialize(self, colors: torch.Tensor, far: torch.Tensor, generator: torch.Generator) -> Any:
+        first, light = super().initialize(colors, far, generator)
+        return first | {"tint": torch.ones(len(colors))}, light
 
 
 @dataclasses.dataclass(frozen=True)
 class _Dark(SkyShading):
-    def initial_light(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        return {}
+    def initialize(self, colors: torch.Tensor, far: torch.Tensor, generator: torch.Generator) -> Any:
+        return super().initialize(colors, far, generator)[0], {}
 
 
 @pytest.mark.parametrize(

@@ -97,15 +97,9 @@ def step(
     return Step(result, StepTargets(CAMERA, shown, valid, priors=priors), GLASS, SCALES, 2.0, ssim_weight)
 
 
-def result(**layers: Tensor | None) -> RenderResult:
-    empty = dict.fromkeys(("specular", "diffuse", "reflection", "strength", "normal", "depth"))
-    values = {
-        "final": picture(5),
-        "base": picture(5),
-        "alpha": torch.ones(SIZE),
-        "radii": torch.ones(3),
-    }
-    return RenderResult(**{**empty, **values, **layers})  # type: ignore[arg-type]
+def result(**layers: Tensor) -> RenderResult:
+    values = {"final": picture(5), "base": picture(5), "alpha": torch.ones(SIZE), **layers}
+    return RenderResult(values, training={"radii": torch.ones(3)})
 
 
 @pytest.mark.parametrize("length", [0.5, 1.0, 3.0])
@@ -227,7 +221,7 @@ def test_the_step_loss_is_the_weighted_sum_of_its_terms(priors: ViewPriors) -> N
         + 0.3 * normal_loss(rendered.normal, priors)
         + 0.4 * azimuth_loss(rendered.normal, priors)
         + 0.6 * chromatic_loss(rendered.normal, priors)
-        + 0.9 * flatness_loss(SCALES, rendered.radii, 2.0)
+        + 0.9 * flatness_loss(SCALES, rendered.training["radii"], 2.0)
         + 1.1 * stokes_loss(rendered, priors, GLASS)
     )
     assert float(total) == pytest.approx(float(expected), rel=1e-5)
@@ -331,11 +325,9 @@ def depth_of_plane(normal: Tensor, distance: float = 5.0) -> Tensor:
 
 
 def surface(normal: Tensor, depth: Tensor, alpha: Tensor) -> RenderResult:
-    empty = dict.fromkeys(("specular", "diffuse", "reflection", "strength"))
     picture = torch.zeros(20, 24, 3)
-    return RenderResult(
-        final=picture, base=picture, alpha=alpha, radii=torch.ones(1), normal=normal, depth=depth, **empty
-    )
+    layers = {"final": picture, "base": picture, "alpha": alpha, "normal": normal, "depth": depth}
+    return RenderResult(layers, training={"radii": torch.ones(1)})
 
 
 @pytest.mark.parametrize("plane", PLANES)

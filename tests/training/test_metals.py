@@ -17,13 +17,13 @@ from trainings import CPU, context_of, different, make_trainer, run
 from polarguide import optics
 from polarguide.capture import Scene, View
 from polarguide.core.progress import Reporter
+from polarguide.gaussians.gaussians import any_nonzero
 from polarguide.optics.fresnel import reflectances_from_cosine
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.model import GaussianModel
 from polarguide.runs.reports import METALS_PICTURE, report_metals
-from polarguide.shading.metal import any_nonzero
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.metals.cut import INFINITE, Graph, decide, minimum_cut, surfaces, unary
@@ -234,7 +234,7 @@ def test_training_makes_metals_of_what_the_user_says(tiny_scene: Scene, tmp_path
     whole = trainer_of(scene, settings, heard)
     for until in (32, 45):
         run(whole, until)
-        assert any_nonzero(whole.state.gaussians["metalness"])
+        assert any_nonzero(whole.state.gaussians, "metalness")
         (tmp_path / str(until)).mkdir()
         save_checkpoint(tmp_path / str(until), whole.state)
     assert not heard
@@ -249,7 +249,7 @@ def test_training_makes_metals_of_what_the_user_says(tiny_scene: Scene, tmp_path
 def test_dielectric_turns_the_search_off(tiny_scene: Scene) -> None:
     trainer = trainer_of(with_materials(tiny_scene, 2), TrainSettings(60, 3, materials="dielectric"), [])
     trainer.run()
-    assert not any_nonzero(trainer.state.gaussians["metalness"])
+    assert not any_nonzero(trainer.state.gaussians, "metalness")
 
 
 @pytest.mark.parametrize("minimum", [1, 1000])

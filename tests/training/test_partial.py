@@ -47,16 +47,9 @@ def rendered(seed: int = 0) -> RenderResult:
     for leaf in (specular, diffuse, normal):
         leaf.requires_grad_()
     alpha = torch.ones(SIZE)
+    lobes = {"specular": specular, "diffuse": diffuse}
     return RenderResult(
-        final=specular + diffuse,
-        specular=specular,
-        diffuse=diffuse,
-        base=diffuse,
-        reflection=None,
-        strength=None,
-        normal=normal,
-        depth=None,
-        alpha=alpha,
+        {"final": specular + diffuse, **lobes, "base": diffuse, "normal": normal, "alpha": alpha}
     )
 
 
@@ -123,7 +116,7 @@ def test_too_bright_a_rendering_is_not_explained_by_polarization(exposures: tupl
     """S0 takes no part beside the photometric term: light that an analyzer blocks would run away."""
     result = rendered()
     view = measured(result, exposures)
-    brighter = replace(result, final=result.final + 0.2)
+    brighter = result.with_layers(final=result.final + 0.2)
     alone = replace(WEIGHTS, photometric=0.0)
     total, _ = terms(brighter, view, alone)
     assert float(total.detach()) == pytest.approx(float(terms(result, view, alone)[0].detach()), abs=1e-7)

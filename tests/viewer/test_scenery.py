@@ -46,7 +46,7 @@ def test_every_layer_of_a_recipe_is_drawn_as_it_is_rendered(recipe):
     result = seen.render(CAMERA, depth=True, surface=True)
     for layer in LAYERS:
         picture = paint(seen, Appearance(layer=layer))
-        if getattr(result, layer) is None:
+        if layer not in result.layers:
             assert picture is None
         else:
             assert picture.shape == (CAMERA.height, CAMERA.width, 3)

@@ -91,7 +91,7 @@ class Opened:
         result = self.seen.render(camera, depth=True, surface=True)
         if layer == "normal":
             return figures.normal_to_rgb(result.normal, camera)
-        return figures.radiance_to_rgb(getattr(result, layer))
+        return figures.radiance_to_rgb(result.layers[layer])
 
 
 def psnr(picture: np.ndarray, expected: np.ndarray) -> float:

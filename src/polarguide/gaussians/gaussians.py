@@ -7,7 +7,7 @@ out of step.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -26,6 +26,14 @@ CORE_SHAPES = {
 }
 # The direction from which training views see a Gaussian; not trained, and only where a recipe is oriented.
 ORIENTED_SHAPES = {"outward": (3,)}
+
+
+class Parameters(Protocol):
+    """Per-Gaussian tensors by name: those in training, or a frozen copy of them."""
+
+    def __getitem__(self, name: str, /) -> Tensor: ...
+    def get(self, name: str, /) -> Tensor | None:
+        """The tensor, or None if there is none of that name."""
 
 
 Own = TypeVar("Own", bound="Trained")
@@ -114,6 +122,7 @@ class Gaussians(Trained):
 
     def __init__(self, tensors: Mapping[str, Tensor], rates: Mapping[str, float]) -> None:
         super().__init__(tensors, rates)
+        self._nonzero: dict[str, bool] = {}
         self._check()
 
     def _check(self) -> None:
@@ -136,6 +145,15 @@ class Gaussians(Trained):
         """The tensor, or None if there is none of that name."""
         return self._tensors.get(name)
 
+    def any_nonzero(self, name: str) -> bool:
+        """Return whether a tensor that is not trained has a value other than 0; False without such a tensor.
+
+        The device is read once between two changes of the tensor.
+        """
+        if name not in self._nonzero:
+            self._nonzero[name] = any_nonzero(self._tensors, name)
+        return self._nonzero[name]
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all tensors."""
@@ -157,6 +175,7 @@ class Gaussians(Trained):
             values: values of all Gaussians, also where ``rows`` chooses among them.
             rows: [N] bool, those whose values are replaced and whose moments are zeroed; all, if not given.
         """
+        self._nonzero.pop(name, None)
         tensor = self._tensors[name]
         chosen = slice(None) if rows is None else rows
         tensor[chosen] = values[chosen]
@@ -179,7 +198,16 @@ class Gaussians(Trained):
 
     def _replace(self, tensors: Mapping[str, Tensor], follow: Callable[[Tensor], Tensor]) -> None:
         """Put other values in the tensors' place; ``follow`` makes the same edit on a moment."""
+        self._nonzero.clear()
         for name, values in tensors.items():
             self._tensors[name] = values.contiguous().requires_grad_()
             self._adam.change(name, follow)
         self._check()
+
+
+def any_nonzero(gaussians: Parameters, name: str) -> bool:
+    """Return whether a tensor that is not trained has a value other than 0; False without such a tensor."""
+    if isinstance(gaussians, Gaussians):
+        return gaussians.any_nonzero(name)
+    values = gaussians.get(name)
+    return values is not None and not values.is_meta and bool(values.any())

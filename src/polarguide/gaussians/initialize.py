@@ -43,7 +43,7 @@ def neighbor_distance(points: np.ndarray) -> np.ndarray:
     return np.sqrt((distance**2).mean(axis=1)).clip(min=1e-7)
 
 
-def orbit(points: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, float]:
+def camera_reach(points: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, float]:
     """The median of the points [M, 3], and the distance from it within which nine tenths of the cameras [V, 3] are."""
     middle = np.median(points, axis=0)
     return middle, float(np.quantile(np.linalg.norm(cameras - middle, axis=1), 0.9))
@@ -54,7 +54,7 @@ def far_away(means: Tensor, points: Tensor, centers: Tensor, share: float = 1.0)
 
     Or than this share of the cameras' distance.
     """
-    middle, radius = orbit(points.double().numpy(), centers.double().numpy())
+    middle, radius = camera_reach(points.double().numpy(), centers.double().numpy())
     return (means.double() - torch.from_numpy(middle)).norm(dim=1) > share * radius
 
 
@@ -76,7 +76,7 @@ def initial_parameters(
     random = np.random.default_rng(seed)
     sfm = points.double().numpy()
     cameras = centers.double().numpy()
-    middle, radius = orbit(sfm, cameras)
+    middle, radius = camera_reach(sfm, cameras)
     directions = random.normal(size=(settings.shell, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     near, far = (radius * r for r in settings.shell_radii)

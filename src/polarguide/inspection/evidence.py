@@ -430,7 +430,7 @@ def surface_of(state: TrainingState, view: View, backend: Backend) -> Surface:
     """The surface of the trained Gaussians in one view, on the CPU, where pictures are compared with it."""
     request = RenderRequest(sh_degree=0, depth=True)
     result = render(state.gaussians, view.camera, backend.rasterize, request).to("cpu")
-    if result.normal is None or result.depth is None:
+    if not {"normal", "depth"} <= result.layers.keys():
         raise PolarguideError(
             view.name, expected="normals and depth", found="none", remedy="Report this: it is a fault here."
         )

@@ -302,7 +302,7 @@ def _look(
         depth = torch.full_like(result.alpha, near)
         fog = float((model.alpha_in_front(camera, depth) * result.alpha).mean().clamp(0, 1))
     stops = _stops(measured.mean(dim=0), predicted.mean(dim=0), counted)
-    return ViewHealth(psnr, None, _share(burned), fog, _share(bare), stops), result.radii
+    return ViewHealth(psnr, None, _share(burned), fog, _share(bare), stops), result.training.get("radii")
 
 
 def _stops(measured: Tensor, predicted: Tensor, counted: Tensor) -> tuple[float, float, float] | None:

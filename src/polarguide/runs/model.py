@@ -6,9 +6,10 @@ with a fixed layout would take further fields for the next Gaussian. Our linear 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
@@ -122,7 +123,7 @@ class GaussianModel:
     @torch.no_grad()
     def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
         """The Stokes vectors [3, H, W, 3] that a rendered picture predicts; None without both layers and a normal."""
-        if any(layer is None for layer in (result.specular, result.diffuse, result.normal)):
+        if not result.is_polarized:
             return None
         return self.shading.predicted_stokes(result, camera)
 
@@ -224,7 +225,7 @@ def write_run_ply(
     *,
     color: Tensor | None = None,
     linear: bool = False,
-    own_fields: bool = False,
+    own_fields: Mapping[str, Tensor] = MappingProxyType({}),
 ) -> None:
     """Write the trained Gaussians; see the module's text, and ``learned_normals`` for the centers of the cameras.
 
@@ -232,7 +233,7 @@ def write_run_ply(
         path: the file. state, shading: those of the run. centers: [M, 3] of the cameras.
         color: [3, 3] of a presentation; it holds for the harmonics that other programs show, never for our own fields.
         linear: whether the harmonics are of linear colors, for readers that want them.
-        own_fields: whether our linear fields follow those of the release.
+        own_fields: fields [N, ...] behind those of the release, by name.
     """
     gaussians = state.gaussians
 
@@ -246,6 +247,5 @@ def write_run_ply(
         for name in ("means", "log_scales", "quaternions", "opacity_logits")
     }
     plain["quaternions"] = torch.nn.functional.normalize(plain["quaternions"], dim=-1)
-    own = shading.fields(gaussians) if own_fields else {}
-    extra = {name: field.detach().cpu() for name, field in own.items()}
+    extra = {name: field.detach().cpu() for name, field in own_fields.items()}
     write_ply(path, **plain, sh_dc=dc, sh_rest=rest, normals=learned_normals(gaussians, centers), extra=extra)

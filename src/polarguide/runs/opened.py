@@ -27,7 +27,7 @@ from polarguide.recipes import recipe_named
 from polarguide.runs.folder import CONFIGURATION, RunConfiguration, load_checkpoint, writing_to
 from polarguide.runs.health import Health
 from polarguide.runs.model import GaussianModel, Within
-from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
+from polarguide.shading.result import LAYERS, POLARIZED, RenderResult, polarized_layers
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 
@@ -323,7 +323,8 @@ class OpenedRun:
         """
         chosen = self.scene.view(camera).camera if isinstance(camera, str) else camera
         result = self.model.render(chosen, normals=normals, depth=depth, surface=surface, within=within)
-        return replace(result, predicted=self.model.stokes(result, chosen)) if polarized else result
+        stokes = self.model.stokes(result, chosen) if polarized else None
+        return result if stokes is None else result.with_layers(**polarized_layers(stokes))
 
     def render(self, camera: Camera | str, layers: Iterable[str] = ("final",)) -> dict[str, Tensor]:
         """Layers of a picture.
@@ -352,8 +353,8 @@ class OpenedRun:
         Raises:
             PolarguideError: this recipe has not got one of them.
         """
-        layers = {name: getattr(result, name) for name in names}
-        absent = [name for name, values in layers.items() if values is None]
+        names = list(names)
+        absent = [name for name in names if name not in result.layers]
         if absent:
             raise PolarguideError(
                 "layers",
@@ -361,7 +362,7 @@ class OpenedRun:
                 found=f"{', '.join(absent)}, which it has not",
                 remedy="Leave out the layers that it does not have.",
             )
-        return layers
+        return {name: result.layers[name] for name in names}
 
 
 def checked_layers(names: list[str]) -> list[str]:

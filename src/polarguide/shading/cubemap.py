@@ -132,7 +132,7 @@ def ringed_texels(texture: Tensor) -> Tensor:
     return texels[ring.source].index_put((ring.corners,), texels[ring.around].mean(dim=1))
 
 
-def bilinear(
+def ringed_lookup(
     ringed: Tensor,
     place: tuple[Tensor, Tensor, Tensor],
     resolution: int | Tensor,
@@ -169,7 +169,7 @@ def bilinear(
 
 def cubemap_lookup_reference(texture: Tensor, directions: Tensor) -> Tensor:
     """The reference implementation of ``cubemap_lookup``: plain torch, any dtype and device."""
-    return bilinear(ringed_texels(texture), face_coordinates(directions), texture.shape[1])
+    return ringed_lookup(ringed_texels(texture), face_coordinates(directions), texture.shape[1])
 
 
 class _Lookup(torch.autograd.Function):
@@ -353,5 +353,5 @@ def mip_lookup_reference(levels: Sequence[Tensor], directions: Tensor, level: Te
     ringed = torch.cat([ringed_texels(texture) for texture in levels])
     place = face_coordinates(directions)
     upper = (lower + 1).clamp(max=last)
-    below, above = (bilinear(ringed, place, resolutions[k], begins[k]) for k in (lower, upper))
+    below, above = (ringed_lookup(ringed, place, resolutions[k], begins[k]) for k in (lower, upper))
     return torch.lerp(below, above, (level - lower)[:, None].expand_as(below))

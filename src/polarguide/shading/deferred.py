@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -12,44 +11,36 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.core.native import fits
-from polarguide.gaussians.gaussians import Gaussians
-from polarguide.gaussians.geometry import mirrored_directions
+from polarguide.gaussians.gaussians import any_nonzero
 from polarguide.geometry.camera import Camera
 from polarguide.optics import reflectances_from_cosine
 from polarguide.shading.cubemap import cubemap_lookup, mip_lookup
 from polarguide.shading.metal import (
     FIRST_REFLECTANCE,
-    any_nonzero,
-    convert,
     metal_channels,
     metal_pixels,
     metalness_picture,
-    mirror_base,
     reflectance,
     reflectance_logits,
-    scale_light,
     with_metal,
 )
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,
     ChannelParameters,
-    Channels,
     GBuffer,
     Light,
-    PageShading,
     Parameter,
     Parameters,
     RadianceCubemap,
     ShadingModel,
-    base_colors,
     harmonic_colors,
-    harmonic_values,
     local_light,
     mirrored,
 )
 from polarguide.shading.native import reflect_arguments, reflect_reference, shade_native
-from polarguide.shading.result import LAYERS, DetachedLayers
-from polarguide.shading.roughness import LEVELS, blended_roughness, ggx_alpha, gltf_roughness, light_levels
+from polarguide.shading.result import LAYERS
+from polarguide.shading.roughness import LEVELS, blended_blur, gltf_roughness, light_levels
+from polarguide.shading.surface import SurfaceProperty
 
 Blend = Literal["lerp", "fresnel"]
 RESET_STRENGTH = 1e-3
@@ -58,7 +49,18 @@ LOCAL_NOTE = (
     "Turning the environment turns what is reflected from afar. What stands near is reflected by the Gaussians "
     "themselves, which stay as they are."
 )
-INDEX_NOTE = "Surfaces of several refractive indices are drawn with one that reflects as much at 45 degrees."
+METALNESS = SurfaceProperty("metalness", "metalness")
+REFLECTANCE = SurfaceProperty(
+    "reflectance",
+    "reflectance_logits",
+    channels=3,
+    activation=reflectance,
+    inverse=reflectance_logits,
+    initial=FIRST_REFLECTANCE,
+    slot="metal",
+)
+INDEX = SurfaceProperty("index", "index_offset")
+"""Offset of a Gaussian's refractive index from the run's."""
 
 
 @dataclass(frozen=True)
@@ -105,21 +107,37 @@ class DeferredShading(ShadingModel):
     stream: ClassVar[int] = 1
 
     @property
-    def parameters(self) -> Mapping[str, Parameter]:
-        """``strength_logits``; with ``local`` harmonics of the mirrored direction; with ``metal`` its two; with
-        ``rough`` or ``metal`` ``roughness_logits``; with ``indices`` what is added to the refractive index.
+    def surface(self) -> tuple[SurfaceProperty, ...]:
+        """Strength; with ``metal`` metalness and reflectance; with either kind of blur the blur; with ``indices`` the
+        offset of the refractive index.
         """
         minimum = float(torch.logit(torch.tensor(RESET_STRENGTH, dtype=torch.float64)))
-        own = {"strength_logits": Parameter((), self.strength_rate, minimum)}
+        logistic = SurfaceProperty("strength", "strength_logits", 1, torch.sigmoid, torch.logit, slot="share")
+        rows = [
+            replace(logistic, initial=self.first_strength, rate=self.strength_rate, reset_minimum=minimum)
+        ]
+        if self.metal:
+            rows += [METALNESS, replace(REFLECTANCE, rate=self.metal_rate)]
+        if self.blurs:
+            blur = replace(logistic, name="blur", parameter="roughness_logits", slot="blur")
+            rows.append(replace(blur, initial=self.first_roughness, rate=self.roughness_rate))
+        if self.indices:
+            rows.append(INDEX)
+        return (*rows, *self.added_surface)
+
+    @property
+    def blurs(self) -> bool:
+        """Whether surfaces can be other than mirrors."""
+        return self.rough or self.metal
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]:
+        """Those of the surface properties; with ``local`` harmonics of the mirrored direction."""
+        own = {**super().parameters}
         if self.local:
             own["local_dc"] = Parameter((3,), self.local_rate)
             own["local_rest"] = Parameter((15, 3), self.local_rate / 20)
-        if self.metal:
-            own["metalness"] = Parameter((), 0.0)
-            own["reflectance_logits"] = Parameter((3,), self.metal_rate)
-        if self.rough or self.metal:
-            own["roughness_logits"] = Parameter((), self.roughness_rate)
-        return own | ({"index_offset": Parameter((), 0.0)} if self.indices else {})
+        return own
 
     @property
     def light_parameters(self) -> Mapping[str, Parameter]:
@@ -127,32 +145,18 @@ class DeferredShading(ShadingModel):
         side = self.environment_resolution
         return {"texels": Parameter((6, side, side, 3), self.environment_rate)}
 
-    def initial_parameters(self, colors: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        """The same strength everywhere, no light of the Gaussians' own, and no metal."""
-        zeros = {
-            name: torch.zeros(len(colors), *parameter.shape) for name, parameter in self.parameters.items()
-        }
-        logit = torch.logit(torch.tensor(self.first_strength))
-        first = {**zeros, "strength_logits": logit.expand(len(colors)).clone()}
-        if self.metal:
-            first["reflectance_logits"] = reflectance_logits(torch.full((len(colors), 3), FIRST_REFLECTANCE))
-        if "roughness_logits" in first:
-            first["roughness_logits"] = torch.logit(torch.full((len(colors),), self.first_roughness))
-        return first
-
-    def initial_light(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Uniform texels."""
+    def initialize(
+        self, colors: Tensor, far: Tensor, generator: torch.Generator
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """The surface everywhere the same, no light of the Gaussians' own, and uniform texels."""
+        first, _ = super().initialize(colors, far, generator)
         uniform = torch.rand(self.light_parameters["texels"].shape, generator=generator) * 2 - 1
-        return {"texels": uniform * self.environment_spread}
-
-    def strength(self, gaussians: Parameters) -> Tensor:
-        """Reflection strength [N] in [0, 1]."""
-        return torch.sigmoid(gaussians["strength_logits"])
+        return first, {"texels": uniform * self.environment_spread}
 
     @property
     def layers(self) -> tuple[str, ...]:
         """All, ``metalness`` if there can be metals, ``roughness`` if there is some."""
-        absent = {"metalness": not self.metal, "roughness": not (self.rough or self.metal)}
+        absent = {"metalness": not self.metal, "roughness": not self.blurs}
         return tuple(name for name in LAYERS if not absent.get(name))
 
     def radiance(self, texels: Tensor) -> Tensor:
@@ -170,7 +174,7 @@ class DeferredShading(ShadingModel):
     @property
     def radiance_cubemap(self) -> RadianceCubemap | None:
         """The texels."""
-        return RadianceCubemap("texels", self.radiance, self.raw_texels)
+        return RadianceCubemap("texels", self.radiance, self.raw_texels, LOCAL_NOTE if self.local else "")
 
     def far_light(self, texels: Tensor, directions: Tensor, level: Tensor | None) -> Tensor:
         """Radiance [P, 3] from far away along directions [P, 3], read at mip levels [P]; None: not blurred."""
@@ -185,11 +189,6 @@ class DeferredShading(ShadingModel):
         if self.blend == "lerp":
             return [texels]
         return light_levels(self.radiance(texels)) if rough else [self.radiance(texels)]
-
-    @property
-    def local_note(self) -> str:
-        """With ``local``, that the Gaussians' own light stays."""
-        return LOCAL_NOTE if self.local else ""
 
     def contributions(
         self,
@@ -211,86 +210,43 @@ class DeferredShading(ShadingModel):
         s, p = reflectances_from_cosine(cosine, self.refractive_index if index is None else index)
         return strength * (0.5 * (s + p)) * light, base
 
-    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
-        """``color`` [N, 3] (the base color), ``strength`` [N, 1], with ``local`` the Gaussians' own light ``local``
-        [N, 3], ``roughness`` [N, 1] where there is some; where some are metals ``metal`` [N, 4], and where some have
-        refractive indices of their own ``index`` [N, 1], these less the run's.
+    def channel_parameters(self, gaussians: Parameters) -> ChannelParameters | None:
+        """``color`` and ``strength``, with ``local`` the Gaussians' own light ``local``; behind them ``blur`` where
+        there is some, where Gaussians are metals ``metal`` [N, 4], where they have refractive indices of their own
+        ``index`` [N, 1], the offset from the run's, and the added surface properties.
         """
-        strength = self.strength(gaussians)[:, None]
-        channels = {"color": base_colors(gaussians, center, degree), "strength": strength}
-        if self._has_metal(gaussians):
-            body = 1 - gaussians["metalness"].detach()[:, None]
-            channels = {name: values * body for name, values in channels.items()}
-        if self.local:
-            directions = mirrored_directions(gaussians["means"], center, normals)
-            channels["local"] = local_light(gaussians, directions, degree)
-        return channels | self._further(gaussians)
-
-    def _further(self, gaussians: Parameters) -> dict[str, Tensor]:
-        """The channels of roughness, metals and refractive indices, where there are some."""
         further = {}
-        if (roughness := self._roughness(gaussians)) is not None:
-            further["roughness"] = roughness[:, None]
-        if self._has_metal(gaussians):
+        if (blur := self.blur(gaussians)) is not None:
+            further["blur"] = blur[:, None]
+        has_metal = self.has_metal(gaussians)
+        if has_metal:
             metals = gaussians["metalness"].detach(), reflectance(gaussians["reflectance_logits"])
             further["metal"] = metal_channels(*metals)
-        if self._has_indices(gaussians):
+        if self.has_indices(gaussians):
             further["index"] = gaussians["index_offset"].detach()[:, None]
-        return further
-
-    def channel_parameters(self, gaussians: Parameters) -> ChannelParameters | None:
-        """The parameters that ``channels`` reads; None for a class with other channels."""
-        if type(self).channels is not DeferredShading.channels:
-            return None
+        for row in self.added_surface:
+            further[row.name] = row.values(gaussians).reshape(-1, row.channels)
         return ChannelParameters(
             gaussians["strength_logits"],
             gaussians["local_dc"] if self.local else None,
             gaussians["local_rest"] if self.local else None,
-            gaussians["metalness"].detach() if self._has_metal(gaussians) else None,
-            self._further(gaussians),
+            gaussians["metalness"].detach() if has_metal else None,
+            further,
         )
 
-    @property
-    def knows_indices(self) -> bool:
-        """With ``indices``."""
-        return self.indices
-
-    def _has_indices(self, gaussians: Parameters) -> bool:
+    def has_indices(self, gaussians: Parameters) -> bool:
         """Whether any Gaussian has a refractive index other than the run's."""
-        return self.indices and any_nonzero(gaussians["index_offset"])
+        return self.indices and any_nonzero(gaussians, "index_offset")
 
-    @property
-    def knows_metals(self) -> bool:
-        """With ``metal``."""
-        return self.metal
-
-    def become_metal(
-        self,
-        gaussians: Gaussians,
-        light: Light,
-        metalness: Tensor,
-        reflectance: Tensor,
-        gain: Callable[[], float],
-    ) -> None:
-        """See ``ShadingModel`` and ``shading.metal``."""
-        first = not any_nonzero(gaussians["metalness"])
-        fresh = convert(gaussians, metalness, reflectance)
-        if not any_nonzero(gaussians["metalness"]):
-            return
-        if first:
-            scale_light(gaussians, light["texels"], gain())
-        if self.local:
-            mirror_base(gaussians, light["texels"], fresh, self.radiance)
-
-    def _has_metal(self, gaussians: Parameters) -> bool:
+    def has_metal(self, gaussians: Parameters) -> bool:
         """Whether one of the Gaussians is a metal; without, everything is as if there could be none."""
-        return self.metal and any_nonzero(gaussians["metalness"])
+        return self.metal and any_nonzero(gaussians, "metalness")
 
-    def _roughness(self, gaussians: Parameters) -> Tensor | None:
-        """Roughness [N] of each Gaussian; None: all are mirrors."""
+    def blur(self, gaussians: Parameters) -> Tensor | None:
+        """Return the share [N] of the mip levels by which each Gaussian blurs; None: all are mirrors."""
         if self.rough:
             return torch.sigmoid(gaussians["roughness_logits"])
-        if self._has_metal(gaussians):
+        if self.has_metal(gaussians):
             return gaussians["metalness"].detach() * torch.sigmoid(gaussians["roughness_logits"])
         return None
 
@@ -298,40 +254,48 @@ class DeferredShading(ShadingModel):
         """``final``, ``specular``, ``diffuse`` and ``reflection`` [H, W, 3], ``strength`` and ``roughness`` [H, W].
 
         With ``metal`` also ``metalness`` [H, W] and, where there is some, ``metal``. Where there are several refractive
-        indices, ``index`` [H, W].
+        indices, ``index`` [H, W]. Added surface properties by their names, [H, W] or [H, W, C], blended over alpha.
         """
         texels = light["texels"]
-        if splatted.metal is None and fits(splatted.features, texels):
-            return self._shade_native(splatted, texels, camera, detached=False)
         strength = splatted["strength"][..., 0]
-        local = splatted["local"] if self.local else None
-        index = self._index_picture(splatted)
-        rough = blended_roughness(splatted)
-        level = None if rough is None else LEVELS * rough
-        layers: dict[str, Any] = reflect_reference(
-            splatted["color"], splatted["normal"], strength, texels, camera, self, local, index, level
-        )
-        layers |= {"strength": strength, "index": index, **self._shown_roughness(splatted)}
-        return self._with_metals(layers, splatted, camera)
-
-    def shade_detached(
-        self, splatted: GBuffer, light: Light, camera: Camera
-    ) -> tuple[dict[str, Any], DetachedLayers | None]:
-        """As ``ShadingModel`` has it; on the CPU in float32 one native pass."""
-        texels = light["texels"]
-        if not fits(splatted.features, texels):
-            return super().shade_detached(splatted, light, camera)
-        layers = self._shade_native(splatted, texels, camera, detached=True)
-        again = layers.pop("detached specular"), layers.pop("detached diffuse")
-        return layers, (*again, layers.get("metal"))
+        index = None
+        if "index" in splatted.layout:
+            index = self.refractive_index + splatted["index"][..., 0].detach()
+        blur = blended_blur(splatted)
+        layers: dict[str, Any]
+        if splatted.metal is None and fits(splatted.features, texels):
+            textures = self.light_levels(texels, rough=blur is not None)
+            arguments = reflect_arguments(
+                splatted, self.blend == "fresnel", self.local, self.refractive_index
+            )
+            layers = shade_native(splatted, textures, camera, arguments)
+        else:
+            local = splatted["local"] if self.local else None
+            level = None if blur is None else LEVELS * blur
+            layers = {
+                **reflect_reference(
+                    splatted["color"], splatted["normal"], strength, texels, camera, self, local, index, level
+                )
+            }
+            layers = self._with_metals(layers, splatted, camera)
+        layers["strength"] = strength
+        if index is not None:
+            layers["index"] = index
+        if self.blurs:
+            shown = torch.zeros_like(splatted.alpha) if blur is None else blur
+            layers["roughness"] = gltf_roughness(shown, self.environment_resolution)
+        if self.metal:
+            layers["metalness"] = metalness_picture(layers["metal"], splatted.features)
+        for row in self.added_surface:
+            blended = splatted[row.name] / splatted.alpha.detach().clamp(min=1e-6)[..., None]
+            layers[row.name] = blended[..., 0] if row.channels == 1 else blended
+        return layers
 
     def _with_metals(self, layers: dict[str, Any], splatted: GBuffer, camera: Camera) -> dict[str, Any]:
-        """The layers of dielectrics with what metals add to them; as they are where the model knows no metals."""
-        if not self.metal:
-            return layers
-        features = splatted.features
+        """The layers of dielectrics with the contribution of metals: the reference of ``shade_native``."""
         metal = splatted.metal
         if metal is None and "metal" in splatted.layout:
+            features = splatted.features
             rays = camera.world_rays(dtype=features.dtype, device=features.device)
             metal = metal_pixels(
                 features.flatten(0, 1),
@@ -340,52 +304,22 @@ class DeferredShading(ShadingModel):
                 splatted["normal"].flatten(0, 1),
                 layers["reflection"].flatten(0, 1),
             )
-        mixed = layers if metal is None else with_metal(layers, metal)
-        return {**mixed, "metalness": metalness_picture(metal, features), "metal": metal}
-
-    def _shown_roughness(self, splatted: GBuffer) -> dict[str, Tensor]:
-        """The layer ``roughness``, where surfaces can have one."""
-        if not (self.rough or self.metal):
-            return {}
-        blended = blended_roughness(splatted)
-        roughness = torch.zeros_like(splatted.alpha) if blended is None else blended
-        return {"roughness": gltf_roughness(roughness, self.environment_resolution)}
-
-    def _index_picture(self, splatted: GBuffer) -> Tensor | None:
-        """Refractive indices [H, W]; None: the run's everywhere."""
-        if "index" not in splatted.layout:
-            return None
-        return self.refractive_index + splatted["index"][..., 0].detach()
-
-    def _shade_native(
-        self, splatted: GBuffer, texels: Tensor, camera: Camera, *, detached: bool
-    ) -> dict[str, Any]:
-        textures = self.light_levels(texels, rough="roughness" in splatted.layout)
-        fresnel = self.blend == "fresnel"
-        arguments = reflect_arguments(splatted, fresnel, self.local, self.refractive_index, detached)
-        layers: dict[str, Any] = shade_native(splatted, textures, camera, arguments)
-        layers |= {"strength": splatted["strength"][..., 0], "index": self._index_picture(splatted)}
-        layers |= self._shown_roughness(splatted)
-        if self.metal:
-            layers["metalness"] = metalness_picture(layers["metal"], splatted.features)
-        else:
-            del layers["metal"]
-        return layers
+        return {**(layers if metal is None else with_metal(layers, metal)), "metal": metal}
 
     def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
         """Colors [N, 3] of Gaussians by themselves; see ``ShadingModel``."""
         directions = mirrored(rays, normals).contiguous()
-        rough = self._roughness(gaussians)
-        reflected = self.far_light(light["texels"], directions, None if rough is None else LEVELS * rough)
+        blur = self.blur(gaussians)
+        reflected = self.far_light(light["texels"], directions, None if blur is None else LEVELS * blur)
         if self.local:
             reflected = (reflected + local_light(gaussians, directions, 3)).clamp(min=0)
         cosine = -(rays * normals).sum(dim=-1, keepdim=True).clamp(-1, 0)
         base = harmonic_colors(gaussians, rays)
         strength = self.strength(gaussians)[:, None]
-        several = self._has_indices(gaussians)
+        several = self.has_indices(gaussians)
         index = self.refractive_index + gaussians["index_offset"][:, None] if several else None
         specular, diffuse = self.contributions(base, strength, reflected, cosine, index)
-        if not self._has_metal(gaussians):
+        if not self.has_metal(gaussians):
             return specular + diffuse
         mean, _ = optics.conductor(cosine, reflectance(gaussians["reflectance_logits"]))
         return torch.lerp(specular + diffuse, mean * reflected, gaussians["metalness"][:, None])
@@ -393,56 +327,4 @@ class DeferredShading(ShadingModel):
     def diffuse_colors(self, gaussians: Parameters, rays: Tensor) -> Tensor:
         """Linear colors [N, 3] without reflections: none of metals."""
         colors = super().diffuse_colors(gaussians, rays)
-        return colors * (1 - gaussians["metalness"][:, None]) if self._has_metal(gaussians) else colors
-
-    def fields(self, gaussians: Parameters) -> dict[str, Tensor]:
-        """Linear harmonics of the base color, ``strength`` [N], ``roughness`` [N] as in glTF (the square root of GGX's
-        alpha), of metals ``metalness`` [N] and ``reflectance`` [N, 3], and ``refractive_index`` [N].
-        """
-        own = {**super().fields(gaussians), "strength": self.strength(gaussians)}
-        if self.metal:
-            own["metalness"] = gaussians["metalness"]
-            own["reflectance"] = reflectance(gaussians["reflectance_logits"])
-        if self.rough or self.metal:
-            rough = self._roughness(gaussians)
-            rough = torch.zeros_like(own["strength"]) if rough is None else rough
-            own["roughness"] = gltf_roughness(rough, self.environment_resolution)
-        if self._has_indices(gaussians):
-            own["refractive_index"] = self.refractive_index + gaussians["index_offset"]
-        return own
-
-    def page(self, gaussians: Parameters, light: Light) -> PageShading | None:
-        """Harmonics, strength and texels; where there is metal, also what that needs."""
-        values = {**harmonic_values(gaussians), "share": self.strength(gaussians)}
-        notes = [self.local_note] if self.local else []
-        drawn = self.refractive_index
-        if self._has_indices(gaussians):
-            own = self.refractive_index + gaussians["index_offset"].detach()
-            drawn = float(own.max())  # so that strengths become less, never more than 1
-            values["share"] = values["share"] * self._at_45_degrees(own) / self._at_45_degrees(drawn)
-            notes.append(INDEX_NOTE)
-        if self.local:
-            values |= {"own_color": gaussians["local_dc"], "own_harmonics": gaussians["local_rest"]}
-        constants: dict[str, Any] = {"blend": self.blend, "index": drawn}
-        if not self.local and (self.rough or self._has_metal(gaussians)):
-            return None  # no recipe has such surfaces, and the page no shaders for them
-        if (rough := self._roughness(gaussians)) is not None:
-            values["roughness"] = rough
-            constants["mirror"] = float(ggx_alpha(torch.zeros(()), self.environment_resolution))
-        if self._has_metal(gaussians):
-            metalness = gaussians["metalness"].detach()[:, None]
-            values["metal"] = metalness * reflectance(gaussians["reflectance_logits"])
-            constants["metal"] = True
-        return PageShading(
-            kind="local" if self.local else "reflection",
-            values=values,
-            light=self.light_levels(light["texels"], rough=rough is not None),
-            constants=constants,
-            notes=notes,
-        )
-
-    @staticmethod
-    def _at_45_degrees(index: Tensor | float) -> Tensor:
-        """Twice the reflectance there."""
-        s, p = reflectances_from_cosine(torch.tensor(math.sqrt(0.5)), index)
-        return s + p
+        return colors * (1 - gaussians["metalness"][:, None]) if self.has_metal(gaussians) else colors

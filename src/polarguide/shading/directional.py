@@ -26,7 +26,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import relu
 
-from polarguide.gaussians.harmonics import SH_C0
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import unit
 from polarguide.shading.cubemap import box_mips, mip_lookup
@@ -35,7 +34,6 @@ from polarguide.shading.model import (
     Channels,
     GBuffer,
     Light,
-    PageShading,
     Parameter,
     Parameters,
     ShadingModel,
@@ -51,7 +49,6 @@ INPUTS = CHANNELS * (1 + FEATURES)
 ALBEDO_SCALE = 0.2
 # Pixels with less alpha than this get no specular light: there is no surface to reflect it.
 MINIMUM_ALPHA = 0.05
-SURROUNDINGS_NOTE = "The far surroundings have one color from all sides here; in the program they vary."
 _DARKEST = 1e-3  # a black point's first albedo, so that its logarithm is finite
 
 
@@ -109,24 +106,22 @@ class DirectionalShading(ShadingModel):
             table[f"mlp_bias_{layer}"] = Parameter((outputs,), self.mlp_rate)
         return table
 
-    def initial_parameters(self, colors: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        """Albedo from the colors, one roughness, random features; all with a surface."""
+    def initialize(
+        self, colors: Tensor, far: Tensor, generator: torch.Generator
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Albedo from the colors, one roughness, random features, and a surface where the position is not ``far``.
+
+        The light has uniform texels, and an MLP that is uniform within 1 / sqrt(inputs), as torch's Linear.
+        """
         count = colors.shape[0]
         albedo = (self.first_albedo * colors).clamp(min=_DARKEST)
         logit = math.log(self.first_roughness / (1 - self.first_roughness))
-        return {
+        first = {
             "log_albedo": torch.log(albedo / ALBEDO_SCALE),
             "roughness_logits": torch.full((count,), logit),
             "features": torch.randn(count, FEATURES, generator=generator),
-            "surface": torch.ones(count),
+            "surface": (~far).float(),
         }
-
-    def placed_parameters(self, far: Tensor) -> dict[str, Tensor]:
-        """Surroundings have no surface."""
-        return {"surface": (~far).float()}
-
-    def initial_light(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Uniform texels, then the MLP: uniform within 1 / sqrt(inputs), as torch's Linear."""
         table = self.light_parameters
 
         def uniform(name: str, bound: float) -> Tensor:
@@ -138,7 +133,7 @@ class DirectionalShading(ShadingModel):
             for name in (f"mlp_weight_{layer}", f"mlp_bias_{layer}"):
                 values[name] = uniform(name, bound)
         values["mlp_bias_2"] = torch.full((3,), math.log(self.first_light))
-        return values
+        return first, values
 
     def radiance(self, light: Light, directions: Tensor, roughness: Tensor, features: Tensor) -> Tensor:
         """Specular radiance [P, 3], in (0, e^5].
@@ -161,18 +156,18 @@ class DirectionalShading(ShadingModel):
         return out.clamp(max=MAXIMUM_LOG_LIGHT).exp()
 
     def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
-        """Albedo, or harmonics without a surface, as ``color`` [N, 3]; ``roughness`` [N, 1], ``feature`` [N, 4] and
+        """Albedo, or harmonics without a surface, as ``color`` [N, 3]; ``blur`` [N, 1], ``feature`` [N, 4] and
         ``surface`` [N, 1].
 
         Without a surface the latter are 0.
         """
         surface = gaussians["surface"].detach()[:, None]
         colors = torch.where(surface > 0, albedo_of(gaussians), base_colors(gaussians, center, degree))
-        roughness = torch.sigmoid(gaussians["roughness_logits"])[:, None]
+        blur = torch.sigmoid(gaussians["roughness_logits"])[:, None]
         feature = torch.tanh(gaussians["features"])
         return {
             "color": colors,
-            "roughness": surface * roughness,
+            "blur": surface * blur,
             "feature": surface * feature,
             "surface": surface,
         }
@@ -187,7 +182,7 @@ class DirectionalShading(ShadingModel):
         radiance = self.radiance(
             light,
             directions.reshape(-1, 3),
-            splatted["roughness"].flatten(),
+            splatted["blur"].flatten(),
             splatted["feature"].reshape(-1, FEATURES),
         ).reshape(albedo.shape)
         share = (splatted["surface"][..., 0] / alpha.clamp(min=MINIMUM_ALPHA)).clamp(max=1)
@@ -209,36 +204,3 @@ class DirectionalShading(ShadingModel):
         """Albedo, or harmonics without a surface [N, 3]."""
         surface = gaussians["surface"][:, None] > 0
         return torch.where(surface, albedo_of(gaussians), harmonic_colors(gaussians, rays))
-
-    def fields(self, gaussians: Parameters) -> dict[str, Tensor]:
-        """Linear harmonics, which count where ``surface`` is 0; ``albedo``, ``roughness``, ``feature``, ``surface``."""
-        return {
-            **super().fields(gaussians),
-            "albedo": albedo_of(gaussians),
-            "roughness": torch.sigmoid(gaussians["roughness_logits"]),
-            "feature": torch.tanh(gaussians["features"]),
-            "surface": gaussians["surface"],
-        }
-
-    def page(self, gaussians: Parameters, light: Light) -> PageShading | None:
-        """Albedo, roughness, features; the grid's levels and the MLP.
-
-        A record has no room for features and harmonics: the surroundings have their mean color and no features, by
-        which the page knows them.
-        """
-        fields = self.fields(gaussians)
-        surface = gaussians["surface"]
-        mean_color = (gaussians["sh_dc"] * SH_C0 + 0.5).clamp(min=0)
-        layers = range(3)
-        return PageShading(
-            kind="directional",
-            values={
-                "color": torch.where(surface[:, None] > 0, fields["albedo"], mean_color),
-                "share": surface * fields["roughness"],
-                "features": surface[:, None] * fields["feature"],
-            },
-            light=box_mips(light["texels"]),
-            network=[m for k in layers for m in (light[f"mlp_weight_{k}"], light[f"mlp_bias_{k}"][None])],
-            constants={"width": self.width},
-            notes=[] if bool((surface > 0).all()) else [SURROUNDINGS_NOTE],
-        )

@@ -7,7 +7,7 @@ On the CPU in float32 one native pass each way does what a shading model describ
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ from polarguide.raster.interface import Rasterize, ScreenStatistic, Splats
 from polarguide.raster.magnification import as_trained
 from polarguide.raster.surface import surface_picture
 from polarguide.shading.model import PLAIN, GBuffer, Light, Parameters, ShadingModel
-from polarguide.shading.native import split_native
+from polarguide.shading.native import DETACHED, split_native
 from polarguide.shading.result import NORMAL_CHANNELS, Layout, RenderResult
 
 
@@ -72,8 +72,9 @@ def splatting(
         )
     pose = camera.pose(torch.float32, core[0].device)
     forward = pose.rotation[2].contiguous() if depth else None
-    settings = _Settings(sh_degree, pose.center.contiguous(), forward, normals)
-    tensors = applied(_Splatting, settings, *core, outward, *described[:-1], _joined(described.further))
+    settings = SplattingSettings(sh_degree, pose.center.contiguous(), forward, normals)
+    further = torch.cat([*described.further.values()], dim=1) if described.further else None
+    tensors = applied(_Splatting, settings, *core, outward, *described[:-1], further)
     return Splats(*tensors), Layout(_widths(described.widths, normals=normals, depth=depth))
 
 
@@ -107,62 +108,77 @@ def _widths(own: Mapping[str, int], *, normals: bool, depth: bool) -> dict[str, 
     return {**first, **{name: width for name, width in own.items() if name != "color"}, **last}
 
 
-def _joined(further: Mapping[str, Tensor]) -> Tensor | None:
-    return torch.cat([*further.values()], dim=1) if further else None
-
-
 _CORE = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
+_INPUTS = (
+    "means",
+    "quaternions",
+    "log_scales",
+    "opacity_logits",
+    "dc",
+    "rest",
+    "outward",
+    "strength",
+    "light_dc",
+    "light_rest",
+    "metalness",
+    "further",
+)
+"""Tensors of the native pass by the names of its arguments, in the order of ``_Splatting``."""
+_UNTRAINED = ("outward", "metalness")
 
 
-class _Settings(NamedTuple):
+class SplattingSettings(NamedTuple):
+    """Arguments of the native pass that are no parameters of Gaussians.
+
+    Attributes:
+        degree: degree of the base color's harmonics. center: [3] of the camera.
+        forward: [3] direction of the camera depth; None: no depth. normals: whether to splat normals.
+    """
+
     degree: int
     center: Tensor
     forward: Tensor | None
     normals: bool
 
 
-def _native_splatting(settings: _Settings, core: Any, others: Any) -> Any:
-    """The native pass for these Gaussians, which it holds."""
-    tensors: list[Any] = [*core, *settings, GRAZING, *others]
-    return _native.Splatting(*tensors)
-
-
 class _Splatting(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, settings: _Settings, *given: Tensor | None) -> tuple[Tensor, ...]:
-        means, quaternions, *_ = given
-        assert means is not None
-        assert quaternions is not None
-        contiguous = [None if t is None else t.detach().contiguous() for t in given]
-        core = [t for t in contiguous[: len(_CORE)] if t is not None]
-        outputs = _native_splatting(settings, core, contiguous[len(_CORE) :])
-        count = len(means)
-        light = given[len(_CORE) + 2]
-        scales = means.new_empty(count, 3)
-        opacities = means.new_empty(count)
-        features = means.new_empty(count, outputs.channels)
+    def forward(ctx: Any, settings: SplattingSettings, *tensors: Tensor | None) -> tuple[Tensor, ...]:
+        inputs: dict[str, Any] = dict(zip(_INPUTS, tensors, strict=True))
+        means = inputs["means"]
+        quaternions = inputs["quaternions"]
+        inputs = {name: None if t is None else t.detach().contiguous() for name, t in inputs.items()}
+        kernel = _native.Splatting(**inputs, **settings._asdict(), grazing=GRAZING)
+        outputs = {
+            "scales": torch.empty_like(inputs["log_scales"]),
+            "opacities": torch.empty_like(inputs["opacity_logits"]),
+            "features": means.new_empty(len(means), kernel.channels),
+        }
         learns = any(ctx.needs_input_grad)
-        mirrored = means.new_empty(count, 3) if learns and light is not None else None
-        outputs.forward(scales, opacities, features, mirrored)
+        mirrored = torch.empty_like(inputs["means"]) if learns and inputs["light_dc"] is not None else None
+        kernel.forward(**outputs, mirrored=mirrored)
         if learns:
             ctx.settings = settings
-            ctx.save_for_backward(*contiguous, scales, opacities, features, mirrored)
-        return means.view_as(means), quaternions.view_as(quaternions), scales, opacities, features
+            ctx.save_for_backward(*inputs.values(), *outputs.values(), mirrored)
+        return means.view_as(means), quaternions.view_as(quaternions), *outputs.values()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        *inputs, scales, opacities, features, mirrored = ctx.saved_tensors
-        core = inputs[: len(_CORE)]
-        outward, strength, dc, rest, metalness, further = inputs[len(_CORE) :]
-        others = [outward, strength, dc, rest, metalness, further]
-        to_core = [torch.empty_like(t) for t in core]
-        to_learned = [None if t is None else torch.empty_like(t) for t in (strength, dc, rest, further)]
-        results = scales, opacities, features, mirrored
-        by_results = [g.contiguous() for g in grads]
-        _native_splatting(ctx.settings, core, others).backward(*results, *by_results, *to_core, *to_learned)
-        to_strength, to_dc, to_rest, to_further = to_learned
-        return None, *to_core, None, to_strength, to_dc, to_rest, None, to_further
+        saved = ctx.saved_tensors
+        inputs: dict[str, Any] = dict(zip(_INPUTS, saved, strict=False))
+        results = ("scales", "opacities", "features", "mirrored")
+        outputs = dict(zip(results, saved[len(_INPUTS) :], strict=True))
+        names = ("grad_means", "grad_quaternions", "grad_scales", "grad_opacities", "grad_features")
+        by = {name: grad.contiguous() for name, grad in zip(names, grads, strict=True)}
+        to: dict[str, Any] = {
+            name: None if inputs[name] is None else torch.empty_like(inputs[name])
+            for name in _INPUTS
+            if name not in _UNTRAINED
+        }
+        kernel = _native.Splatting(**inputs, **ctx.settings._asdict(), grazing=GRAZING)
+        kernel.backward(**outputs, **by, **{f"to_{name}": gradient for name, gradient in to.items()})
+        return None, *(to.get(name) for name in _INPUTS)
 
 
 NO_LIGHT: Light = MappingProxyType({})
@@ -223,13 +239,12 @@ def render(
     rotated = NORMAL_CHANNELS if request.normal_rotation_only and normals else ()
     picture = rasterize(gaussian_splats, camera, statistic=request.statistic, still=rotated)
     features, normal, camera_depth = split(picture.features, picture.alpha, layout)
-    splatted = GBuffer(features, picture.alpha, layout)
-    if request.layers_detached and normals:
-        layers, detached = shading.shade_detached(splatted, light, camera)
-    else:
-        layers = shading.shade(splatted, light, camera)
-        detached = None
-    blended = None
+    splatted = GBuffer(features, picture.alpha, layout, detached=request.layers_detached and normals)
+    layers = shaded(shading, splatted, light, camera)
+    metal = layers.pop("metal", None)
+    training = {"radii": picture.radii}
+    training |= {name: layers.pop(name) for name in DETACHED if name in layers}
+    layers |= {"base": splatted["color"], "alpha": picture.alpha}
     if request.at_median_depth and (normals or depth):
         directions = (
             gaussian_splats.features[:, layout.channels("normal")]
@@ -237,26 +252,35 @@ def render(
             else torch.zeros_like(gaussian_splats.means)
         )
         surface = surface_picture(gaussian_splats._replace(features=directions), camera)
-        camera_depth = surface.depth if depth else None
-        if normals:
-            normal, blended = picture.alpha[..., None] * surface.directions, normal
-    return RenderResult(
-        final=layers["final"],
-        base=splatted["color"],
-        **{name: layers.get(name) for name in _LAYERS},
-        normal=normal,
-        depth=camera_depth,
-        alpha=picture.alpha,
-        radii=picture.radii,
-        detached_layers=detached,
-        rotation_only_normal=picture.still,
-        metal=layers.get("metal"),
-        index=layers.get("index"),
-        blended_normal=blended,
-    )
+        camera_depth = surface.depth
+        if normal is not None:
+            layers["shaded_normal"] = normal
+            normal = picture.alpha[..., None] * surface.directions
+    if normal is not None:
+        layers["normal"] = normal
+    if depth and camera_depth is not None:
+        layers["depth"] = camera_depth
+    if picture.still is not None:
+        training["rotation_only_normal"] = picture.still
+    return RenderResult(layers, metal, training)
 
 
-_LAYERS = ("specular", "diffuse", "reflection", "strength", "roughness", "metalness")
+def shaded(
+    shading: ShadingModel, splatted: GBuffer, light: Light, camera: Camera, *, native: bool = True
+) -> dict[str, Any]:
+    """Return the layers of a shading model, and the ``DETACHED`` ones if the G-buffer requests them.
+
+    Where the model does not return these, or not ``native``, it shades a second time with detached normals. Metals keep
+    their gradient on the normals.
+    """
+    layers = {**shading.shade(replace(splatted, detached=splatted.detached and native), light, camera)}
+    if not splatted.detached or "specular" not in layers or DETACHED[0] in layers:
+        return layers
+    parts = [splatted[name].detach() if name == "normal" else splatted[name] for name in splatted.layout]
+    features = torch.cat(parts, dim=-1)
+    again = shading.shade(replace(splatted, features=features, metal=layers.get("metal")), light, camera)
+    return layers | {name: again[name.removeprefix("detached_")] for name in DETACHED}
+
 
 Split = tuple[Tensor, Tensor | None, Tensor | None]
 

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.gaussians.gaussians import Gaussians
+from polarguide.gaussians.gaussians import Gaussians, any_nonzero
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.harmonics import sh_basis
 from polarguide.geometry.camera import Camera
@@ -40,22 +40,6 @@ LEAST = 0.2
 FIRST_REFLECTANCE = 0.7
 # Pixels with less of a metal than this are shaded as dielectrics alone.
 MINIMUM_SHARE = 0.01
-
-
-def any_nonzero(values: Tensor) -> bool:
-    """Whether a value of a tensor that is not trained is other than 0; False of a tensor without values.
-
-    The device is read once for each state of the tensor, which caches the answer until its values change.
-    Tensors of ``torch.inference_mode`` do not count their changes: they are read each time.
-    """
-    if values.is_meta:
-        return False
-    version = None if values.is_inference() else values._version
-    cached = getattr(values, "_polarguide_nonzero", None)
-    if cached is None or version is None or cached[0] != version:
-        cached = version, bool((values != 0).any())
-        values._polarguide_nonzero = cached  # type: ignore[attr-defined]
-    return bool(cached[1])
 
 
 def reflectance(logits: Tensor) -> Tensor:
@@ -153,6 +137,31 @@ MOST_STRENGTH = 0.98
 # Directions in which functions are compared, and Gaussians at a time.
 DIRECTIONS = 128
 CHUNK = 4096
+
+
+def become_metal(
+    gaussians: Gaussians,
+    texels: Tensor,
+    radiance: Callable[[Tensor], Tensor],
+    metalness: Tensor,
+    reflectances: Tensor,
+    gain: Callable[[], float],
+) -> None:
+    """Change which Gaussians are metals.
+
+    Args:
+        texels: [6, R, R, 3] raw light from afar, changed in place. radiance: radiance of raw values.
+        metalness: [N], 0 to 1. reflectances: [N, 3] at normal incidence, first values of new metals.
+        gain: factor by which all light should be brighter, called when the first metals appear.
+    """
+    first = not any_nonzero(gaussians, "metalness")
+    fresh = convert(gaussians, metalness, reflectances)
+    if not any_nonzero(gaussians, "metalness"):
+        return
+    if first:
+        scale_light(gaussians, texels, gain())
+    if gaussians.get("local_dc") is not None:
+        mirror_base(gaussians, texels, fresh, radiance)
 
 
 @torch.no_grad()

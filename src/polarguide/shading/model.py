@@ -7,22 +7,25 @@ reflected, so that a new model is one new class, and nothing else changes.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from polarguide import optics
 from polarguide.core.errors import PolarguideError
-from polarguide.gaussians.gaussians import Gaussians
+from polarguide.gaussians.gaussians import Parameters as Parameters
+from polarguide.gaussians.geometry import mirrored_directions
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot
 from polarguide.shading.metal import metal_stokes
-from polarguide.shading.result import DetachedLayers, Layout, MetalPixels, RenderResult
+from polarguide.shading.result import Layout, MetalPixels, RenderResult
+from polarguide.shading.surface import Parameter as Parameter
+from polarguide.shading.surface import SurfaceProperty
 
 # Brightest light of an environment with the exponential scale: e^5, about 150 times display white.
 MAXIMUM_LOG_LIGHT = 5.0
@@ -34,28 +37,6 @@ Light = Mapping[str, Tensor]
 """The learned light of a shading model: its parameters by name."""
 
 Model = TypeVar("Model", bound="ShadingModel")
-
-
-class Parameters(Protocol):
-    """Per-Gaussian tensors by name: those in training, or a frozen copy of them."""
-
-    def __getitem__(self, name: str, /) -> Tensor: ...
-    def get(self, name: str, /) -> Tensor | None:
-        """The tensor, or None if there is none of that name."""
-
-
-class Parameter(NamedTuple):
-    """A tensor that a shading model trains.
-
-    Attributes:
-        shape: shape of one Gaussian's values; of the whole tensor for a parameter of the light.
-        rate: learning rate (Adam); with 0 it keeps its first values.
-        reset_minimum: a reset of the opacities raises values to at least this; None: it leaves them.
-    """
-
-    shape: tuple[int, ...]
-    rate: float
-    reset_minimum: float | None = None
 
 
 class ChannelParameters(NamedTuple):
@@ -90,13 +71,16 @@ class GBuffer:
         features: [H, W, D] all channels, blended: ``color``, ``normal`` (world axes, not normalized), and others.
         alpha: [H, W].
         layout: which channels are what.
-        metal: what metals add to the picture, where that is known before; None: not yet.
+        metal: contribution of metals to the picture, where it was computed before; None: not yet.
+        detached: whether ``shade`` returns ``detached_specular`` and ``detached_diffuse`` as well, without a gradient
+            on the normals. A model may ignore it; ``gbuffer.shaded`` then shades twice.
     """
 
     features: Tensor
     alpha: Tensor
     layout: Layout
     metal: MetalPixels | None = None
+    detached: bool = False
 
     def __getitem__(self, name: str) -> Tensor:
         return self.features[..., self.layout.channels(name)]
@@ -109,32 +93,13 @@ class RadianceCubemap(NamedTuple):
         name: name of the parameter, raw texels [6, R, R, 3].
         radiance: linear radiance of raw values, [..., 3].
         raw: the inverse, as far as raw values can hold the radiance.
+        note: sentences on light that does not follow when this light is turned or replaced; empty: all light does.
     """
 
     name: str
     radiance: Callable[[Tensor], Tensor]
     raw: Callable[[Tensor], Tensor]
-
-
-@dataclass(frozen=True, eq=False)
-class PageShading:
-    """Data by which an exported page shades Gaussians as the model does.
-
-    Attributes:
-        kind: the page's shaders are compiled with its name, in capitals, defined.
-        values: per Gaussian, by the names of ``results.export.share.SLOTS``, [N, ...].
-        light: cubemaps [6, R, R, C], the finest first.
-        network: matrices [rows, columns] in the order in which the shaders read them.
-        constants: further entries of the page's scene, plain JSON values.
-        notes: sentences for whoever looks at the page.
-    """
-
-    kind: str
-    values: Mapping[str, Tensor]
-    light: Sequence[Tensor] = ()
-    network: Sequence[Tensor] = ()
-    constants: Mapping[str, Any] = field(default_factory=dict)
-    notes: Sequence[str] = ()
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -156,6 +121,25 @@ class ShadingModel(ABC):
     needs_normals: ClassVar[bool] = True
     """Whether shading reads the normals, so that they are always splatted."""
 
+    smooth_dielectric: ClassVar[bool] = True
+    """Whether ``predicted_stokes`` is that of a smooth dielectric, for which there is a native kernel."""
+
+    def __init_subclass__(cls) -> None:
+        """Check that methods and kernels agree: whoever replaces a method states what its kernel is.
+
+        Raises:
+            TypeError: ``channels`` was replaced, but not the ``channel_parameters`` that stand for it.
+        """
+        super().__init_subclass__()
+        own = vars(cls)
+        if "predicted_stokes" in own and "smooth_dielectric" not in own:
+            cls.smooth_dielectric = False
+        described = cls.channel_parameters is not ShadingModel.channel_parameters
+        if "channels" in own and "channel_parameters" not in own and described:
+            raise TypeError(
+                f"{cls.__name__}: replace channel_parameters() with channels(); it returns None without kernels"
+            )
+
     def bind(self: Model, refractive_index: float) -> Model:
         """A copy of the model with its refractive index set to ``refractive_index``.
 
@@ -175,73 +159,56 @@ class ShadingModel(ABC):
     # What is learned
 
     @property
+    def added_surface(self) -> tuple[SurfaceProperty, ...]:
+        """Surface properties of a model derived from another; they need no code of their own, see ``surface``."""
+        return ()
+
+    @property
+    def surface(self) -> tuple[SurfaceProperty, ...]:
+        """Surface properties; their parameters and first values are those of the model."""
+        return self.added_surface
+
+    @property
     def parameters(self) -> Mapping[str, Parameter]:
-        """Per-Gaussian tensors besides those that every recipe trains."""
-        return {}
+        """Per-Gaussian tensors besides those that every recipe trains: those of the surface properties."""
+        return {row.parameter: row.learned for row in self.surface}
 
     @property
     def light_parameters(self) -> Mapping[str, Parameter]:
         """Parameters of the learned light; none: it has no light to learn."""
         return {}
 
-    def initial_parameters(self, colors: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        """The tensors of ``parameters`` before the first step, [N, ...].
+    def initialize(
+        self, colors: Tensor, far: Tensor, generator: torch.Generator
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Return the tensors of ``parameters`` [N, ...] and of ``light_parameters`` before the first step.
+
+        Here parameters of the surface have their first values, and others are 0.
 
         Args:
-            colors: [N, 3] linear, of the first Gaussians. generator: of random numbers; the light draws from it next.
+            colors: [N, 3] linear colors of the first Gaussians.
+            far: [N] bool, Gaussians that lie farther away than the cameras (``gaussians.initialize.far_away``).
+            generator: generator of random numbers.
         """
-        return {}
-
-    def placed_parameters(self, far: Tensor) -> dict[str, Tensor]:
-        """Initial parameters that depend on the positions of the first Gaussians; they replace ``initial_parameters``.
-
-        Args:
-            far: [N] bool, which of them lie farther away than the cameras (``gaussians.initialize.far_away``).
-        """
-        return {}
-
-    def initial_light(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """The tensors of ``light_parameters`` before the first step."""
-        return {}
+        count = len(colors)
+        zeros = {name: torch.zeros(count, *own.shape) for name, own in self.parameters.items()}
+        return zeros | {row.parameter: row.first(count) for row in self.surface}, {}
 
     def strength(self, gaussians: Parameters) -> Tensor:
-        """Reflection strength [N] in [0, 1]: what tells glossy from matte Gaussians (for normal propagation).
+        """Reflection strength [N] in [0, 1], which tells glossy from matte Gaussians: the property "strength".
 
         Raises:
-            PolarguideError: the model has none.
+            PolarguideError: the model has no such property.
         """
+        for row in self.surface:
+            if row.name == "strength":
+                return row.values(gaussians)
         raise PolarguideError(
             "recipe",
             expected="a shading model with a reflection strength",
             found=type(self).__name__,
             remedy='Take the action "propagate_normals" out of the recipe, or define strength().',
         )
-
-    @property
-    def knows_metals(self) -> bool:
-        """Whether Gaussians can be metals; then ``become_metal`` makes them."""
-        return False
-
-    @property
-    def knows_indices(self) -> bool:
-        """Whether Gaussians can have refractive indices of their own: ``index_offset``, what each adds to the run's."""
-        return False
-
-    def become_metal(
-        self,
-        gaussians: Gaussians,
-        light: Light,
-        metalness: Tensor,
-        reflectance: Tensor,
-        gain: Callable[[], float],
-    ) -> None:
-        """Change which Gaussians are metals, of a model that knows them.
-
-        Args:
-            metalness: [N], 0 to 1. reflectance: [N, 3] at normal incidence that new ones begin with.
-            gain: by how much all light should be brighter, called when the first metals appear.
-        """
-        raise NotImplementedError
 
     # What it renders
 
@@ -255,40 +222,35 @@ class ShadingModel(ABC):
         """Whether pictures have a specular layer."""
         return "specular" in self.layers
 
-    @abstractmethod
+    def channel_parameters(self, gaussians: Parameters) -> ChannelParameters | None:
+        """Parameters behind the channels, for which there are native kernels; None: ``channels`` has its own code."""
+        return None
+
     def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
-        """Per Gaussian by name: ``color`` [N, 3], and what else is blended, each [N, C]; not ``normal`` or ``depth``.
+        """Per Gaussian by name: ``color`` [N, 3], and further blended values [N, C], without ``normal`` and ``depth``.
+
+        Here they are computed from ``channel_parameters``.
 
         Args:
             normals: [N, 3] unit, world axes. center: [3] of the camera. degree: of the base color's harmonics, 0 to 3.
         """
-
-    def channel_parameters(self, gaussians: Parameters) -> ChannelParameters | None:
-        """The same as ``channels``, where it is the base color and no more than these; None: it is not."""
-        return None
+        described = self.channel_parameters(gaussians)
+        if described is None:
+            raise NotImplementedError(f"{type(self).__name__}: channels() or channel_parameters()")
+        channels = {"color": base_colors(gaussians, center, degree)}
+        if described.strength_logits is not None:
+            channels["strength"] = torch.sigmoid(described.strength_logits)[:, None]
+        if described.metalness is not None:
+            body = 1 - described.metalness[:, None]
+            channels = {name: values * body for name, values in channels.items()}
+        if described.light_dc is not None:
+            directions = mirrored_directions(gaussians["means"], center, normals)
+            channels["local"] = local_light(gaussians, directions, degree)
+        return channels | dict(described.further)
 
     @abstractmethod
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Any]:
-        """Layers of a picture by their names in ``RenderResult``; ``final`` at least. And ``metal``, where there is."""
-
-    def shade_detached(
-        self, splatted: GBuffer, light: Light, camera: Camera
-    ) -> tuple[dict[str, Any], DetachedLayers | None]:
-        """``shade``, and if it reflects ``specular`` and ``diffuse`` again, without a gradient on the normals but by
-        what metals mirror, and those metals.
-        """
-        layers = self.shade(splatted, light, camera)
-        if "specular" not in layers:
-            return layers, None
-        parts = [splatted[name].detach() if name == "normal" else splatted[name] for name in splatted.layout]
-        features = torch.cat(parts, dim=-1)
-        again = self.shade(replace(splatted, features=features, metal=layers.get("metal")), light, camera)
-        return layers, (again["specular"], again["diffuse"], again.get("metal"))
-
-    @property
-    def smooth_dielectric(self) -> bool:
-        """Whether ``predicted_stokes`` is that of a smooth dielectric, as here; False for a class with its own."""
-        return type(self).predicted_stokes is ShadingModel.predicted_stokes
+        """Return layers by their names in ``RenderResult``, at least ``final``; ``metal`` where there are metals."""
 
     def predicted_stokes(self, result: RenderResult, camera: Camera) -> Tensor:
         """Stokes vectors [3, H, W, 3] of a rendered picture; here of a smooth dielectric.
@@ -297,35 +259,28 @@ class ShadingModel(ABC):
             result: with the specular and diffuse layers and the normal.
         """
         normal = result.shaded_normal
-        assert result.specular is not None
-        assert result.diffuse is not None
-        assert normal is not None
+        own = result.layers.get("index")
         stokes = optics.predicted_stokes(
-            2 * result.specular,
-            2 * result.diffuse,
+            2 * result.layers["specular"],
+            2 * result.layers["diffuse"],
             camera.to_camera(normal),
             camera.rays(device=normal.device),
-            self.refractive_index if result.index is None else result.index,
+            self.refractive_index if own is None else own,
         )
         if result.metal is None:
             return stokes
-        index: float | Tensor = self.refractive_index
-        if result.index is not None:
-            index = result.index.flatten()[result.metal.pixels]
-        metal = metal_stokes(result.specular, result.diffuse, normal, result.metal, camera, index)
+        index = self.refractive_index if own is None else own.flatten()[result.metal.pixels]
+        metal = metal_stokes(
+            result.layers["specular"], result.layers["diffuse"], normal, result.metal, camera, index
+        )
         return stokes.flatten(1, 2).index_copy(1, result.metal.pixels, metal).view_as(stokes)
 
-    # What exports need
+    # Colors of single Gaussians, and light that can be exported
 
     @property
     def radiance_cubemap(self) -> RadianceCubemap | None:
         """The light's radiance from afar; None where the light is not such a cubemap."""
         return None
-
-    @property
-    def local_note(self) -> str:
-        """Layers that do not follow when the distant light is turned or replaced; empty: all follow."""
-        return ""
 
     @abstractmethod
     def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
@@ -334,14 +289,6 @@ class ShadingModel(ABC):
     def diffuse_colors(self, gaussians: Parameters, rays: Tensor) -> Tensor:
         """Linear colors [N, 3] without reflections, along unit rays [N, 3]."""
         return harmonic_colors(gaussians, rays)
-
-    def fields(self, gaussians: Parameters) -> dict[str, Tensor]:
-        """Fields of a PLY of the Gaussians besides display colors, [N, ...] by name: linear harmonics."""
-        return {"linear_dc": gaussians["sh_dc"], "linear_rest": gaussians["sh_rest"].flatten(1)}
-
-    def page(self, gaussians: Parameters, light: Light) -> PageShading | None:
-        """Data of an exported page; None where it has no shaders for the model (colors are then baked)."""
-        return None
 
 
 @dataclass(frozen=True)
@@ -355,13 +302,9 @@ class PlainShading(ShadingModel):
         """Without reflection there is one color."""
         return PLAIN_LAYERS
 
-    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
-        """Base color [N, 3]."""
-        return {"color": base_colors(gaussians, center, degree)}
-
     def channel_parameters(self, gaussians: Parameters) -> ChannelParameters | None:
-        """Nothing but the color; None for a class with other channels."""
-        return ChannelParameters() if type(self).channels is PlainShading.channels else None
+        """The color alone."""
+        return ChannelParameters()
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         """``final`` [H, W, 3]."""
@@ -370,10 +313,6 @@ class PlainShading(ShadingModel):
     def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
         """Base colors [N, 3]; see ``ShadingModel``."""
         return self.diffuse_colors(gaussians, rays)
-
-    def page(self, gaussians: Parameters, light: Light) -> PageShading | None:
-        """Harmonics alone."""
-        return PageShading("plain", harmonic_values(gaussians))
 
 
 PLAIN = PlainShading()
@@ -404,11 +343,6 @@ def local_light(gaussians: Parameters, directions: Tensor, sh_degree: int) -> Te
     directions = directions.detach()
     origin = directions.new_zeros(3)
     return evaluate_sh(directions, origin, gaussians["local_dc"], gaussians["local_rest"], sh_degree)
-
-
-def harmonic_values(gaussians: Parameters) -> dict[str, Tensor]:
-    """The base color's harmonics as values of a page."""
-    return {"color": gaussians["sh_dc"], "harmonics": gaussians["sh_rest"]}
 
 
 def mirrored(rays: Tensor, normals: Tensor) -> Tensor:

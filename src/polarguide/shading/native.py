@@ -38,51 +38,58 @@ class MetalArguments(NamedTuple):
     least_share: float
 
 
-class RoughnessArguments(NamedTuple):
-    """Arguments of the native pass for rough surfaces.
-
-    Attributes:
-        channel: channel of the blended roughness.
-        blur: mip levels from a mirror to a roughness of 1.
-        alpha: [P] by which a pixel's blended roughness is divided; without a gradient.
-    """
-
-    channel: int
-    blur: float
-    alpha: Tensor
-
-
 class ReflectArguments(NamedTuple):
     """Arguments of ``reflect_native`` from a shading model and its G-buffer.
 
     Attributes:
-        fresnel: Fresnel's weight of radiance, in place of the lerp with the logistic function of raw texels.
+        fresnel: whether light is radiance with Fresnel's weight; otherwise a lerp with the logistic function of texels.
         local: whether channels 7 to 9 are light that is added to the environment's.
-        refractive_index: of Fresnel's weight.
-        added_index: the channel of what is added to it, without a gradient; -1: there is none.
-        roughness: where surfaces have one; None: all are mirrors.
-        metal: where there is some; it is added to ``final`` and ``specular``.
-        detached: also ``specular`` and ``diffuse`` once more, without a gradient on the normals but for that of metals.
+        refractive_index: refractive index of Fresnel's weight.
+        index_channel: channel of the offset of the refractive index, without a gradient; -1: no such channel.
+        blur_channel: channel of the blended blur; -1: all surfaces are mirrors.
+        blur: mip levels from a mirror to a blur of 1.
+        alpha: [P] divisor of the blended blur, without a gradient.
+        metal: metals in the picture, which are added to ``final`` and ``specular``; None without metals.
+        detached: whether to return ``specular`` and ``diffuse`` also without a gradient on the normals, other than by
+            the light that metals mirror.
     """
 
     fresnel: bool
     local: bool
     refractive_index: float
-    added_index: int = -1
-    roughness: RoughnessArguments | None = None
+    index_channel: int = -1
+    blur_channel: int = -1
+    blur: float = 0.0
+    alpha: Tensor | None = None
     metal: MetalArguments | None = None
     detached: bool = False
 
     @property
-    def model(self) -> tuple[bool, bool, float, int]:
-        """The arguments of each native function."""
-        return self.fresnel, self.local, self.refractive_index, self.added_index
+    def shading(self) -> dict[str, Any]:
+        """Arguments of the native functions about the weight of the light."""
+        return {
+            "fresnel": self.fresnel,
+            "local": self.local,
+            "refractive_index": self.refractive_index,
+            "index": self.index_channel,
+        }
 
     @property
-    def levels(self) -> tuple[int, float, Tensor | None]:
-        """The arguments for the mip level of a look-up."""
-        rough = self.roughness
-        return (-1, 0.0, None) if rough is None else (rough.channel, rough.blur, rough.alpha)
+    def level(self) -> dict[str, Any]:
+        """Arguments of the native functions about the mip level of the light."""
+        return {"roughness": self.blur_channel, "blur": self.blur, "alpha": self.alpha}
+
+    @property
+    def outputs(self) -> list[str]:
+        """Names of the outputs of ``reflect_native``, in order."""
+        detached = DETACHED if self.detached else []
+        return [*_LAYERS, *detached, *(_METAL if self.metal is not None else [])]
+
+
+_LAYERS = ["final", "specular", "diffuse", "reflection"]
+DETACHED = ["detached_specular", "detached_diffuse"]
+"""Names of the layers without a gradient on the normals."""
+_METAL = ["share", "reflected", "slope"]
 
 
 class _Reflect(torch.autograd.Function):
@@ -92,62 +99,101 @@ class _Reflect(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         features, rays, *levels = (t.detach().contiguous() for t in (features, rays, *textures))
         learns = any(ctx.needs_input_grad)
-        count = len(rays)
-        sizes = ((count, 3), (count,), (count, 3)) if learns else ()
-        looked_up = [rays.new_empty(*size) for size in sizes]
-        layers = [torch.empty_like(rays) for _ in range(4)]
-        inputs: list[Any] = [features, rays, levels, *given.model, *given.levels]
-        _native.reflect_forward(*inputs, *(looked_up or (None, None, None)), *layers)
-        metal = given.metal
-        outputs = []
-        light = []
-        if metal is not None:
-            pixels = len(metal.pixels)
-            outputs = [rays.new_empty(pixels), rays.new_empty(pixels, 3), rays.new_empty(pixels, 3)]
-            light = [layers[3]]
-            _native.metal_layers(features, rays, *metal, *light, *outputs, *layers[:2])
-            ctx.mark_non_differentiable(outputs[0])
+        directions = torch.empty_like(rays) if learns else None
+        level = rays.new_empty(len(rays)) if learns else None
+        seen = torch.empty_like(rays) if learns else None
+        outputs: dict[str, Any] = {name: torch.empty_like(rays) for name in _LAYERS}
+        _native.reflect_forward(
+            features,
+            rays,
+            levels,
+            **given.shading,
+            **given.level,
+            directions=directions,
+            level=level,
+            seen=seen,
+            **outputs,
+        )
+        light = None
+        reflected: dict[str, Any] = {}
+        if given.metal is not None:
+            light = outputs["reflection"]
+            count = len(given.metal.pixels)
+            reflected = {name: rays.new_empty(count, 3) for name in _METAL}
+            reflected["share"] = rays.new_empty(count)
+            lobes = {name: outputs[name] for name in ("final", "specular")}
+            _native.metal_layers(features, rays, **given.metal._asdict(), light=light, **reflected, **lobes)
+            ctx.mark_non_differentiable(reflected["share"])
         ctx.given = given
         ctx.set_materialize_grads(False)
         if learns:
-            ctx.save_for_backward(features, rays, *looked_up, *light, *levels)
-        again = [layers[1].clone(), layers[2].clone()] if given.detached else []
-        return (*layers, *again, *outputs)
+            ctx.save_for_backward(features, rays, directions, level, seen, light, *levels)
+        if given.detached:
+            outputs |= {name: outputs[name.removeprefix("detached_")].clone() for name in DETACHED}
+        return *outputs.values(), *reflected.values()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        features, rays, directions, level, looked_up, *saved = ctx.saved_tensors
-        given = ctx.given
-        contiguous = [None if g is None else g.contiguous() for g in grads]
-        metal = given.metal
-        to_layers = contiguous if metal is None else contiguous[:-3]
-        to_layers += [None] * (6 - len(to_layers))
+        features, rays, directions, level, seen, light, *levels = ctx.saved_tensors
+        given: ReflectArguments = ctx.given
+        contiguous = (None if grad is None else grad.contiguous() for grad in grads)
+        by = dict(zip(given.outputs, contiguous, strict=True))
+        by_detached = [by.get(name) for name in DETACHED]
         to_features = torch.empty_like(features)
-        to_seen = torch.empty_like(looked_up)
+        to_seen = torch.empty_like(seen)
+        # Gradients through the detached layers reach the light, but not the normals by way of the directions.
+        to_texels = None if all(grad is None for grad in by_detached) else torch.empty_like(seen)
+        to_light = by["reflection"]
+        metal = given.metal
         if metal is not None:
-            light, *saved = saved
-            by_layers = [*to_layers[:2], to_layers[4]]
-            by_metal = contiguous[-2:]
-            to_light = torch.zeros_like(rays) if to_layers[3] is None else to_layers[3].clone()
+            to_light = torch.zeros_like(rays) if to_light is None else to_light.clone()
             to_normal = rays.new_empty(len(metal.pixels), 3)
             to_metal = rays.new_empty(len(metal.pixels), 4)
-            inputs: list[Any] = [features, rays, *metal, light, *by_layers, *by_metal]
-            inputs += [to_light, to_normal, to_metal]
-            _native.metal_backward(*inputs)
-            to_layers[3] = to_light
-        # What comes by the detached layers goes to the light, and not by way of the directions to the normals.
-        to_look_up = None if to_layers[4] is None and to_layers[5] is None else torch.empty_like(looked_up)
-        inputs = [features, rays, looked_up, *given.model, *to_layers, to_seen, to_look_up, to_features]
-        _native.reflect_backward_layers(*inputs)
+            _native.metal_backward(
+                features,
+                rays,
+                **metal._asdict(),
+                light=light,
+                grad_final=by["final"],
+                grad_specular=by["specular"],
+                grad_held=by_detached[0],
+                grad_reflected=by["reflected"],
+                grad_slope=by["slope"],
+                grad_light=to_light,
+                grad_normal=to_normal,
+                grad_metal=to_metal,
+            )
+        _native.reflect_backward_layers(
+            features,
+            rays,
+            seen,
+            **given.shading,
+            grad_final=by["final"],
+            grad_specular=by["specular"],
+            grad_diffuse=by["diffuse"],
+            grad_reflection=to_light,
+            grad_held_specular=by_detached[0],
+            grad_held_diffuse=by_detached[1],
+            grad_seen=to_seen,
+            grad_texels=to_texels,
+            grad_features=to_features,
+        )
         if metal is not None:
             to_features[:, 3:6].index_add_(0, metal.pixels, to_normal)
             to_features[:, metal.first : metal.first + 4].index_add_(0, metal.pixels, to_metal)
+        learns_light = any(ctx.needs_input_grad[3:])
         to_directions, to_level, to_textures = mips_backward(
-            saved, directions, level, to_seen, any(ctx.needs_input_grad[3:]), to_look_up
+            levels, directions, level, to_seen, learns_light, to_texels
         )
-        inputs = [features, rays, *given.levels, to_directions, to_level, to_features]
-        _native.reflect_backward_directions(*inputs)
+        _native.reflect_backward_directions(
+            features,
+            rays,
+            **given.level,
+            grad_directions=to_directions,
+            grad_level=to_level,
+            grad_features=to_features,
+        )
         return to_features, None, None, *to_textures
 
 
@@ -184,39 +230,37 @@ def reflect_native(
 
 
 def reflect_arguments(
-    splatted: GBuffer, fresnel: bool, local: bool, refractive_index: float, detached: bool
+    splatted: GBuffer, fresnel: bool, local: bool, refractive_index: float
 ) -> ReflectArguments:
     """Arguments of ``reflect_native`` for a G-buffer, by the channels that it has."""
     layout = splatted.layout
-    rough = None
-    metal = None
-    if "roughness" in layout:
-        rough = RoughnessArguments(layout.first("roughness"), LEVELS, splatted.alpha.detach().flatten())
+    arguments = ReflectArguments(
+        fresnel, local, refractive_index, index_channel=layout.first("index"), detached=splatted.detached
+    )
+    if "blur" in layout:
+        alpha = splatted.alpha.detach().flatten()
+        arguments = arguments._replace(blur_channel=layout.first("blur"), blur=LEVELS, alpha=alpha)
     if "metal" in layout:
         first = layout.first("metal")
-        metal = MetalArguments(where_metal(splatted.features.flatten(0, 1), first), first, MINIMUM_SHARE)
-    index = layout.first("index")
-    return ReflectArguments(fresnel, local, refractive_index, index, rough, metal, detached)
+        pixels = where_metal(splatted.features.flatten(0, 1), first)
+        arguments = arguments._replace(metal=MetalArguments(pixels, first, MINIMUM_SHARE))
+    return arguments
 
 
 def shade_native(
     splatted: GBuffer, textures: Sequence[Tensor], camera: Camera, given: ReflectArguments
 ) -> dict[str, Any]:
-    """The layers of ``reflect_native`` by name, [H, W, 3] each.
-
-    If ``given.detached`` is set, ``detached specular`` and ``detached diffuse`` are among them: the same layers, whose
-    gradient does not reach the normals. ``metal`` is None if no Gaussian is a metal.
-    """
-    shaded = reflect_native(splatted.features.flatten(0, 1), world_rays_native(camera), textures, given)
-    names = ["final", "specular", "diffuse", "reflection"]
-    names += ["detached specular", "detached diffuse"] if given.detached else []
-    shape = splatted.features.shape[:2]
-    layers = {name: layer.unflatten(0, shape) for name, layer in zip(names, shaded, strict=False)}
-    metal = None if given.metal is None else MetalPixels(given.metal.pixels, *shaded[len(names) :])
-    return {**layers, "metal": metal}
+    """Return the layers of ``reflect_native`` by name, [H, W, 3] each, and ``metal``, None without metals."""
+    outputs = reflect_native(splatted.features.flatten(0, 1), world_rays_native(camera), textures, given)
+    shaded = dict(zip(given.outputs, outputs, strict=True))
+    shown = [] if given.metal is None else [shaded.pop(name) for name in _METAL]
+    size = splatted.features.shape[:2]
+    layers: dict[str, Any] = {name: layer.unflatten(0, size) for name, layer in shaded.items()}
+    layers["metal"] = None if given.metal is None else MetalPixels(given.metal.pixels, *shown)
+    return layers
 
 
-class _Split(torch.autograd.Function):
+class _GBufferSplit(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, features: Tensor, alpha: Tensor, deep: bool
@@ -266,7 +310,7 @@ def split_native(features: Tensor, alpha: Tensor, *, depth: bool) -> tuple[Tenso
     Raises:
         ValueError: if a shape is not as above.
     """
-    rest, normal, deep = _Split.apply(features, alpha, depth)
+    rest, normal, deep = _GBufferSplit.apply(features, alpha, depth)
     return rest, normal, deep
 
 

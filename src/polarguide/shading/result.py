@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -88,105 +88,104 @@ class MetalPixels(NamedTuple):
     slope: Tensor
 
 
-DetachedLayers = tuple[Tensor, Tensor, MetalPixels | None]
-"""``specular``, ``diffuse`` and ``metal`` of a result, without a gradient on the normals."""
-
-
 @dataclass(frozen=True, eq=False)
 class RenderResult:
-    """All layers of one view. Radiance is linear, on the scale of S0/2; [H, W, 3] unless stated otherwise.
+    """A rendered view: its layers by name, and tensors that training alone reads.
+
+    Radiance is linear, on the scale of S0/2. ``final``, ``base`` and ``alpha`` are always there, ``normal`` and
+    ``depth`` where they were requested, the other layers where the shading model has them.
 
     Attributes:
-        final: the picture; ``specular + diffuse``.
-        specular: what reflection adds to it; None for a recipe without reflection.
-        diffuse: what the base color adds to it; None for a recipe without reflection.
-        base: blended base color.
-        reflection: the environment seen along the mirrored ray; None where the shading has no such layer.
-        strength: [H, W] reflection strength in [0, 1]; None where the shading has none.
-        roughness: [H, W] square root of GGX's alpha, as glTF has it; None where the shading has none. No gradient.
-        metalness: [H, W] share of metals in [0, 1]; None where the shading knows none.
-        normal: blended normal in world axes, not normalized; None where the stage does not splat it. Where the surface
-            was asked for, that around the pixel's median depth, see ``raster.surface``.
-        depth: [H, W] expected camera depth over alpha; None where not asked for. Where the surface was asked for, that
-            around the median.
-        alpha: [H, W] in [0, 1].
-        radii: [N] pixels, of the projected Gaussians; 0 where culled; None where there are no Gaussians.
-        detached_layers: ``specular``, ``diffuse`` and ``metal`` once more, without a gradient on the normals; None
-            where not asked for.
-        rotation_only_normal: the blended normal once more, with a gradient that rotates Gaussians, but neither moves
-            them nor changes their opacity; None where not asked for.
-        metal: what metals add to ``specular``; None where there is none.
-        index: [H, W] refractive index of each pixel, without a gradient; None: that of the run everywhere.
-        blended_normal: the blended normal, where ``normal`` is that of the surface.
-        predicted: [3, H, W, 3] Stokes vectors in the lens frame, as ``View.stokes`` measures them, S0 twice the
-            picture; None where they were not asked for, or the model predicts none.
+        layers: by name, [H, W, 3] unless stated otherwise.
+
+            - ``final``: the picture; ``specular + diffuse`` of a model that reflects.
+            - ``specular``, ``diffuse``: contributions of reflection and of the base color to the picture.
+            - ``base``: blended base color.
+            - ``reflection``: the environment along the mirrored ray.
+            - ``strength``: [H, W] reflection strength in [0, 1].
+            - ``roughness``: [H, W] square root of GGX's alpha, as in glTF; no gradient.
+            - ``metalness``: [H, W] share of metals in [0, 1].
+            - ``normal``: blended normal in world axes, not normalized. If the surface was requested, the normal around
+              the pixel's median depth, see ``raster.surface``.
+            - ``depth``: [H, W] expected camera depth over alpha; if the surface was requested, around the median.
+            - ``alpha``: [H, W] in [0, 1].
+            - ``shaded_normal``: the normal of the shading, where ``normal`` is that of the surface.
+            - ``index``: [H, W] refractive index, no gradient, where it is not the run's everywhere.
+            - ``stokes``, ``dolp``, ``aolp``: see ``polarized_layers``.
+
+        metal: contribution of metals to ``specular``; None without metals.
+        training: tensors that training alone reads, by name.
+
+            - ``radii``: [N] pixels, of the projected Gaussians; 0 where culled.
+            - ``detached_specular``, ``detached_diffuse``: the layers without a gradient on the normals.
+            - ``rotation_only_normal``: the blended normal with a gradient that rotates Gaussians, but neither moves
+              them nor changes their opacity.
     """
 
-    final: Tensor
-    specular: Tensor | None
-    diffuse: Tensor | None
-    base: Tensor
-    reflection: Tensor | None
-    strength: Tensor | None
-    normal: Tensor | None
-    depth: Tensor | None
-    alpha: Tensor
-    radii: Tensor | None = None
-    detached_layers: DetachedLayers | None = None
-    rotation_only_normal: Tensor | None = None
+    layers: Mapping[str, Tensor]
     metal: MetalPixels | None = None
-    metalness: Tensor | None = None
-    roughness: Tensor | None = None
-    index: Tensor | None = None
-    blended_normal: Tensor | None = None
-    predicted: Tensor | None = None
+    training: Mapping[str, Tensor] = field(default_factory=dict)
 
     @property
-    def stokes(self) -> Tensor | None:
-        """``predicted``, by its name as a layer."""
-        return self.predicted
+    def final(self) -> Tensor:
+        """The picture, [H, W, 3]."""
+        return self.layers["final"]
 
     @property
-    def dolp(self) -> Tensor | None:
-        """Predicted degree of linear polarization of the luminance, [H, W] in [0, 1]."""
-        return None if self.predicted is None else optics.dolp(optics.luminance(self.predicted))
+    def base(self) -> Tensor:
+        """Blended base color, [H, W, 3]."""
+        return self.layers["base"]
 
     @property
-    def aolp(self) -> Tensor | None:
-        """Predicted angle of linear polarization of the luminance, [H, W] radians in [0, pi)."""
-        return None if self.predicted is None else optics.aolp(optics.luminance(self.predicted))
+    def alpha(self) -> Tensor:
+        """Blended opacity, [H, W]."""
+        return self.layers["alpha"]
 
     @property
-    def shaded_normal(self) -> Tensor | None:
-        """The normal that the layers were shaded with."""
-        return self.normal if self.blended_normal is None else self.blended_normal
+    def normal(self) -> Tensor:
+        """Normal of a rendering that requested it, [H, W, 3]."""
+        return self.layers["normal"]
+
+    @property
+    def depth(self) -> Tensor:
+        """Camera depth of a rendering that requested it, [H, W]."""
+        return self.layers["depth"]
+
+    def __getattr__(self, name: str) -> Tensor | None:
+        """An optional layer as an attribute: ``result.strength``; None where the rendering does not have it."""
+        if name not in LAYERS:
+            raise AttributeError(f"RenderResult has no layer {name!r}")
+        return self.layers.get(name)
+
+    @property
+    def shaded_normal(self) -> Tensor:
+        """Normal with which the layers were shaded, [H, W, 3]."""
+        return self.layers.get("shaded_normal", self.normal)
+
+    @property
+    def is_polarized(self) -> bool:
+        """Whether Stokes vectors can be predicted: both lobes and the normal are there."""
+        return {"specular", "diffuse", "normal"} <= self.layers.keys()
+
+    def with_layers(self, **layers: Tensor) -> RenderResult:
+        """A copy with layers added or replaced."""
+        return replace(self, layers={**self.layers, **layers})
 
     def to(self, device: torch.device | str) -> RenderResult:
-        """The same on a device, but for ``detached_layers``; nothing is copied that is there already."""
-        layers = {field.name: getattr(self, field.name) for field in fields(self)}
-        moved: dict[str, Any] = {name: t.to(device) for name, t in layers.items() if isinstance(t, Tensor)}
-        metal = None if self.metal is None else type(self.metal)(*(t.to(device) for t in self.metal))
-        return replace(self, detached_layers=None, metal=metal, **moved)
+        """The layers on a device, without the tensors of training."""
+        layers = {name: layer.to(device) for name, layer in self.layers.items()}
+        metal = None if self.metal is None else MetalPixels(*(t.to(device) for t in self.metal))
+        return RenderResult(layers, metal)
 
-    def resized(self, width: int, height: int) -> RenderResult:
-        """The pictures in another size, each pixel that of the nearest place; nothing else is kept."""
-        pictures: dict[str, Any] = {}
-        for name in LAYERS:
-            if (layer := getattr(self, name)) is not None:
-                rows, columns = (
-                    (torch.arange(new, device=layer.device) * old) // new
-                    for new, old in zip((height, width), layer.shape[:2], strict=True)
-                )
-                pictures[name] = layer[rows][:, columns]
-        bare: dict[str, Any] = dict.fromkeys(
-            (
-                "predicted",
-                "detached_layers",
-                "rotation_only_normal",
-                "radii",
-                "metal",
-                "index",
-                "blended_normal",
-            )
-        )
-        return replace(self, **bare, **pictures)
+
+def polarized_layers(stokes: Tensor) -> dict[str, Tensor]:
+    """Layers of predicted polarization by the names of ``POLARIZED``.
+
+    Args:
+        stokes: [3, H, W, 3] Stokes vectors in the lens frame, as in ``View.stokes``; S0 is twice the picture.
+
+    Returns:
+        ``stokes``, and of its luminance the ``dolp`` [H, W] in [0, 1] and the ``aolp`` [H, W] in [0, pi) radians.
+    """
+    luminance = optics.luminance(stokes)
+    return {"stokes": stokes, "dolp": optics.dolp(luminance), "aolp": optics.aolp(luminance)}

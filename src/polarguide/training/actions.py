@@ -89,7 +89,6 @@ def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: 
     for view in views:
         camera = view.camera
         depth = render(gaussians, camera, rasterize, DEPTH_ALONE).depth
-        assert depth is not None
         center = camera.pose(means.dtype, means.device).center
         pixel, z, inside = seen_at(means - center, camera)
         visible = inside & (z < depth[pixel] * (1 + DEPTH_SLACK))

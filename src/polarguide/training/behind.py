@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -21,15 +19,11 @@ def turned_behind(result: RenderResult, near: float, far: float) -> RenderResult
         result: with ``normal``, ``rotation_only_normal`` and ``depth``.
         near, far: camera depths, 0 < near < far.
     """
-    assert result.normal is not None
-    assert result.rotation_only_normal is not None
-    assert result.depth is not None
     depth = result.depth.detach()
     share = shares_before(depth, near, far)
-    return replace(
-        result,
-        normal=result.rotation_only_normal.lerp(result.normal, share[..., None]),
-        depth=depth.lerp(result.depth, share),
+    rotation_only = result.training["rotation_only_normal"]
+    return result.with_layers(
+        normal=rotation_only.lerp(result.normal, share[..., None]), depth=depth.lerp(result.depth, share)
     )
 
 

@@ -78,7 +78,7 @@ class IndexOffsets(Callback[TrainingLoop]):
     def act(self, loop: TrainingLoop) -> None:
         context = loop.current
         indices = context.scene.indices
-        if not indices or not context.shading.knows_indices:
+        if not indices or "index_offset" not in context.shading.parameters:
             return
         loop.feed.refresh_priors()
         gaussians = loop.state.gaussians

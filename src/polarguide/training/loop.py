@@ -16,7 +16,7 @@ from torch import Tensor
 from polarguide.capture import View
 from polarguide.capture.exposures import Exposure
 from polarguide.core.errors import PolarguideError
-from polarguide.gaussians.initialize import orbit
+from polarguide.gaussians.initialize import camera_reach
 from polarguide.raster import ScreenStatistic
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN
@@ -138,7 +138,7 @@ class TrainingLoop(Loop):
         self.state = state or first_state(context)
         self.position = self.schedule.at(self.state.step)
         self._exposures = dict[str, tuple[Exposure, ...]]()
-        self._reach = orbit(context.scene.points.double().numpy(), context.centers.double().numpy())[1]
+        self._reach = camera_reach(context.scene.points.double().numpy(), context.centers.double().numpy())[1]
         self._set_batch_betas()
         _check_known("action", context.recipe.actions, {each.action for each in self.callbacks})
         stored = {name.split(".")[1] for name in self.state.extra}
@@ -200,9 +200,9 @@ class TrainingLoop(Loop):
         loss = step_loss(step, stage.weights)
         loss.total.backward()
         gradient = statistic.gradient if statistic else None
-        if counts and gradient is not None and result.radii is not None:
+        if counts and gradient is not None:
             self.whole = False
-            state.statistics.add(gradient, result.radii, camera.width, camera.height, slot)
+            state.statistics.add(gradient, result.training["radii"], camera.width, camera.height, slot)
         psnr = -10 * torch.log10(loss.error.clamp(min=1e-10))
         return torch.stack((loss.photometric.detach(), psnr, loss.total.detach()))
 

@@ -151,8 +151,6 @@ def consistency_loss(result: RenderResult, camera: Camera, weight: Tensor | None
         camera: camera of the view.
         weight: [H, W] where it counts; None: everywhere.
     """
-    assert result.normal is not None
-    assert result.depth is not None
     if min(result.alpha.shape) < 3:
         return result.alpha.new_zeros(())
     cosine = dot(result.normal, depth_normals(result.depth, camera))
@@ -302,23 +300,25 @@ def layer_terms(step: Step, weights: Weights) -> Tensor | None:
     total = result.final.new_zeros(())
     separated_share = priors.separated.mean()
     for weight, layer, target in (
-        (weights.specular, result.specular, priors.specular),
-        (weights.diffuse, result.diffuse, priors.diffuse),
-        (weights.reflection, result.reflection, priors.specular),
-        (weights.base, result.base, priors.diffuse),
+        (weights.specular, "specular", priors.specular),
+        (weights.diffuse, "diffuse", priors.diffuse),
+        (weights.reflection, "reflection", priors.specular),
+        (weights.base, "base", priors.diffuse),
     ):
-        if weight and layer is not None:
+        if weight and layer in result.layers:
             # Over all pixels like the picture's own term, so that before nothing it does not outweigh it.
             share = weight * separated_share
-            total = total + share * photometric_loss(layer, target, priors.separated, step.ssim_weight)
+            total = total + share * photometric_loss(
+                result.layers[layer], target, priors.separated, step.ssim_weight
+            )
     return total
 
 
 def flatness_term(step: Step, weights: Weights) -> Tensor | None:
     """The weighted flatness of the Gaussians that are visible."""
-    if not weights.flatness or step.result.radii is None:
+    if not weights.flatness:
         return None
-    return weights.flatness * flatness_loss(step.log_scales, step.result.radii, step.extent)
+    return weights.flatness * flatness_loss(step.log_scales, step.result.training["radii"], step.extent)
 
 
 def coverage_term(step: Step, weights: Weights) -> Tensor | None:
@@ -348,7 +348,6 @@ def normal_terms(step: Step, weights: Weights) -> Tensor:
     consistency = None
     beside = result.alpha.new_zeros(())
     if priors is not None:
-        assert result.normal is not None
         directions = [
             Directions(target, weight, factor / float(total), plane)
             for factor, target, weight, total, plane in (
@@ -370,7 +369,8 @@ def normal_terms(step: Step, weights: Weights) -> Tensor:
             measured = priors.stokes[1:]
             index = shading.refractive_index
             factor = weights.stokes / measured.numel()
-            stokes = PolarizationTerm(measured, S1_AND_S2, priors.stokes_weight, factor, index, result.index)
+            index_layer = result.layers.get("index")
+            stokes = PolarizationTerm(measured, S1_AND_S2, priors.stokes_weight, factor, index, index_layer)
     if weights.consistency:
         factor = weights.consistency / ((result.alpha.shape[0] - 2) * (result.alpha.shape[1] - 2))
         consistency = Consistency(None if priors is None else priors.surface, factor)
@@ -380,9 +380,9 @@ def normal_terms(step: Step, weights: Weights) -> Tensor:
 
 def _native_fits(result: RenderResult, priors: ViewPriors | None) -> bool:
     """Whether the native pass takes these pictures."""
-    rendered = result.normal, result.specular, result.diffuse, result.depth, result.alpha
+    rendered = [result.layers.get(name) for name in ("normal", "specular", "diffuse", "depth", "alpha")]
     compared = () if priors is None else (priors.stokes, priors.weight, priors.plane, priors.chromatic)
-    return result.normal is not None and min(result.alpha.shape) >= 3 and fits(*rendered, *compared)
+    return "normal" in result.layers and min(result.alpha.shape) >= 3 and fits(*rendered, *compared)
 
 
 def normal_terms_reference(step: Step, weights: Weights) -> Tensor:
@@ -397,7 +397,7 @@ def normal_terms_reference(step: Step, weights: Weights) -> Tensor:
             (weights.azimuth, azimuth_loss),
             (weights.chromatic, chromatic_loss),
         ):
-            if weight and result.normal is not None:
+            if weight and "normal" in result.layers:
                 total = total + weight * loss(result.normal, priors)
         if weights.stokes and shading.reflects:
             total = total + weights.stokes * stokes_loss(result, priors, shading)
@@ -425,9 +425,9 @@ def step_loss(step: Step, weights: Weights) -> StepLoss:
     """
     result = step.result
     targets = step.targets
-    if result.detached_layers is not None:
-        specular, diffuse, metal = result.detached_layers
-        step = replace(step, result=replace(result, specular=specular, diffuse=diffuse, metal=metal))
+    if "detached_specular" in result.training:
+        lobes = {name: result.training[f"detached_{name}"] for name in ("specular", "diffuse")}
+        step = replace(step, result=result.with_layers(**lobes))
     if targets.partial is None:
         picture = photometric_terms(result.final, targets.picture, targets.valid, step.ssim_weight)
         total = weights.photometric * picture.loss

@@ -160,8 +160,8 @@ def pixel_terms(result: RenderResult, camera: Camera, terms: Terms) -> Tensor:
         terms,
         result.alpha,
         result.normal,
-        result.specular if polarized else None,
-        result.diffuse if polarized else None,
+        result.layers["specular"] if polarized else None,
+        result.layers["diffuse"] if polarized else None,
         _field(result) if polarized else None,
         result.depth if deep else None,
     )

@@ -261,8 +261,7 @@ def partial_terms(step: Step, photometric: float, polarization: float) -> tuple[
     def compared(rendered: Tensor) -> Photometric:
         return photometric_terms(rendered, view.shown, step.targets.valid, step.ssim_weight)
 
-    layers = result.specular, result.diffuse, result.normal
-    predicts = shading.reflects and all(layer is not None for layer in layers)
+    predicts = shading.reflects and result.is_polarized
     if not (polarization and len(view.intensities) and predicts):
         picture = compared(result.final)
         return photometric * picture.loss, picture

@@ -179,9 +179,10 @@ def first_state(context: TrainingContext) -> TrainingState:
     if recipe.oriented:
         tensors |= {name: torch.zeros(count, *shape) for name, shape in ORIENTED_SHAPES.items()}
     generator = seeded(settings.seed, recipe.shading.stream)
-    tensors |= recipe.shading.initial_parameters(tensors["sh_dc"] * SH_C0 + 0.5, generator)
-    tensors |= recipe.shading.placed_parameters(far_away(tensors["means"], scene.points, centers))
-    light = {name: t.to(device) for name, t in recipe.shading.initial_light(generator).items()}
+    far = far_away(tensors["means"], scene.points, centers)
+    own, first_light = recipe.shading.initialize(tensors["sh_dc"] * SH_C0 + 0.5, far, generator)
+    tensors |= own
+    light = {name: t.to(device) for name, t in first_light.items()}
     for declared, first, leading in (
         (recipe.shading.parameters, tensors, (count,)),
         (recipe.shading.light_parameters, light, ()),

@@ -19,7 +19,7 @@ from polarguide.results.rendering.relight import RELIT_RESOLUTION, turned_cubema
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
-from polarguide.shading.result import POLARIZED, RenderResult
+from polarguide.shading.result import POLARIZED, RenderResult, polarized_layers
 from polarguide.training.loop import TrainingLoop
 from polarguide.viewer.cameras import drawn_camera, letterbox
 from polarguide.visualization import figures
@@ -88,7 +88,7 @@ class Scenery:
 
     def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
         """The Stokes vectors that a result predicts; None without both layers and a normal."""
-        if any(layer is None for layer in (result.specular, result.diffuse, result.normal)):
+        if not result.is_polarized:
             return None
         return self.shading.predicted_stokes(result, camera)
 
@@ -220,8 +220,8 @@ class Painter:
     ) -> Picture | None:
         """A picture of a layer; None where there is no such layer."""
         result = self._result(scenery, camera, appearance)
-        if appearance.layer in POLARIZED:
-            result = replace(result, predicted=scenery.stokes(result, camera))
+        if appearance.layer in POLARIZED and (stokes := scenery.stokes(result, camera)) is not None:
+            result = result.with_layers(**polarized_layers(stokes))
         return self._layer(result, camera, appearance, settled=settled)
 
     def _wiped(
@@ -283,16 +283,16 @@ class Painter:
         result = scenery.render(
             camera, depth=appearance.layer == "depth", surface=surface, within=within, turn=turn
         )
-        if result.specular is None or result.diffuse is None or strength == 1.0:
+        if not {"specular", "diffuse"} <= result.layers.keys() or strength == 1.0:
             return result
-        specular = strength * result.specular
-        return replace(result, specular=specular, final=result.diffuse + specular)
+        specular = strength * result.layers["specular"]
+        return result.with_layers(specular=specular, final=result.layers["diffuse"] + specular)
 
     def _layer(
         self, result: RenderResult, camera: Camera, appearance: Appearance, *, settled: bool
     ) -> Picture | None:
         layer = appearance.layer
-        values: Tensor | None = getattr(result, layer)
+        values = result.layers.get(layer)
         if values is None:
             return None
         if layer in RADIANCE:

@@ -341,7 +341,7 @@ def view_run(
 
 def paintable_run(run: OpenedRun) -> Paintable | None:
     """What can be painted over a run; None where its recipe tells no metals."""
-    if not run.model.shading.knows_metals:
+    if "metalness" not in run.model.shading.parameters:
         return None
     model = run.model
     scene = run.scene

@@ -47,8 +47,8 @@ def layer_picture(
         color: color of the presentation, [3, 3], of layers of radiance.
     """
     if name in POLARIZED:
-        return None if result.predicted is None else polarization_picture(name, result.predicted)
-    values: Tensor | None = getattr(result, name)
+        return polarization_picture(name, result.layers["stokes"]) if "stokes" in result.layers else None
+    values = result.layers.get(name)
     if values is None:
         return None
     if name in RADIANCE:

@@ -70,17 +70,12 @@ class FieldModel:
         size = (camera.height, camera.width)
         final = srgb_decode(color).view(*size, 3)
         rays = camera.rays(device=self.device)
-        return RenderResult(
-            final=final,
-            specular=None,
-            diffuse=None,
-            base=final,
-            reflection=None,
-            strength=None,
-            normal=normal.view(*size, 3) if normals else None,
-            depth=distance.view(size) * rays[..., 2] * self.field.region.unit if depth else None,
-            alpha=opacity.view(size),
-        )
+        layers = {"final": final, "base": final, "alpha": opacity.view(size)}
+        if normals:
+            layers["normal"] = normal.view(*size, 3)
+        if depth:
+            layers["depth"] = distance.view(size) * rays[..., 2] * self.field.region.unit
+        return RenderResult(layers)
 
     def stokes(self, result: RenderResult, camera: Camera) -> None:
         """It predicts an angle of polarization, and no Stokes vector."""

@@ -29,7 +29,8 @@ def drawn(monkeypatch, tmp_path: Path, scene, *, layers=True):
     for view in scene.views:
         result, stokes, _ = rendered(known_scene().views[0] if view.ground_truth is None else view, 5)
         if not layers:
-            result.specular = result.diffuse = stokes = None
+            stokes = None
+            del result.layers["specular"], result.layers["diffuse"]
         sheet.add(view, ViewTarget.of_view(view, facts, CPU), result, stokes)
     sheet.write(tmp_path / "errors.png")
     return seen

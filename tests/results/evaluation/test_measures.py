@@ -153,7 +153,7 @@ def test_depth_beyond_counts_what_is_drawn_from_behind_the_surface():
     factor[3:5] = 1.2499
     factor[7:9] = 1.2501
     factor[:, 3] = 0.0  # nothing covers these
-    result.depth = factor * true
+    result.layers["depth"] = factor * true
     smooth = without_jumps(true) & ~VIEW.invalid
     counted = [float(factor[p]) > 1.25 or float(factor[p]) == 0.0 for p in PIXELS if smooth[p]]
     assert 0 < sum(counted) < len(counted)

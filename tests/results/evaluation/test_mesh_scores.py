@@ -168,7 +168,8 @@ def sphere_result(camera: Camera, radius: float = 1.0) -> RenderResult:
     )
     alpha, zero = (depth > 0).float(), torch.zeros(*depth.shape, 3)
     normal = torch.where((depth > 0)[..., None], points, torch.zeros(()).double()).float()
-    return RenderResult(zero, zero, zero, zero, None, None, normal, depth.float(), alpha)
+    lobes = dict.fromkeys(("final", "base", "specular", "diffuse"), zero)
+    return RenderResult({**lobes, "normal": normal, "depth": depth.float(), "alpha": alpha})
 
 
 def test_the_mesh_of_a_run_is_scored() -> None:
@@ -185,7 +186,7 @@ def test_nothing_to_compare_or_to_fuse(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def nothing(camera: Camera) -> RenderResult:
         seen = sphere_result(camera)
-        return dataclasses.replace(seen, alpha=0 * seen.alpha)
+        return seen.with_layers(alpha=0 * seen.alpha)
 
     assert measured.mesh_scores(fused(nothing), views()) == dict.fromkeys(KEYS, 0.0)
 

@@ -11,6 +11,7 @@ from faults import Fault
 from polarguide.results.evaluation import metrics, record, scores, table
 from polarguide.results.evaluation.table import HIGHEST_PSNR, VIEW_METRICS
 from polarguide.results.evaluation.target import ViewTarget
+from polarguide.shading.result import RenderResult
 
 VIEW_KEYS = {metric.key for metric in VIEW_METRICS}
 AGAINST_GROUND_TRUTH = (
@@ -55,11 +56,13 @@ def scene(seed=0, height=36, width=40):
 
 
 def rendering(photograph, ground_truth):
-    return SimpleNamespace(
-        final=photograph * 0.9,
-        normal=ground_truth.normal * 0.3 + 0.02,
-        specular=ground_truth.specular * 0.4,
-        diffuse=ground_truth.diffuse * 0.5,
+    return RenderResult(
+        {
+            "final": photograph * 0.9,
+            "normal": ground_truth.normal * 0.3 + 0.02,
+            "specular": ground_truth.specular * 0.4,
+            "diffuse": ground_truth.diffuse * 0.5,
+        }
     )
 
 
@@ -99,16 +102,14 @@ def test_invalid_pixels_count_in_no_score():
     invalid[8:20, 12:22] = True
     before = score(photograph, invalid, ground_truth, rendered)
     assert before != score(photograph, None, ground_truth, rendered)
-    spoiled = SimpleNamespace(
-        **{k: torch.where(invalid[..., None], 0.3, v) for k, v in vars(rendered).items()}
-    )
+    spoiled = RenderResult({k: torch.where(invalid[..., None], 0.3, v) for k, v in rendered.layers.items()})
     photograph = torch.where(invalid[..., None], 1.0, photograph)
     assert score(photograph, invalid, ground_truth, spoiled) == before
 
 
 def test_what_is_missing_is_none():
     photograph, ground_truth = scene()
-    plain = SimpleNamespace(final=photograph * 0.9, normal=None, specular=None, diffuse=None)
+    plain = RenderResult({"final": photograph * 0.9})
     without_ground_truth = score(photograph, None, None, plain)
     assert without_ground_truth["psnr"] is not None
     for key in AGAINST_GROUND_TRUTH:
@@ -159,7 +160,7 @@ def test_summary_is_the_plain_mean_of_what_is_there():
 def views():
     photograph, ground_truth = scene()
     perfect = rendering(photograph, ground_truth)
-    perfect.final = photograph
+    perfect.layers["final"] = photograph
     return {
         "v1": score(photograph, None, ground_truth, rendering(photograph, ground_truth)),
         "v2": score(photograph, None, ground_truth, perfect),

@@ -89,9 +89,10 @@ def errors(scene, *, layers=True, metal=None):
     for view, seed in zip(scene.views, SEEDS, strict=True):
         result, stokes, _ = rendered(view, seed)
         if not layers:
-            result.specular = result.diffuse = stokes = None
+            stokes = None
+            del result.layers["specular"], result.layers["diffuse"]
         if metal is not None:
-            result.metalness = metal(view)
+            result.layers["metalness"] = metal(view)
         score_view(ViewTarget.of_view(view, facts, CPU), result, stokes=stokes, by_object=pool)
     return pool.records()
 

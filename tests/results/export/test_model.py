@@ -17,7 +17,6 @@ import torch
 from faults import Fault
 from random_runs import ring
 from scipy.ndimage import maximum_filter, minimum_filter
-from torch import Tensor
 
 from polarguide.capture.presentation import Crop, Presentation
 from polarguide.core.errors import install_package, require_package
@@ -31,7 +30,7 @@ from polarguide.results.export.model.build import charted_subject, require_room,
 from polarguide.results.export.model.gltf import Textured, color_pixels, write_glb
 from polarguide.results.export.model.irradiance import Surroundings, arriving_light, irradiance
 from polarguide.results.export.model.obj import write_obj
-from polarguide.results.export.model.texels import texels_of
+from polarguide.results.export.model.texels import rasterized_texels
 from polarguide.results.export.model.topology import Topology, cleaned, topology
 from polarguide.results.export.model.unwrap import Unwrapped, unwrap
 from polarguide.results.export.placement import IN_PLACE
@@ -117,7 +116,7 @@ def test_texels_interpolate_and_textures_are_filled_to_their_end() -> None:
     """A square of two triangles in the middle of a texture: texel centers at half texels, the first row at v = 0."""
     uv = np.array([[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]])
     square = Unwrapped(np.arange(4), np.array([[0, 1, 2], [0, 2, 3]]), uv, 1)
-    texels = texels_of(square, 64)
+    texels = rasterized_texels(square, 64)
     assert len(texels.index) == 32 * 32
     row, column = np.divmod(texels.index, 64)
     expected = np.stack([column + 0.5, row + 0.5], axis=1) / 64
@@ -125,7 +124,7 @@ def test_texels_interpolate_and_textures_are_filled_to_their_end() -> None:
     picture = texels.texture(expected)
     np.testing.assert_allclose(picture[0, 0], [16.5 / 64] * 2, atol=1e-6)
     np.testing.assert_allclose(picture[40, 63], [47.5 / 64, 40.5 / 64], atol=1e-6)
-    Fault(where="texture", found="none").raised_by(texels_of, replace(square, uv=0.001 * uv), 64)
+    Fault(where="texture", found="none").raised_by(rasterized_texels, replace(square, uv=0.001 * uv), 64)
 
 
 def test_charts_keep_their_distance(tmp_path: Path) -> None:
@@ -135,7 +134,7 @@ def test_charts_keep_their_distance(tmp_path: Path) -> None:
     unwrapped = unwrap(np.array(ball.vertices), faces, 2048, tmp_path, SILENT)
     assert unwrapped.charts > 1
     np.testing.assert_array_equal(unwrapped.source[unwrapped.faces], faces)
-    texels = texels_of(unwrapped, 2048)
+    texels = rasterized_texels(unwrapped, 2048)
     mesh = trimesh.Trimesh(unwrapped.uv, unwrapped.faces, process=False)
     chart = np.zeros(len(unwrapped.faces), int)
     for number, part in enumerate(trimesh.graph.connected_components(mesh.face_adjacency)):
@@ -237,9 +236,10 @@ def ball_view(camera: Camera, mirrored: float = 1.0) -> RenderResult:
     picture, alpha = diffuse.float(), hit.float()
     normal = torch.where(hit[..., None], points, 0.0).float()
     specular = 0.2 * alpha[..., None].expand_as(picture)
-    result = RenderResult(picture + specular, specular, picture, picture, 5 * mirrored * specular, 0.5 * alpha, normal,
-                          depth, alpha, Tensor())  # fmt: skip
-    return replace(result, roughness=0.3 * alpha)
+    lobes = {"final": picture + specular, "specular": specular, "diffuse": picture, "base": picture}
+    surface = {"normal": normal, "depth": depth, "alpha": alpha}
+    shaded = {"reflection": 5 * mirrored * specular, "strength": 0.5 * alpha, "roughness": 0.3 * alpha}
+    return RenderResult({**lobes, **surface, **shaded})
 
 
 def ball_run(light: float = 1.0) -> Any:
@@ -330,8 +330,8 @@ def test_light_that_gaussians_add_is_folded_in() -> None:
     cubemap = run.model.shading.radiance_cubemap
     run.light["texels"] = torch.full((6, 4, 4, 3), math.log(0.2))
     found = [cubemap.radiance(mirrored_light(run, cubemap, lambda *_: None))]
-    run.result = lambda camera: replace(
-        ball_view(camera), specular=torch.zeros(camera.height, camera.width, 3)
+    run.result = lambda camera: ball_view(camera).with_layers(
+        specular=torch.zeros(camera.height, camera.width, 3)
     )
     found.append(cubemap.radiance(mirrored_light(run, cubemap, lambda *_: None)))
     for values, expected in zip(found, (3.0, 0.2), strict=True):

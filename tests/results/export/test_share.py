@@ -16,10 +16,12 @@ from random_runs import KINDS, random_state, ring
 from polarguide.capture.presentation import Presentation
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.results.export import web_page
+from polarguide.results.export.adapters import page_shading
 from polarguide.results.export.share import BAKED, baked_page, harmonics_steps, records, share_page
 from polarguide.runs.model import gaussian_colors
 from polarguide.shading.deferred import DeferredShading
-from polarguide.shading.model import PLAIN
+from polarguide.shading.model import PLAIN, Light, Parameters
+from polarguide.shading.result import RenderResult
 
 REFLECTING = ["final", "diffuse", "specular", "base", "strength", "normal"]
 LAYERS = {
@@ -117,8 +119,10 @@ def test_each_kind_of_shading_has_its_data(recipe: str) -> None:
 class Unknown(DeferredShading):
     """A model that the page has no shaders for."""
 
-    def page(self, gaussians, light):
-        return None
+
+@page_shading.register
+def _(shading: Unknown, gaussians: Parameters, light: Light) -> None:
+    """None: colors are baked."""
 
 
 def test_a_model_without_shaders_is_baked_and_says_so() -> None:
@@ -175,9 +179,9 @@ def test_it_begins_at_the_best_view_and_brightens_dark_gloss() -> None:
     assert web_page._best_view(views, None, None).name == "a"
     alpha = torch.ones(10, 10)
     for brightest, times in ((0.2, 4.0), (1.5, 1.0), (1e-4, 16.0)):
-        result = SimpleNamespace(specular=torch.full((10, 10, 3), brightest), alpha=alpha)
+        result = RenderResult({"specular": torch.full((10, 10, 3), brightest), "alpha": alpha})
         assert web_page._gloss(result) == times
-    assert web_page._gloss(SimpleNamespace(specular=None, alpha=alpha)) == 1.0
+    assert web_page._gloss(RenderResult({"alpha": alpha})) == 1.0
 
 
 def test_the_same_run_gives_the_same_page() -> None:
@@ -187,7 +191,7 @@ def test_the_same_run_gives_the_same_page() -> None:
 @pytest.mark.parametrize("recipe", KINDS)
 def test_records_are_close_to_what_they_stand_for(recipe: str) -> None:
     state, shading = random_state(recipe)
-    page = shading.page(state.gaussians, state.light)
+    page = page_shading(shading, state.gaussians, state.light)
     assert page.kind == KINDS[recipe]
     data = records(state.gaussians, page.values)
     seen = torch.sigmoid(state.gaussians["opacity_logits"].detach()) >= 1 / 255

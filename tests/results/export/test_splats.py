@@ -23,6 +23,7 @@ from polarguide.gaussians.ply import read_ply, write_ply
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.raster import Splats
 from polarguide.raster.cpu import rasterize_cpu
+from polarguide.results.export.adapters import ply_fields
 from polarguide.results.export.placement import (
     IN_PLACE,
     Origin,
@@ -47,11 +48,11 @@ def test_the_file_holds_display_colors_and_the_fields_of_the_model(name: str, tm
     state, shading = random_state(name, COUNT)
     write_run_ply(tmp_path / "run.ply", state, shading)
     assert read_ply(tmp_path / "run.ply")["extra"] == {}
-    write_run_ply(tmp_path / "run.ply", state, shading, own_fields=True)
+    write_run_ply(tmp_path / "run.ply", state, shading, own_fields=ply_fields(shading, state.gaussians))
     read = read_ply(tmp_path / "run.ply")
     assert set(read["extra"]) == FIELDS[name]
     assert all(bool(torch.isfinite(t).all()) for t in (read["sh_dc"], read["sh_rest"]))
-    for field, values in shading.fields(state.gaussians).items():
+    for field, values in ply_fields(shading, state.gaussians).items():
         torch.testing.assert_close(read["extra"][field], values.detach())
 
 
@@ -273,7 +274,7 @@ def picture(ply: Path, camera, field: str = "") -> torch.Tensor:  # type: ignore
 def test_the_same_picture_from_the_same_place(presentation: Presentation, tmp_path: Path) -> None:
     state, shading = random_state("polarguide-stokes")
     whole, moved, placement = tmp_path / "whole.ply", tmp_path / "moved.ply", placed(presentation)
-    write_run_ply(whole, state, shading, own_fields=True)
+    write_run_ply(whole, state, shading, own_fields=ply_fields(shading, state.gaussians))
     rewrite_splats(moved, whole, placement, None, [])
     camera = CAMERAS["v2"]
     for field in ("", "linear"):

@@ -13,7 +13,6 @@ import torch
 from faults import Fault
 from glb_files import read_glb
 from random_runs import ring
-from torch import Tensor
 
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.camera import Camera
@@ -156,7 +155,8 @@ def sphere(camera: Camera) -> RenderResult:
     alpha, zero = hit.float(), torch.zeros(*hit.shape, 3)
     normal = torch.where(hit[..., None], points, torch.zeros(()).double()).float()
     base = alpha[..., None] * COLOR
-    return RenderResult(base, zero, base, base, None, None, normal, depth.float(), alpha, Tensor())
+    lobes = {"final": base, "base": base, "diffuse": base, "specular": zero}
+    return RenderResult({**lobes, "normal": normal, "depth": depth.float(), "alpha": alpha})
 
 
 def test_seen_points_lie_on_the_sphere() -> None:
@@ -207,9 +207,7 @@ def test_a_mesh_of_the_sphere(tmp_path) -> None:  # type: ignore[no-untyped-def]
 def test_nothing_to_see_is_said() -> None:
     def nothing(camera: Camera) -> RenderResult:
         seen = sphere(camera)
-        return RenderResult(
-            *(getattr(seen, f) if f != "alpha" else 0 * seen.alpha for f in seen.__dataclass_fields__)
-        )
+        return seen.with_layers(alpha=0 * seen.alpha)
 
     Fault(expected="surfaces", found="none").raised_by(scene_mesh, CAMERAS, nothing, resolution=32)
 

@@ -7,7 +7,6 @@ import platform
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -88,11 +87,11 @@ class ErrorSheet:
             "final": _difference(result.final, target.photograph, target.valid),
         }
         for name in ("specular", "diffuse"):
-            layer = getattr(result, name)
+            layer = result.layers.get(name)
             lobe = getattr(target, name)
             if layer is not None and lobe is not None and target.foreground is not None:
                 pictures[name] = _difference(layer, lobe / 2, target.foreground)
-        if result.normal is not None and target.normal is not None and target.surface is not None:
+        if "normal" in result.layers and target.normal is not None and target.surface is not None:
             angles = normal_angles_deg(result.normal.nan_to_num(), target.normal)
             pictures["normal"] = _heat(angles, target.surface.mask, NORMAL_HIGH)
         keep = target.valid if target.polarized is None else target.polarized
@@ -350,7 +349,7 @@ def _score(
     result = run.model.render(view.camera, depth=True, surface=True)
     stokes = run.model.stokes(result, view.camera)
     if not view.measures_radiance:
-        result = replace(result, final=cross_fitted(view, result.final, stokes))
+        result = result.with_layers(final=cross_fitted(view, result.final, stokes))
     in_front = None
     if target.depth is not None:
         in_front = run.model.alpha_in_front(view.camera, HAZE_DEPTH * target.depth)

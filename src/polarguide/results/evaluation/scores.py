@@ -15,6 +15,7 @@ from polarguide.results.evaluation.metrics import LEAST_POLARIZED, Selection, de
 from polarguide.results.evaluation.perceptual import flip, lpips
 from polarguide.results.evaluation.table import HIGHEST_PSNR, OBJECT_METRICS, VIEW_METRICS, Layers
 from polarguide.results.evaluation.target import ViewTarget
+from polarguide.shading.result import RenderResult
 
 HALF = 0.5
 """Share of metals from which on a pixel counts as one."""
@@ -148,7 +149,7 @@ as 90 degrees off.
 
 def score_view(
     target: ViewTarget,
-    rendered: Any,
+    rendered: RenderResult,
     *,
     stokes: Tensor | None = None,
     in_front: Tensor | None = None,
@@ -160,9 +161,7 @@ def score_view(
 
     Args:
         target: what it is compared with, on the same device.
-        rendered: an object with ``final`` [H, W, 3] linear, and, each None where the recipe has no such
-            layer, ``normal`` [H, W, 3] world of any length, ``specular`` and ``diffuse`` [H, W, 3] linear
-            contributions to the final picture; ``depth``, ``alpha`` and ``metalness`` [H, W] may be missing.
+        rendered: the rendering; layers that it does not have are not scored.
         stokes: [3, H, W, 3] predicted Stokes vectors on the scale where the picture is S0/2; None: no prediction.
         in_front: [H, W] share of the weight before ``HAZE_DEPTH`` times the true depth; None: not measured.
         by_object: gets the view's errors added.
@@ -173,8 +172,8 @@ def score_view(
     Raises:
         ValueError: shapes that do not fit.
     """
-    layers = {name: _plain(getattr(rendered, name)) for name in ("final", "normal", "specular", "diffuse")}
-    layers |= {name: _plain(getattr(rendered, name, None)) for name in ("depth", "alpha", "metalness")}
+    names = ("final", "normal", "specular", "diffuse", "depth", "alpha", "metalness")
+    layers = {name: _plain(rendered.layers.get(name)) for name in names}
     layers["polarization"] = None if stokes is None else _plain(stokes[1:].movedim(0, 2).flatten(2))
     layers["in_front"] = _plain(in_front)
     broken = torch.zeros_like(target.valid.mask)

@@ -32,6 +32,7 @@ from polarguide.core.options import (
 )
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.optics.color import srgb_encode
+from polarguide.results.export.adapters import ply_fields
 from polarguide.results.export.cameras import write_cameras
 from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
 from polarguide.results.export.model.build import BASE_COLORS, Charted, charted_subject, textured_model
@@ -161,7 +162,7 @@ def _ply(
             presented.centers,
             color=color,
             linear=linear,
-            own_fields=own_fields,
+            own_fields=ply_fields(model.shading, model.state.gaussians) if own_fields else {},
         )
         selected = None if presented.inside is None else presented.inside.cpu()
         rewrite_splats(path, whole, placement or presented.placement, selected, presented.comments)

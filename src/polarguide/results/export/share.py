@@ -17,14 +17,16 @@ from torch.nn.functional import normalize, pad
 
 from polarguide import __version__
 from polarguide.capture.presentation import STOPS, Presentation
+from polarguide.gaussians.gaussians import Parameters
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.trajectory import camera_record
 from polarguide.raster.interface import MINIMUM_ALPHA
+from polarguide.results.export.adapters import PageShading, page_shading
 from polarguide.runs.model import baked_harmonics
 from polarguide.shading.cubemap import ringed_texels
-from polarguide.shading.model import PLAIN_LAYERS, Light, PageShading, Parameters, ShadingModel
+from polarguide.shading.model import PLAIN_LAYERS, Light, ShadingModel
 from polarguide.visualization.figures import color_gradient
 from polarguide.visualization.pages import page, page_part
 
@@ -44,7 +46,7 @@ SLOTS = {
     "color": (32, "3<f2"),
     "axis": (38, "3<i2"),
     "side": (44, "<u2"),
-    "roughness": (46, "<u2"),
+    "blur": (46, "<u2"),
     "features": (48, "4<i2"),
     "harmonics": (48, "45i1"),
     "own_color": (96, "3<f2"),
@@ -62,7 +64,7 @@ texel content
 ===== ==================================================================================================
 0     mean 3 x float32; opacity u16; ``share`` u16 (strength, or the roughness of Ref-GS)
 1     rotation (w, x, y, z) 4 x i16; logarithms of the scales 3 x f16; scale of ``harmonics`` f16
-2     ``color`` of degree 0 (or albedo) 3 x f16; normal axis 3 x i16; ``side`` u16; ``roughness`` u16
+2     ``color`` of degree 0 (or albedo) 3 x f16; normal axis 3 x i16; ``side`` u16; ``blur`` u16
 3-5   ``harmonics`` of degrees 1 to 3, 45 signed bytes in steps of their scale; or ``features`` 4 x i16 in texel 3
 6-9   light of its own: ``own_color`` of degree 0 3 x f16, scale f16; then ``own_harmonics`` as above
 10    ``metal``: reflectance 3 x f16; 0 of what is not a metal
@@ -226,7 +228,7 @@ WORDS = {
     "roughness": Words("roughness", "how blurred mirror images are", "mirror", "matte"),
 }
 """By the names of the layers, for somebody who knows none of them."""
-_SHOWN_WITH = {"metalness": {"metal"}, "roughness": {"roughness"}}
+_SHOWN_WITH = {"metalness": {"metal"}, "roughness": {"blur"}}
 BAKED = (
     "This page has no shaders for the reflections of this model. Each Gaussian shows its color toward the eye, with "
     "reflections baked into spherical harmonics of degree 3, which keep broad highlights and no mirror images."
@@ -263,7 +265,7 @@ def share_page(
     Returns:
         HTML that asks for nothing from outside; its own policy forbids it to.
     """
-    shaded = shading.page(gaussians, light)
+    shaded = page_shading(shading, gaussians, light)
     layers: Sequence[str] = shading.layers
     if shaded is None:
         shaded = baked_page(gaussians, light, shading)

@@ -97,8 +97,8 @@ MOST_GLOSS = 16.0
 
 def _gloss(result: RenderResult) -> float:
     """Times, in whole stops, that the specular layer can be brighter before 1 % of what it shows clips."""
-    if result.specular is None:
+    if "specular" not in result.layers:
         return 1.0
-    brightest = result.specular.amax(dim=-1)[result.alpha > 0.5].flatten()
+    brightest = result.layers["specular"].amax(dim=-1)[result.alpha > 0.5].flatten()
     limit = float(brightest.quantile(0.99)) if brightest.numel() else 1.0
     return 2.0 ** math.floor(math.log2(min(max(1.0 / max(limit, 1e-6), 1.0), MOST_GLOSS)))

@@ -254,11 +254,9 @@ class DepthSamples:
 
 
 def _depth_samples(result: RenderResult, camera: Camera) -> DepthSamples:
-    assert result.depth is not None
-    assert result.normal is not None
     normal = unit(result.normal, 1e-3)
     cosine = -dot(camera.world_rays(), normal)
-    diffuse = result.base if result.diffuse is None else result.diffuse
+    diffuse = result.layers.get("diffuse", result.base)
     return DepthSamples(
         result.depth, (result.alpha > OPAQUE) & (cosine > _STEEPEST), diffuse.half(), normal.half()
     )

@@ -47,7 +47,6 @@ def surface_at(result: RenderResult, camera: Camera, x: float, y: float) -> Surf
     """
     if not (0 <= x < camera.width and 0 <= y < camera.height):
         return None
-    assert result.depth is not None
     column = int(x)
     row = int(y)
     depth = float(result.depth[row, column])
@@ -56,7 +55,7 @@ def surface_at(result: RenderResult, camera: Camera, x: float, y: float) -> Surf
     local = torch.tensor([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0], dtype=torch.float64)
     ray = camera.rotation.T @ local
     normal: Tensor | None = None
-    if result.normal is not None:
+    if "normal" in result.layers:
         blended = _patch(result.normal, row, column).double().mean(dim=(0, 1))
         if float(blended.norm()) > 0.1:
             normal = unit(blended, 1e-9)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -144,7 +143,7 @@ def write_pictures(
                 elif format == "png":
                     figures.write_png(folder / f"{view.name}_{name}.png", picture, about=about)
                 else:
-                    _write_numbers(folder / f"{view.name}_{name}.{format}", getattr(result, name))
+                    _write_numbers(folder / f"{view.name}_{name}.{format}", result.layers[name])
             if len(rows) < SHEET_VIEWS:
                 cells = {name: picture for name, picture in pictures.items() if picture is not None}
                 rows.append((view.name, cells | reference_pictures(view, color, depths)))
@@ -177,7 +176,6 @@ def rendered_depths(run: OpenedRun, cameras: Sequence[Camera], within: Within | 
     values = []
     for camera in cameras[:: max(1, len(cameras) // 4)]:
         result = run.result(camera, within=within)
-        assert result.depth is not None
         values.append(result.depth[result.alpha > 0.5].flatten().cpu())
     joined = torch.cat(values)
     return depth_range(joined, joined > 0)
@@ -210,8 +208,8 @@ def _is_even(picture: Picture) -> bool:
 def _unblended(result: RenderResult) -> RenderResult:
     """Layers of radiance as of what is there alone: over alpha, where anything is."""
     alpha = result.alpha.clamp(min=1e-3)[..., None]
-    layers = {name: getattr(result, name) for name in ("final", "base", "specular", "diffuse")}
-    return replace(result, **{name: t / alpha for name, t in layers.items() if t is not None})
+    names = {"final", "base", "specular", "diffuse"} & result.layers.keys()
+    return result.with_layers(**{name: result.layers[name] / alpha for name in names})
 
 
 def _write_numbers(path: Path, values: Tensor) -> None:

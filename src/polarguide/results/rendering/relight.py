@@ -61,8 +61,8 @@ def relight(
         texels = texels_of(picture, cubemap, around, RELIT_RESOLUTION)
         light[cubemap.name] = texels.to(light[cubemap.name].device)
     light[cubemap.name] = turned_cubemap(light[cubemap.name].detach(), around.turn(degrees), RELIT_RESOLUTION)
-    if run.model.shading.local_note:
-        reporter.say(f"note: {run.model.shading.local_note}")
+    if cubemap.note:
+        reporter.say(f"note: {cubemap.note}")
 
 
 def needs_radiance(shading: ShadingModel, *, what: str) -> RadianceCubemap:
@@ -96,11 +96,12 @@ def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -
     views = run.scene.train_views
     for count, view in enumerate(views, 1):
         result = run.result(view.camera).to("cpu")
-        assert result.specular is not None
-        assert result.reflection is not None
-        assert result.normal is not None
-        light = result.reflection
-        share = (result.specular.sum(-1) / light.sum(-1).clamp(min=1e-6)).clamp(0, 1)[..., None].square()
+        light = result.layers["reflection"]
+        share = (
+            (result.layers["specular"].sum(-1) / light.sum(-1).clamp(min=1e-6))
+            .clamp(0, 1)[..., None]
+            .square()
+        )
         directions = mirrored(view.camera.world_rays(), unit(result.normal, 1e-3)).reshape(-1, 3)
         with torch.enable_grad():
             # The gradient of a look-up shares each pixel among the texels that it would read.

@@ -15,11 +15,11 @@ from polarguide import optics
 from polarguide._native import MAX_CHANNELS
 from polarguide.capture import View
 from polarguide.core.system import UNBOUNDED, MemoryBound
+from polarguide.gaussians.gaussians import any_nonzero
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import RenderRequest, render, splats
-from polarguide.shading.metal import any_nonzero
 from polarguide.shading.model import Parameters
 from polarguide.training.priors import guide_normals
 from polarguide.training.rules import MetalViews
@@ -69,7 +69,6 @@ def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal:
     """Sums [N, 11] over a view's pixels: 1, S0, P, the polarization at 45 degrees to it and the cosine."""
     device = gaussians["means"].device
     normal = render(gaussians, view.camera, rasterize, RenderRequest(sh_degree=0)).normal
-    assert normal is not None
     view = view.to(device)
     rays = view.camera.rays(device=device)
     guide, reliable = guide_normals(view.camera.to_camera(normal), rays, least_normal)
@@ -108,7 +107,7 @@ def blended(gaussians: Parameters, values: Tensor, camera: Camera, rasterize: Ra
 def metalness_share(gaussians: Parameters, camera: Camera, rasterize: Rasterize) -> Tensor | None:
     """Blended metalness [H, W]; None where no Gaussian is a metal, or none can be."""
     metalness = gaussians.get("metalness")
-    if metalness is None or not any_nonzero(metalness):
+    if metalness is None or not any_nonzero(gaussians, "metalness"):
         return None
     return blended(gaussians, metalness, camera, rasterize)
 
@@ -224,6 +223,6 @@ def index_picture(
 ) -> Tensor | None:
     """Refractive indices [H, W] as blended; None where all Gaussians have the run's."""
     offsets = gaussians.get("index_offset")
-    if offsets is None or not any_nonzero(offsets):
+    if offsets is None or not any_nonzero(gaussians, "index_offset"):
         return None
     return refractive_index + blended(gaussians, offsets, camera, rasterize)

@@ -15,6 +15,7 @@ from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.initialize import far_away
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import render
+from polarguide.shading.metal import become_metal
 from polarguide.shading.model import Light, ShadingModel
 from polarguide.training.context import TrainingContext
 from polarguide.training.metals.cut import decide
@@ -110,7 +111,9 @@ class MetalSearch:
         gain = partial(
             light_gain, gaussians, state.light, determined, rasterize, context.shading, limits, context.memory
         )
-        context.shading.become_metal(gaussians, state.light, metal, reflectance, gain)
+        cubemap = context.shading.radiance_cubemap
+        if cubemap is not None:
+            become_metal(gaussians, state.light[cubemap.name], cubemap.radiance, metal, reflectance, gain)
         del measured
         context.memory.clear()
 
@@ -206,7 +209,7 @@ def warn_of_unused_materials(context: TrainingContext) -> None:
     indices = context.scene.indices
     if not indices:
         return
-    if not (recipe.shading.knows_indices and refreshed):
+    if not ("index_offset" in recipe.shading.parameters and refreshed):
         why = f"the recipe {recipe.name} takes the run's for everything"
     elif not any(numbers_in(view) & indices.keys() for view in views):
         why = "no picture in materials/ of a training view has one of their numbers"
@@ -218,7 +221,7 @@ def warn_of_unused_materials(context: TrainingContext) -> None:
 
 
 def _searches(recipe: Recipe, settings: ResolvedSettings) -> bool:
-    return recipe.shading.knows_metals and settings.materials == "auto"
+    return "metalness" in recipe.shading.parameters and settings.materials == "auto"
 
 
 def _within(shares: tuple[float, float], step: int, steps: int) -> bool:

@@ -19,6 +19,7 @@ from torch.nn.functional import grid_sample, max_pool2d
 
 from polarguide.capture import View
 from polarguide.core.progress import Reporter
+from polarguide.gaussians.gaussians import any_nonzero
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
 from polarguide.raster.surface import WIDTH
@@ -26,8 +27,9 @@ from polarguide.results.rendering.mesh import OPAQUE
 from polarguide.runs.model import GaussianModel
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.gbuffer import splats
-from polarguide.shading.metal import any_nonzero, metal_channels, reflectance
+from polarguide.shading.metal import metal_channels, reflectance
 from polarguide.shading.result import RenderResult
+from polarguide.shading.surface import GltfTexture
 
 ColorSource = Literal["diffuse", "final", "photograph"]
 STEEPEST = 0.15
@@ -50,6 +52,7 @@ class Baked:
         reflectance: [M, 3] of metals at normal incidence. index: [M] refractive index.
         normal: [M, 3] learned, not unit. seen: [M] bool, whether a view shows the texel.
         nearest: [U] for each of the others the nearest texel in space that one does, whose values it has.
+        added: [M, C] values in [0, 1] of surface properties with a texture of their own.
     """
 
     color: NDArray[np.float32]
@@ -61,6 +64,7 @@ class Baked:
     normal: NDArray[np.float32]
     seen: NDArray[np.bool_]
     nearest: NDArray[np.int64]
+    added: Sequence[tuple[GltfTexture, NDArray[np.float32]]] = ()
 
     def filled(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Values [M, C] with those of unseen texels replaced."""
@@ -78,6 +82,7 @@ CHANNELS = {
     "index": 1,
     "normal": 3,
 }
+"""Numbers of values of a texel. ``surface.SurfaceProperty`` rows with a texture follow."""
 CONSTANTS = {"roughness": 1.0, "metalness": 0.0, "strength": 0.0}
 """Of recipes that learn nothing of the kind: a matte dielectric."""
 
@@ -102,12 +107,16 @@ def bake(
     model = run.model
     points = torch.from_numpy(places)
     facing = torch.from_numpy(normals)
-    total = torch.zeros(len(points), sum(CHANNELS.values()))
+    added = [row for row in model.shading.surface if row.gltf is not None]
+    channels = {**CHANNELS, **{row.name: row.channels for row in added}}
+    total = torch.zeros(len(points), sum(channels.values()))
     weights = torch.zeros(len(points))
     with reporter.track("baking textures", len(views)) as progress:
         for count, view in enumerate(views, 1):
             result = run.result(view.camera).to("cpu")
-            picture = torch.cat([*_layers(model, result, view, color).values()], dim=-1)
+            layers = _layers(model, result, view, color)
+            layers |= {row.name: result.layers[row.name].view(*result.alpha.shape, -1) for row in added}
+            picture = torch.cat([*layers.values()], dim=-1)
             depth = _reliable_depth(result, view if color == "photograph" else None)
             for begin in range(0, len(points), _TOGETHER):
                 part = slice(begin, begin + _TOGETHER)
@@ -121,11 +130,10 @@ def bake(
     total /= weights.clamp(min=1e-6)[:, None]
     values = total.numpy()
     values[~visible] = values[nearest]
-    parts = np.split(values, np.cumsum([*CHANNELS.values()])[:-1], axis=1)
-    named = {
-        name: part if CHANNELS[name] == 3 else part[:, 0] for name, part in zip(CHANNELS, parts, strict=True)
-    }
-    return Baked(**named, seen=visible, nearest=nearest)
+    parts = dict(zip(channels, np.split(values, np.cumsum([*channels.values()])[:-1], axis=1), strict=True))
+    named = {name: parts[name] if CHANNELS[name] == 3 else parts[name][:, 0] for name in CHANNELS}
+    textures = [(row.gltf, parts[row.name]) for row in added if row.gltf is not None]
+    return Baked(**named, added=textures, seen=visible, nearest=nearest)
 
 
 def _layers(model: GaussianModel, result: RenderResult, view: View, color: ColorSource) -> dict[str, Tensor]:
@@ -137,16 +145,15 @@ def _layers(model: GaussianModel, result: RenderResult, view: View, color: Color
     elif color == "final":
         colors = result.final / alpha
     else:
-        colors = (result.base if result.diffuse is None else result.diffuse) / alpha
+        colors = result.layers.get("diffuse", result.base) / alpha
     layers = {"color": colors}
     for name, constant in CONSTANTS.items():
-        values = getattr(result, name)
+        values = result.layers.get(name)
         layers[name] = torch.full((*size, 1), constant) if values is None else values[..., None]
     layers["strength"] = (layers["strength"] / alpha).clamp(max=1)
     layers["reflectance"] = _reflectance(model, view.camera)
-    index = torch.full(size, model.shading.refractive_index) if result.index is None else result.index
+    index = result.layers.get("index", torch.full(size, model.shading.refractive_index))
     layers["index"] = index[..., None]
-    assert result.normal is not None
     layers["normal"] = result.normal
     return layers
 
@@ -154,7 +161,7 @@ def _layers(model: GaussianModel, result: RenderResult, view: View, color: Color
 def _reflectance(model: GaussianModel, camera: Camera) -> Tensor:
     """Reflectance [H, W, 3] of metals at normal incidence; 0 where there are none."""
     gaussians = model.state.gaussians
-    if not model.shading.knows_metals or not any_nonzero(gaussians["metalness"]):
+    if not any_nonzero(gaussians, "metalness"):
         return torch.zeros(camera.height, camera.width, 3)
     own = metal_channels(gaussians["metalness"], reflectance(gaussians["reflectance_logits"]))
     picture = model.backend.rasterize(splats(gaussians, own), camera).features.cpu()
@@ -164,7 +171,6 @@ def _reflectance(model: GaussianModel, camera: Camera) -> Tensor:
 def _reliable_depth(result: RenderResult, view: View | None) -> Tensor:
     """Depth [H, W] of the surface; 0 where a pixel is translucent, on the outline of something, or, of photographs,
     invalid."""
-    assert result.depth is not None
     depth = result.depth
     far = max_pool2d(depth[None, None], 3, 1, 1)[0, 0]
     near = -max_pool2d(-depth[None, None], 3, 1, 1)[0, 0]

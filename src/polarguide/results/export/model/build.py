@@ -19,7 +19,7 @@ from polarguide.results.export.model.bake import Baked, ColorSource, bake
 from polarguide.results.export.model.gltf import Textured, color_pixels, linear_pixels
 from polarguide.results.export.model.irradiance import WHAT, Surroundings, arriving_light, delit, irradiance
 from polarguide.results.export.model.subject import SurfaceView, subject_surface
-from polarguide.results.export.model.texels import Texels, texels_of
+from polarguide.results.export.model.texels import Texels, rasterized_texels
 from polarguide.results.export.model.unwrap import Unwrapped, unwrap
 from polarguide.results.export.placement import Placement
 from polarguide.results.rendering.mesh import ColoredMesh, Surface, fused_surface, painted
@@ -116,7 +116,7 @@ def charted_subject(
         surface, views, box = subject_surface(run, surface_view, inside, options, resolution, reporter)
         mesh = painted(surface, views, box)
     unwrapped = unwrap(mesh.surface.vertices, mesh.surface.faces, options.texture, folder, reporter)
-    return Charted(mesh, inside, box.size, unwrapped, texels_of(unwrapped, options.texture))
+    return Charted(mesh, inside, box.size, unwrapped, rasterized_texels(unwrapped, options.texture))
 
 
 def textured_model(
@@ -153,6 +153,10 @@ def textured_model(
     color, baked = _presented(baked, light, presentation.color, _index(run), reporter)
     axes = run.frame.panorama_axes().numpy()
     textures = _textures(run, baked, texels, options.albedo_scale * color, lit=not options.unlit)
+    added = []
+    for place, values in [] if options.unlit else baked.added:
+        rgb = np.broadcast_to(values, (len(values), 3))
+        added.append((place, linear_pixels(texels.texture(rgb))))
     return Textured(
         placement.scale * vertices @ axes,
         _unit(normals @ axes),
@@ -160,6 +164,7 @@ def textured_model(
         _drawn(unwrapped),
         *textures,
         _index(run),
+        added,
     )
 
 

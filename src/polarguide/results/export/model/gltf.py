@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from polarguide.optics.color import srgb_encode_array
 from polarguide.results.export.glb import ELEMENTS, Binary
+from polarguide.shading.surface import GltfTexture
 
 QUALITY = 92
 """Of JPEG textures."""
@@ -28,6 +30,7 @@ class Textured:
         vertices, normals: [V, 3]. uv: [V, 2], v down from the first row. faces: [F, 3].
         base_color: [T, T, 3] sRGB. surface: [T, T, 3] roughness in green, metalness in blue; None: unlit.
         specular: [T, T] factor on a dielectric's reflection; None: 1. index: refractive index.
+        added: [T, T, 3] textures of added surface properties, which GLB files alone have.
     """
 
     vertices: NDArray[np.float64]
@@ -38,6 +41,7 @@ class Textured:
     surface: Pixels | None
     specular: Pixels | None
     index: float
+    added: Sequence[tuple[GltfTexture, Pixels]] = ()
 
 
 def color_pixels(linear: NDArray[np.float32]) -> Pixels:
@@ -105,4 +109,8 @@ def _material(model: Textured, *, jpeg: bool) -> tuple[list[tuple[str, bytes]], 
         extensions["KHR_materials_specular"] = {"specularTexture": {"index": len(images)}}
         white = np.full_like(model.base_color, 255)
         images.append(encoded(np.concatenate([white, model.specular[..., None]], axis=2), jpeg=False))
+    for place, pixels in model.added:
+        extension = extensions.setdefault(place.extension, {})
+        extension |= {**place.constants, place.texture: {"index": len(images)}}
+        images.append(encoded(pixels, jpeg=False))
     return images, {**material, "extensions": extensions}, [*extensions]

@@ -49,7 +49,7 @@ class Texels:
         return np.asarray(picture.reshape(self.size, self.size, -1)[row, column])
 
 
-def texels_of(mesh: Unwrapped, size: int) -> Texels:
+def rasterized_texels(mesh: Unwrapped, size: int) -> Texels:
     """Rasterize the triangles of a mesh in its texture of ``size`` x ``size`` texels.
 
     Raises:
