@@ -116,13 +116,12 @@ def workers(
         yield Workers(stack.enter_context(Client(cluster)), count, tuple(gpus))
 
 
-@contextlib.contextmanager
-def _connected(address: str) -> Iterator[Client]:
+def _connected(address: str) -> Client:
     """A client of a scheduler that runs already."""
     from distributed import Client
 
     try:
-        client = Client(address, timeout=CONNECT_SECONDS)
+        return Client(address, timeout=CONNECT_SECONDS)
     except (OSError, ValueError, TypeError, ImportError) as error:
         raise PolarguideError(
             "scheduler",
@@ -130,30 +129,25 @@ def _connected(address: str) -> Iterator[Client]:
             found=f"{address}: {str(error).splitlines()[0] if str(error) else type(error).__name__}",
             remedy="Start one (dask scheduler) and workers (dask worker ADDRESS --nthreads 1), or correct the address.",
         ) from None
-    with client:
-        yield client
 
 
-@contextlib.contextmanager
-def _queued(manager: str, count: int, threads: int, memory: int) -> Iterator[Any]:
+def _queued(manager: str, count: int, threads: int, memory: int) -> Any:
     """Workers as jobs of SLURM or PBS, replaced by others when they end.
 
     Queue, account, time and whatever else a site wants are read from dask's own configuration (jobqueue.yaml).
     """
     import dask
 
-    submit = {"slurm": "sbatch", "pbs": "qsub"}[manager]
+    of = f"jobqueue.{manager}"
+    submit, kind, extra = {
+        "slurm": ("sbatch", "SLURMCluster", {"job_cpu": threads}),
+        "pbs": ("qsub", "PBSCluster", {"resource_spec": f"select=1:ncpus={threads}:mem={_mib(memory)}MB"}),
+    }[manager]
     if shutil.which(submit) is None:
         raise _no_cluster(manager, f"no command {submit}")
     jobqueue = optional_import("dask_jobqueue", f"--{manager}")
-    of = f"jobqueue.{manager}"
-    extra: dict[str, dict[str, Any]] = {
-        "slurm": {"job_cpu": threads},
-        "pbs": {"resource_spec": f"select=1:ncpus={threads}:mem={_mib(memory)}MB"},
-    }
-    kind = {"slurm": "SLURMCluster", "pbs": "PBSCluster"}[manager]
     try:
-        cluster = getattr(jobqueue, kind)(
+        return getattr(jobqueue, kind)(
             n_workers=count,  # waits until the jobs are accepted
             cores=1,
             processes=1,
@@ -168,13 +162,11 @@ def _queued(manager: str, count: int, threads: int, memory: int) -> Iterator[Any
                 NOWHERE,
             ],
             silence_logs=logging.CRITICAL,
-            **extra[manager],
+            **extra,
         )
     except (OSError, ValueError, RuntimeError, AssertionError) as error:
         reasons = [line for line in str(error.__context__ or error).splitlines() if line.strip()]
         raise _no_cluster(manager, reasons[-1] if reasons else type(error).__name__) from None
-    with cluster:
-        yield cluster
 
 
 def _no_cluster(manager: str, found: str) -> PolarguideError:
