@@ -18,6 +18,7 @@ from polarguide.results.evaluation.record import code_digest
 from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide_bench.children import (
     POLL_SECONDS,
+    STDERR,
     Message,
     Outcome,
     Task,
@@ -154,6 +155,8 @@ def run_jobs(
                         waiting.appendleft(each.job)
                         continue
                     error = None if outcome.state == "done" else outcome.error
+                    if error is None:
+                        (each.job.folder / STDERR).unlink(missing_ok=True)
                     progress.end(each.job)
                     words = (
                         f"done  {each.job.label}" if error is None else f"failed  {each.job.label}: {error}"

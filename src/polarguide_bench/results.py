@@ -307,7 +307,7 @@ def cell_of(values: Sequence[float | None]) -> Cell:
     return Cell(fmean(numbers), spread, len(numbers)) if numbers else Cell()
 
 
-class Row(NamedTuple):
+class ScoreRow(NamedTuple):
     """One recipe on one scene (None: the mean over scenes), of ``finished`` runs; cells by metric."""
 
     scene: str | None
@@ -378,7 +378,7 @@ class Results:
         return differences(self.record, COMPARED)
 
     @cached_property
-    def table(self) -> list[Row]:
+    def table(self) -> list[ScoreRow]:
         """A row for every scene and recipe, and, with several scenes, one for the mean over scenes of every recipe.
 
         In that mean every scene has one weight, and a quantity is given only where the recipe has it on every scene on
@@ -394,7 +394,7 @@ class Results:
                     numbers = [v[index, :, 0] for s, v in of.items() if scene in (None, s)]
                     cells[key] = cell_of(known(numbers[0])) if scene and numbers else _over_scenes(numbers)
                 finished = len(scored) if scene is None else scored.count(scene)
-                rows.append(Row(scene, recipe, finished, cells))
+                rows.append(ScoreRow(scene, recipe, finished, cells))
         return rows
 
     def content(self) -> dict[str, Any]:

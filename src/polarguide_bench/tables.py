@@ -22,7 +22,7 @@ from polarguide_bench.record import RunRecord
 from polarguide_bench.results import (
     Cell,
     Results,
-    Row,
+    ScoreRow,
     Values,
     controlled,
     known,
@@ -81,9 +81,9 @@ class Section(NamedTuple):
     notes: list[str]
 
 
-def formatted(value: float, column: Metric) -> str:
-    """A recorded value as tables show it, without its unit."""
-    return f"{value * column.factor:,.{column.digits}f}"
+def formatted(value: float | None, column: Metric) -> str:
+    """A recorded value as tables show it, without its unit; empty for None."""
+    return "" if value is None else f"{value * column.factor:,.{column.digits}f}"
 
 
 def signed(value: float, column: Metric) -> str:
@@ -154,7 +154,7 @@ def leaders(
     return same_digits | {index for index, told in apart.items() if told is False}
 
 
-def score_cell(row: Row, column: Metric, bold: bool, results: Results) -> TableCell:
+def score_cell(row: ScoreRow, column: Metric, bold: bool, results: Results) -> TableCell:
     """The cell of a recipe's score on a scene."""
     cell: Cell = row.cells[column.key]
     if cell.mean is None:
@@ -171,7 +171,7 @@ def seed_counts(results: Results) -> list[int]:
     return sorted(set(Counter((run.scene, run.recipe) for run in results.record.runs).values()))
 
 
-def _remark(row: Row, results: Results) -> str:
+def _remark(row: ScoreRow, results: Results) -> str:
     """Its number of steps where that is not the others', and what is missing of it, else its seeds if rows differ."""
     (steps,) = (recipe.steps for recipe in results.record.recipes if recipe.name == row.recipe)
     states = [r.state for r in results.record.runs if r.recipe == row.recipe and row.scene in (None, r.scene)]
