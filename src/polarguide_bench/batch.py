@@ -39,12 +39,11 @@ from polarguide_bench.collection import (
     source_stamp,
 )
 from polarguide_bench.compare import locked
-from polarguide_bench.csv_files import csv_text
 from polarguide_bench.job_queue import Job, run_jobs, training_progress
 from polarguide_bench.options import BatchOptions
 from polarguide_bench.plan import jobs_at_a_time, own_gpus
 from polarguide_bench.report import recorded_health
-from polarguide_bench.tables import formatted
+from polarguide_bench.tables import csv_text, formatted
 
 PAGE = "index.html"
 TABLE = "results.csv"

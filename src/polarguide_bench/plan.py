@@ -24,7 +24,7 @@ from polarguide.capture import View
 from polarguide.capture.layout import SHARE
 from polarguide.capture.variants import black_pixels, mask_background
 from polarguide.core.errors import PolarguideError
-from polarguide.core.options import Exposures, SceneOptions, index_of
+from polarguide.core.options import DeviceName, Exposures, SceneOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import free_memory
 from polarguide.raster import Backend
@@ -32,12 +32,13 @@ from polarguide.results.evaluation.record import PACKAGE, _digest, code_digest, 
 from polarguide.results.evaluation.target import SceneFacts
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, PLY, RunConfiguration, most_gaussians
 from polarguide.runs.memory_plan import pixels_of, plan_memory
-from polarguide.runs.opened import read_scene
+from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import STEPS, TrainSettings
 from polarguide_bench.gnerp.memory import plan_field_memory
+from polarguide_bench.gnerp.runs import FieldRun, open_field
 from polarguide_bench.options import ClusterOptions, CompareOptions
-from polarguide_bench.recipes import AnyRecipe, ablations_of
+from polarguide_bench.recipes import AnyRecipe, ablations_of, recipe_named
 
 State = Literal["new", "begun", "trained", "done"]
 RUNS = "runs"
@@ -390,3 +391,15 @@ def model_digest(kind: type) -> str:
     """Digest of the file that defines a plug-in's shading model; empty for models of this package."""
     file = Path(inspect.getfile(kind))
     return "" if PACKAGE in file.parents else _digest(file.parent, [file])
+
+
+def open_compared(folder: str | Path, device: DeviceName = "auto") -> OpenedRun | FieldRun:
+    """Open a run of a comparison.
+
+    Raises:
+        PolarguideError: the folder is no run, is damaged, or belongs to another version.
+    """
+    recipe = recipe_named(RunConfiguration.load(Path(folder)).recipe)
+    if isinstance(recipe, Recipe):
+        return OpenedRun.open(folder, recipe=recipe, device=device)
+    return open_field(folder, recipe, device=device)

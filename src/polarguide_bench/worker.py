@@ -54,7 +54,7 @@ from polarguide_bench.collection import (
     prepare_settings,
 )
 from polarguide_bench.gnerp.runs import FieldRun, train_field
-from polarguide_bench.opened import open_compared
+from polarguide_bench.plan import open_compared
 from polarguide_bench.recipes import recipe_named
 
 THUMBNAIL = 320
