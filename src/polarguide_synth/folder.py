@@ -17,7 +17,7 @@ from polarguide import __version__
 from polarguide.capture.write import picture_name
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import holds_files, make_folder, read_file, write_whole
-from polarguide.core.records import read_record, shortened
+from polarguide.core.records import first_difference, read_record, shortened
 from polarguide.geometry.polarizer import ANGLES, malus
 from polarguide.optics.color import srgb_encode_array
 from polarguide_synth.mesh import Array
@@ -56,25 +56,14 @@ def folder_state(out: Path, request: dict[str, Any]) -> State:
     before = with_current_keys(read_record(path, dict[str, Any], remedy=remedy))
     now = json.loads(json.dumps(request))
     if before != now:
+        name, old, new = first_difference("", before, now)
         raise PolarguideError(
             out,
             expected="a scene that was begun with the same settings",
-            found=f"a scene with other settings ({_difference(before, now)})",
+            found=f"a scene with other settings ({name[1:]}: {shortened(old)} in place of {shortened(new)})",
             remedy=remedy,
         )
     return "finished" if (out / "scene.json").exists() else "begun"
-
-
-def _difference(before: Any, now: Any, place: str = "") -> str:
-    """The first difference of two JSON values, as text."""
-    if isinstance(before, dict) and isinstance(now, dict):
-        none = "nothing"
-        pairs = [(f"{place}.{key}", before.get(key, none), now.get(key, none)) for key in {**now, **before}]
-    elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
-        pairs = [(f"{place}[{k}]", *both) for k, both in enumerate(zip(before, now, strict=True))]
-    else:
-        return f"{place.lstrip('.')}: {shortened(before)} in place of {shortened(now)}"
-    return next(_difference(old, new, at) for at, old, new in pairs if old != new)
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -101,8 +90,7 @@ def sensor_codes(stokes: Array, change: Callable[[Array], Array]) -> NDArray[np.
 def clipped_share(out: Path, names: Sequence[str]) -> float:
     """Share of the samples of these views' pictures that are at full scale."""
     files = [file for name in names for file in view_files(out, name, ground_truth=False, raw=False)]
-    pictures = (np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64) for file in files)
-    return float(np.mean([(picture == TOP * STEP).mean() for picture in pictures]))
+    return float(np.mean([(_picture(file) == TOP * STEP).mean() for file in files]))
 
 
 def view_files(out: Path, name: str, *, ground_truth: bool, raw: bool) -> list[Path]:
@@ -115,14 +103,13 @@ def view_files(out: Path, name: str, *, ground_truth: bool, raw: bool) -> list[P
 def photograph(out: Path, name: str) -> NDArray[np.uint8]:
     """The mean of a view's four pictures as 8-bit sRGB, [H, W, 3]."""
     files = view_files(out, name, ground_truth=False, raw=False)
-    parts = [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64) for file in files]
-    mean = np.mean(parts, axis=0) / 65535
-    return display_encoded(mean[..., ::-1] if mean.ndim == 3 else np.repeat(mean[..., None], 3, axis=2))
+    mean = np.mean([_picture(file) for file in files], axis=0) / 65535
+    colors = mean[..., ::-1] if mean.ndim == 3 else np.repeat(mean[..., None], 3, axis=2)
+    return np.asarray(np.round(255 * srgb_encode_array(np.clip(colors, 0, 1))), np.uint8)
 
 
-def display_encoded(linear: Array) -> NDArray[np.uint8]:
-    """Linear values in [0, 1] as 8-bit sRGB."""
-    return np.asarray(np.round(255 * srgb_encode_array(np.clip(linear, 0, 1))), np.uint8)
+def _picture(file: Path) -> Array:
+    return np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64)
 
 
 MANIFEST = "checksums.txt"
@@ -206,16 +193,11 @@ def scene_record(
     clipped: float,
 ) -> dict[str, Any]:
     """The content of ``scene.json``."""
-    objects = []
-    for number, thing in enumerate(spec.things, 1):
-        source = thing.material
-        material: dict[str, Any] = {"type": source.type, "diffuse": source.color}
-        if source.type == "plastic":
-            material |= {"alpha": source.roughness, "ior": source.index}
-        elif source.type == "metal":
-            material = {"type": "metal", "alpha": source.roughness, "eta": source.eta, "k": source.k}
-        objects.append({"id": number, "name": thing.name, "mesh": f"mesh/{thing.name}.ply",
-                        "foreground": thing.foreground, "material": material})  # fmt: skip
+    objects = [
+        {"id": number, "name": thing.name, "mesh": f"mesh/{thing.name}.ply", "foreground": thing.foreground,
+         "material": thing.material.record()}
+        for number, thing in enumerate(spec.things, 1)
+    ]  # fmt: skip
     return {
         "scene": spec.name,
         "about": spec.about,
