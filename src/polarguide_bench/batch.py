@@ -25,7 +25,6 @@ from polarguide.results.evaluation.table import COLUMNS
 from polarguide.runs.folder import CHECKPOINT, RunConfiguration
 from polarguide.training.settings import TrainSettings
 from polarguide.visualization.pages import page
-from polarguide_bench.cluster import workers
 from polarguide_bench.collection import (
     INSPECTION,
     RECORD,
@@ -39,7 +38,7 @@ from polarguide_bench.collection import (
     source_stamp,
 )
 from polarguide_bench.compare import locked
-from polarguide_bench.job_queue import Job, run_jobs, training_progress
+from polarguide_bench.job_queue import Job, run_jobs, training_progress, workers
 from polarguide_bench.options import BatchOptions
 from polarguide_bench.plan import jobs_at_a_time, own_gpus
 from polarguide_bench.report import recorded_health

@@ -27,8 +27,7 @@ from polarguide.results.evaluation.record import code_digest, commit
 from polarguide.results.evaluation.table import COLUMNS, PART_METRICS
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.children import Scoring, Task, Training
-from polarguide_bench.cluster import workers
-from polarguide_bench.job_queue import Job, run_job, run_jobs
+from polarguide_bench.job_queue import Job, run_job, run_jobs, workers
 from polarguide_bench.options import MOST_SEEDS, CompareOptions
 from polarguide_bench.plan import (
     Comparison,

@@ -22,8 +22,7 @@ from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide.training.settings import TrainSettings
 from polarguide_bench import children, worker
 from polarguide_bench.children import COMMAND, Message, Scoring, Training, files_digest
-from polarguide_bench.cluster import Workers, workers
-from polarguide_bench.job_queue import MOST_LOSSES, Job, last_row, run_job, run_jobs
+from polarguide_bench.job_queue import MOST_LOSSES, Job, Workers, last_row, run_job, run_jobs, workers
 from polarguide_bench.options import ClusterOptions
 
 # Reads its task, writes down that it begins, does what the name of the device asks for, and writes down the end.
