@@ -22,12 +22,13 @@ from polarguide.geometry.vectors import unit_array as unit
 from polarguide_synth.mesh import Array, Mesh, grid_faces, joined, rotation, smooth_normals, solid, write_ply
 from polarguide_synth.schema import (
     REMEDY,
+    Ball,
     Light,
     Material,
+    MeshFile,
     SceneSpec,
     Thing,
     make,
-    only_fields,
     require_light,
     require_solid,
     require_unicode,
@@ -324,30 +325,15 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
 
 def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:
     if thing.shape.get("type") == "ball":
-        mesh = sphere(_radius(thing))
+        mesh = sphere(decode(thing.shape, Ball, f"{thing.name} shape", remedy=REMEDY).radius)
     elif thing.shape.get("type") == "mesh":
-        only_fields(thing.shape, ("type", "file"), f"{thing.name} shape")
-        mesh = _user_mesh(spec.folder / str(thing.shape.get("file")))
+        file = decode(thing.shape, MeshFile, f"{thing.name} shape", remedy=REMEDY).file
+        mesh = _user_mesh(spec.folder / file)
     else:
         mesh = make_mesh(thing.shape, thing.name)
     moved = mesh.moved(thing.scale, rotation(thing.rotation), np.array(thing.position, float))
     require_solid(moved.points, thing.name)
     return moved
-
-
-def _radius(thing: Thing) -> float:
-    """Of a ball.
-
-    Raises:
-        PolarguideError: the file is no such shape, or the ball has other fields.
-    """
-    only_fields(thing.shape, ("type", "radius"), f"{thing.name} shape")
-    radius = thing.shape.get("radius", 1.0)
-    if isinstance(radius, bool) or not isinstance(radius, int | float) or not radius > 0:
-        raise PolarguideError(
-            f"{thing.name} shape.radius", expected="a number above 0", found=str(radius)[:100], remedy=REMEDY
-        )
-    return float(radius)
 
 
 def _user_mesh(path: Path) -> Mesh:
@@ -416,7 +402,7 @@ def _texture(thing: Thing, mesh: Mesh, folder: Path) -> Array | None:
 def _shape(thing: Thing, mesh: Mesh, path: Path, surface: dict[str, Any]) -> Any:
     """Mitsuba's shape with its BSDF and attributes."""
     if thing.shape.get("type") == "ball":
-        radius = _radius(thing) * thing.scale
+        radius = decode(thing.shape, Ball, f"{thing.name} shape", remedy=REMEDY).radius * thing.scale
         return mi.load_dict({"type": "sphere", "center": list(thing.position), "radius": radius, **surface})
     flat = mesh.normals is None
     return mi.load_dict({"type": "ply", "filename": str(path), "face_normals": flat, **surface})

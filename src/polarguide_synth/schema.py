@@ -7,7 +7,7 @@ linear sRGB in [0, 1], radiance is linear and unbounded, angles are degrees.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -75,17 +75,6 @@ def require_unicode(path: Path) -> None:
         raise PolarguideError(
             path, expected="a name in UTF-8", found="other bytes", remedy="Rename the file or its folder."
         ) from None
-
-
-def only_fields(data: Mapping[str, Any], allowed: Sequence[str], where: str) -> None:
-    """Refuse fields that nothing reads.
-
-    Raises:
-        PolarguideError: there are some.
-    """
-    unknown = sorted(data.keys() - set(allowed))
-    if unknown:
-        raise _fault(where, f"only {', '.join(allowed)}", ", ".join(unknown)[:LONGEST_NAME])
 
 
 def check_color(color: Any, where: str) -> None:
@@ -163,6 +152,18 @@ MOST_VIEWS = 10_000
 MOST_SURFACES = 1000
 OLD_KEYS = {"colour": "color", "colours": "colors", "towards": "toward", "truth": "ground_truth"}
 """Names that fields had in earlier scene files and requests."""
+
+
+class Ball(Struct, frozen=True, forbid_unknown_fields=True, tag_field="type", tag="ball"):
+    """A shape that Mitsuba itself has, without triangles."""
+
+    radius: Annotated[float, Meta(gt=0, le=LARGEST)] = 1.0
+
+
+class MeshFile(Struct, frozen=True, forbid_unknown_fields=True, tag_field="type", tag="mesh"):
+    """The shape in a PLY or OBJ file, whose name starts at the folder of the scene file."""
+
+    file: str
 
 
 class Material(Struct, frozen=True, forbid_unknown_fields=True):
