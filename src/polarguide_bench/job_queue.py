@@ -158,10 +158,11 @@ def _queued(manager: str, count: int, threads: int, memory: int) -> Any:
     import dask
 
     of = f"jobqueue.{manager}"
-    submit, kind, extra = {
+    managers: dict[str, tuple[str, str, dict[str, Any]]] = {
         "slurm": ("sbatch", "SLURMCluster", {"job_cpu": threads}),
         "pbs": ("qsub", "PBSCluster", {"resource_spec": f"select=1:ncpus={threads}:mem={_mib(memory)}MB"}),
-    }[manager]
+    }
+    submit, kind, extra = managers[manager]
     if shutil.which(submit) is None:
         raise _no_cluster(manager, f"no command {submit}")
     jobqueue = optional_import("dask_jobqueue", f"--{manager}")

@@ -17,7 +17,7 @@ from polarguide import __version__
 from polarguide.capture.write import picture_name
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import holds_files, make_folder, read_file, write_whole
-from polarguide.core.records import first_difference, read_record, shortened
+from polarguide.core.records import read_record, shortened
 from polarguide.geometry.polarizer import ANGLES, malus
 from polarguide.optics.color import srgb_encode_array
 from polarguide_synth.mesh import Array
@@ -56,14 +56,25 @@ def folder_state(out: Path, request: dict[str, Any]) -> State:
     before = with_current_keys(read_record(path, dict[str, Any], remedy=remedy))
     now = json.loads(json.dumps(request))
     if before != now:
-        name, old, new = first_difference("", before, now)
         raise PolarguideError(
             out,
             expected="a scene that was begun with the same settings",
-            found=f"a scene with other settings ({name[1:]}: {shortened(old)} in place of {shortened(new)})",
+            found=f"a scene with other settings ({_difference(before, now)})",
             remedy=remedy,
         )
     return "finished" if (out / "scene.json").exists() else "begun"
+
+
+def _difference(before: Any, now: Any, place: str = "") -> str:
+    """The first difference of two JSON values, as text."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        none = "nothing"
+        pairs = [(f"{place}.{key}", before.get(key, none), now.get(key, none)) for key in {**now, **before}]
+    elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
+        pairs = [(f"{place}[{k}]", *both) for k, both in enumerate(zip(before, now, strict=True))]
+    else:
+        return f"{place.lstrip('.')}: {shortened(before)} in place of {shortened(now)}"
+    return next(_difference(old, new, at) for at, old, new in pairs if old != new)
 
 
 def write_file(path: Path, data: bytes) -> None:

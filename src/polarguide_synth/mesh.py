@@ -158,7 +158,7 @@ def surface_nets(values: Array) -> tuple[Array, np.ndarray]:
         return values[tuple(slice(o, o + n) for o, n in zip(corner, shape, strict=True))]
 
     for first in itertools.product((0, 1), repeat=3):
-        for axis in np.flatnonzero(np.array(first) == 0):
+        for axis in (k for k in range(3) if first[k] == 0):
             a = values_at(first)
             b = values_at(tuple(1 if k == axis else first[k] for k in range(3)))
             crossed = (a < 0) != (b < 0)
