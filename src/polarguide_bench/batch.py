@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pandas as pd
 
@@ -20,12 +21,10 @@ from polarguide.preparation.settings import PrepareSettings
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.record import read_metrics
-from polarguide.results.evaluation.table import COLUMNS, Metric
+from polarguide.results.evaluation.table import COLUMNS
 from polarguide.runs.folder import CHECKPOINT, RunConfiguration
 from polarguide.training.settings import TrainSettings
 from polarguide.visualization.pages import page
-from polarguide_bench.children import STDERR
-from polarguide_bench.cluster import workers
 from polarguide_bench.collection import (
     INSPECTION,
     RECORD,
@@ -39,19 +38,18 @@ from polarguide_bench.collection import (
     source_stamp,
 )
 from polarguide_bench.compare import locked
-from polarguide_bench.csv_files import csv_text
-from polarguide_bench.job_queue import Job, run_jobs, training_progress
+from polarguide_bench.job_queue import Job, run_jobs, training_progress, workers
 from polarguide_bench.options import BatchOptions
 from polarguide_bench.plan import jobs_at_a_time, own_gpus
 from polarguide_bench.report import recorded_health
-from polarguide_bench.tables import formatted
+from polarguide_bench.tables import csv_text, formatted
 
 PAGE = "index.html"
 TABLE = "results.csv"
 
 
 @dataclass(frozen=True)
-class Row:
+class CaptureRow:
     """A capture on the page.
 
     Attributes:
@@ -86,23 +84,48 @@ class Row:
     def links(self) -> list[tuple[str, str]]:
         """Label and path of what there is, from the folder of all."""
         at = f"{self.folder.parent.name}/{self.folder.name}"
-        done = () if self.record is None else self.record.done
-        named = [("inspection", f"{INSPECTION}/{INSPECTION_PAGE}")] if "inspect" in done else []
-        named += [("where the errors are", f"{RUN}/errors.png")] if "eval" in done else []
-        named += [("scene", SHARE)] if "share" in done else []
-        named += [] if self.record is None else [(Path(file).name, file) for file in self.record.files]
+        if self.record is None:
+            return []
+        made_by = {
+            "inspect": ("inspection", f"{INSPECTION}/{INSPECTION_PAGE}"),
+            "eval": ("where the errors are", f"{RUN}/errors.png"),
+            "share": ("scene", SHARE),
+        }
+        named = [link for step, link in made_by.items() if step in self.record.done]
+        named += [(Path(file).name, file) for file in self.record.files]
         return [(label, f"{at}/{path}") for label, path in named if (self.folder / path).exists()]
 
 
-def write_page(out: Path, rows: Sequence[Row]) -> None:
-    """Write ``index.html`` and ``results.csv``, each in one step."""
+def write_page(out: Path, rows: Sequence[CaptureRow]) -> None:
+    """Write ``index.html`` and ``results.csv``, each in one step. The page links to files in the captures' folders."""
     scores = {row.name: row.scores() for row in rows}
     columns = [
         column
         for column in COLUMNS
         if column.shown == "tables" and any(of.get(column.key) is not None for of in scores.values())
     ]
-    write_text(out / PAGE, batch_html(rows, scores, columns))
+    counts = Counter(row.state for row in rows)
+    html = page(
+        "polarguide_bench",
+        "batch.html",
+        title=f"{len(rows)} captures",
+        summary=", ".join(
+            f"{counts[state]} {state}" for state in ("done", "failed", "waiting") if counts[state]
+        ),
+        columns=columns,
+        rows=[
+            {
+                "row": row,
+                "pictures": () if row.record is None else row.record.pictures,
+                "verdict": "" if row.record is None else row.record.verdict,
+                "cells": [formatted(scores[row.name].get(column.key), column) for column in columns],
+                "remarks": row.remarks(),
+                "links": row.links(),
+            }
+            for row in rows
+        ],
+    )
+    write_text(out / PAGE, html)
     frame = pd.DataFrame(
         [
             {
@@ -119,38 +142,10 @@ def write_page(out: Path, rows: Sequence[Row]) -> None:
     write_text(out / TABLE, csv_text(frame))
 
 
-def batch_html(rows: Sequence[Row], scores: dict[str, dict[str, Any]], columns: Sequence[Metric]) -> str:
-    """The page; all names and texts in it are escaped. It links to files in the captures' folders."""
-    counts = {state: sum(row.state == state for row in rows) for state in ("done", "failed", "waiting")}
-    return page(
-        "polarguide_bench",
-        "batch.html",
-        title=f"{len(rows)} captures",
-        summary=", ".join(f"{count} {state}" for state, count in counts.items() if count),
-        columns=columns,
-        rows=[
-            {
-                "row": row,
-                "pictures": () if row.record is None else row.record.pictures,
-                "verdict": "" if row.record is None else row.record.verdict,
-                "cells": [_cell(scores[row.name].get(column.key), column) for column in columns],
-                "remarks": row.remarks(),
-                "links": row.links(),
-            }
-            for row in rows
-        ],
-    )
-
-
-def _cell(value: float | None, column: Metric) -> str:
-    return "" if value is None else formatted(value, column)
-
-
 CAPTURES = "captures"
 """Folder of the captures' folders."""
 WORK_BYTES = 2_000_000_000
 """Memory that a job of SLURM or PBS asks for: sizes of captures are not known before they are prepared."""
-State = Literal["done", "failed", "waiting"]
 
 
 @dataclass(frozen=True)
@@ -177,7 +172,7 @@ def run_batch(
     options: BatchOptions,
     *,
     reporter: Reporter = SILENT,
-) -> list[Row]:
+) -> list[CaptureRow]:
     """Prepare, inspect, train, score, share and export every capture, each in a process of its own.
 
     Writes a folder for each to ``captures/`` of ``out``, and ``index.html`` and ``results.csv`` over all whenever one
@@ -214,9 +209,7 @@ def run_batch(
         reporter.say(f"captures: {len(tasks)}, of them finished before: {len(tasks) - len(todo)}")
 
         def end(job: Job, error: str | None) -> None:
-            if error is None:
-                (job.folder / STDERR).unlink(missing_ok=True)
-            else:
+            if error is not None:
                 failures[job.label] = error
             write_page(root, _rows(tasks, failures))
 
@@ -242,9 +235,7 @@ def _task(capture: Capture, root: Path, options: BatchOptions) -> Processing:
     folder = (root / CAPTURES / capture.name).absolute()
     stamp = source_stamp(path)
     earlier = None
-    with contextlib.suppress(
-        PolarguideError
-    ):  # the process that works on it says what is wrong with its record
+    with contextlib.suppress(PolarguideError):  # the child says what is wrong with its record
         earlier = CaptureRecord.load(folder)
     request = Request(
         source=str(path),
@@ -271,20 +262,18 @@ def _job(task: Processing) -> Job:
         if record is None or record.at is None:
             return 0, ""
         note = f"{record.at} ({STEPS.index(record.at) + 1} of {len(STEPS)})"
-        if record.at == "train":
-            try:
+        with contextlib.suppress(OSError, PolarguideError):  # it is about to be written
+            if record.at == "train":
                 steps = RunConfiguration.load(folder / RUN).settings.steps
-            except (OSError, PolarguideError):  # it is about to be written
-                return 0, note
-            step, words = training_progress(folder / RUN, steps)
-            note = f"{note}: {step:,}/{steps:,}  {words}"
+                step, words = training_progress(folder / RUN, steps)
+                note = f"{note}: {step:,}/{steps:,}  {words}"
         return 0, note
 
     saved = (folder / RECORD, folder / RUN / CHECKPOINT)
     return Job(task.name, folder, lambda: (task,), 1, progress, saved)
 
 
-def _rows(tasks: dict[str, Processing], failures: dict[str, str]) -> list[Row]:
+def _rows(tasks: dict[str, Processing], failures: dict[str, str]) -> list[CaptureRow]:
     """A row for each capture, by what its folder holds."""
     rows = []
     for name, task in tasks.items():
@@ -297,8 +286,8 @@ def _rows(tasks: dict[str, Processing], failures: dict[str, str]) -> list[Row]:
                 record.require(task.request, folder)
         except PolarguideError as problem:
             error = error or str(problem)
-        state: State = "failed" if error else "waiting"
+        state = "failed" if error else "waiting"
         if record is not None and not error and set(record.done) == set(STEPS):
             state = "done"
-        rows.append(Row(name, task.request.source, folder, state, error, record))
+        rows.append(CaptureRow(name, task.request.source, folder, state, error, record))
     return rows

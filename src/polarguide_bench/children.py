@@ -13,11 +13,10 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import msgspec
 
@@ -25,10 +24,6 @@ from polarguide.core.files import make_folder
 from polarguide.core.options import ComputeOptions, SceneOptions
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.collection import Processing
-
-if TYPE_CHECKING:
-    from distributed import Worker
-
 
 SOURCES = Path(__file__).parents[1]
 """The folder of all packages."""
@@ -87,6 +82,10 @@ class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     files: str
     code: str
 
+    def to_line(self) -> bytes:
+        """The line; names of files that are no Unicode are escapes in it."""
+        return json.dumps(msgspec.to_builtins(self)).encode() + b"\n"
+
 
 class Outcome(msgspec.Struct, frozen=True):
     """The outcome of a job on a worker.
@@ -101,11 +100,6 @@ class Outcome(msgspec.Struct, frozen=True):
     error: str = ""
 
 
-def encoded(message: Message) -> bytes:
-    """A line that a child reads; names of files that are no Unicode are escapes in it."""
-    return json.dumps(msgspec.to_builtins(message)).encode() + b"\n"
-
-
 POLL_SECONDS = 0.1
 STDERR = "stderr.txt"
 STOPPED = 130
@@ -114,7 +108,6 @@ FROM_OUTSIDE = tuple(-number for number in (signal.SIGTERM, getattr(signal, "SIG
 """Exit statuses of a child that somebody ended: the system for want of memory, a user, the manager of a cluster."""
 
 _at_work: dict[str, subprocess.Popen[bytes]] = {}
-_lock = threading.Lock()
 
 
 def perform(
@@ -136,9 +129,15 @@ def perform(
     worker = get_worker()
     key = thread_state.key
     device = {"CUDA_VISIBLE_DEVICES": gpus[int(worker.name) % len(gpus)]} if gpus else {}
+
+    def wanted() -> bool:
+        """Whether somebody waits: not if the task was canceled, nor if the command that asked for it is gone."""
+        state = worker.state.tasks.get(key)
+        return state is not None and state.state != "cancelled"
+
     for message in messages:
         try:
-            outcome = _watched(message, Path(folder), device, key, lambda: _wanted(worker, key))
+            outcome = _watched(message, Path(folder), device, key, wanted)
         except OSError as error:  # no room, no rights, no processes: of this machine, perhaps
             return Outcome("failed", f"{error.filename or folder}: {error.strerror or error}")
         if outcome.state != "done":
@@ -146,18 +145,8 @@ def perform(
     return Outcome("done")
 
 
-def _wanted(worker: Worker, key: object) -> bool:
-    """Whether somebody waits for a task: not if it was canceled, nor if the command that asked for it is gone."""
-    state = worker.state.tasks.get(key)  # type: ignore[call-overload]
-    return state is not None and state.state != "cancelled"
-
-
 def _watched(
-    message: Message,
-    folder: Path,
-    device: dict[str, str],
-    key: str,
-    wanted: Callable[[], bool],
+    message: Message, folder: Path, device: dict[str, str], key: str, wanted: Callable[[], bool]
 ) -> Outcome:
     """One task from its begin to its end."""
     make_folder(folder)
@@ -181,11 +170,10 @@ def _watched(
             close_fds=False,
         )
     assert process.stdin is not None
-    with _lock:
-        _at_work[key] = process
+    _at_work[key] = process
     try:
         with contextlib.suppress(BrokenPipeError):
-            process.stdin.write(encoded(message))
+            process.stdin.write(message.to_line())
             process.stdin.flush()
         while process.poll() is None:
             if not wanted():
@@ -194,30 +182,27 @@ def _watched(
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(POLL_SECONDS)
     finally:
-        with _lock:
-            del _at_work[key]
+        del _at_work[key]
         with contextlib.suppress(OSError):
             process.stdin.close()  # which ends it, if anything happens here
-    return _outcome(process.returncode, errors)
-
-
-def _outcome(status: int, errors: Path) -> Outcome:
+    status = process.returncode
     if status == 0:
         return Outcome("done")
     lines = [line for line in errors.read_text(errors="replace").splitlines() if line.strip()]
     text = lines[-1].strip() if lines else f"the process ended with status {status}"
-    lost = status == STOPPED or status in FROM_OUTSIDE
-    return Outcome("lost" if lost else "failed", text)
+    return Outcome("lost" if status == STOPPED or status in FROM_OUTSIDE else "failed", text)
+
+
+def _processes(keys: Sequence[str]) -> list[subprocess.Popen[bytes]]:
+    return [process for process in map(_at_work.get, keys) if process is not None]
 
 
 def count_at_work(keys: Sequence[str]) -> int:
     """How many of the tasks still have a process on this worker."""
-    with _lock:
-        return len(_at_work.keys() & set(keys))
+    return len(_processes(keys))
 
 
 def kill(keys: Sequence[str]) -> None:
     """End the processes of tasks at once; their last checkpoints stay."""
-    with _lock:
-        for key in _at_work.keys() & set(keys):
-            _at_work[key].kill()
+    for process in _processes(keys):
+        process.kill()

@@ -33,7 +33,6 @@ SHARE = "share.html"
 """File of the shared page."""
 Step = Literal["prepare", "inspect", "train", "eval", "share", "export"]
 STEPS: tuple[Step, ...] = ("prepare", "inspect", "train", "eval", "share", "export")
-_BLOCK = 1 << 20
 NO_FILES = (0, 0, 0)
 """The stamp of a folder that is empty, or not there."""
 
@@ -99,8 +98,7 @@ class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """
         if not os.path.lexists(folder / RECORD):
             return None
-        record: Any = read_record(folder / RECORD, CaptureRecord, remedy="Remove the folder to begin again.")
-        return record if isinstance(record, CaptureRecord) else None
+        return read_record(folder / RECORD, CaptureRecord, remedy="Remove the folder to begin again.")
 
     def require(self, request: Request, folder: Path) -> None:
         """Refuse to go on with another request than it was begun with; one that is done may lose its source.
@@ -114,9 +112,7 @@ class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.request.digest == request.digest != "":
             alike.add("stamp")
         for name in Request.__struct_fields__:
-            before = getattr(self.request, name)
-            now = getattr(request, name)
-            if before != now and name not in alike:
+            if name not in alike and getattr(self.request, name) != getattr(request, name):
                 raise PolarguideError(
                     folder,
                     expected=f"the capture and options that it was begun with ({name})",
@@ -139,9 +135,7 @@ def source_stamp(folder: Path) -> tuple[int, int, int]:
     """Number of files below a folder, their bytes, and when the newest was changed (ns); without hidden ones."""
     count = size = newest = 0
     for path in _files_below(folder):
-        with contextlib.suppress(
-            OSError, ValueError
-        ):  # it has gone meanwhile, or has a name that no file can have
+        with contextlib.suppress(OSError, ValueError):  # it has gone, or has a name that no file can have
             state = os.stat(path)
             count += 1
             size += state.st_size
@@ -164,7 +158,7 @@ def source_digest(folder: Path, earlier: Request | None, stamp: tuple[int, int, 
             continue  # reading a pipe may never end
         with contextlib.suppress(OSError), open(path, "rb") as file:
             whole.update(f"{canonical(os.path.relpath(path, folder))}\0".encode("utf-8", "surrogateescape"))
-            while block := file.read(_BLOCK):
+            while block := file.read(1 << 20):
                 whole.update(block)
     return "" if stamp == NO_FILES else whole.hexdigest()
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+
+import msgspec
+from msgspec import UNSET
 
 from polarguide import __version__
 from polarguide.capture.layout import refuse_scene
@@ -24,9 +26,8 @@ from polarguide.raster import choose_backend
 from polarguide.results.evaluation.record import code_digest, commit
 from polarguide.results.evaluation.table import COLUMNS, PART_METRICS
 from polarguide.training.settings import TrainSettings
-from polarguide_bench.children import STDERR, Scoring, Task, Training
-from polarguide_bench.cluster import workers
-from polarguide_bench.job_queue import Job, run_job, run_jobs
+from polarguide_bench.children import Scoring, Task, Training
+from polarguide_bench.job_queue import Job, run_job, run_jobs, workers
 from polarguide_bench.options import MOST_SEEDS, CompareOptions
 from polarguide_bench.plan import (
     Comparison,
@@ -39,7 +40,15 @@ from polarguide_bench.plan import (
     scene_entries,
 )
 from polarguide_bench.recipes import ABLATIONS, AnyRecipe, ablations_of, recipe_named
-from polarguide_bench.record import FORMAT, REMEDY, Record
+from polarguide_bench.record import (
+    FORMAT,
+    REMEDY,
+    PartScores,
+    RecipeRecord,
+    Record,
+    RunRecord,
+    SceneRecord,
+)
 from polarguide_bench.report import exposure_svg, read_study, study_svg, write_report
 from polarguide_bench.results import Results
 from polarguide_bench.tables import write_tables
@@ -178,9 +187,12 @@ def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
     """
     names = [recipe.name.removeprefix(f"{base}:") for recipe in ablations_of(base)]
     if not names:
-        expected = "a recipe with ablations: " + ", ".join(ABLATIONS)
-        remedy = "Take one of these, or use compare."
-        raise PolarguideError("base", expected=expected, found=base, remedy=remedy)
+        raise PolarguideError(
+            "base",
+            expected="a recipe with ablations: " + ", ".join(ABLATIONS),
+            found=base,
+            remedy="Take one of these, or use compare.",
+        )
     selected = [name.removeprefix(f"{base}:") for name in only]
     for name in selected:
         check_choice("only", name, names)
@@ -189,25 +201,29 @@ def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
 
 def _checked_recipes(recipes: Sequence[str | AnyRecipe]) -> tuple[AnyRecipe, ...]:
     """The recipes as they are registered: runs are trained in other processes, which know recipes by name."""
-    registered = tuple(recipe_named(recipe if isinstance(recipe, str) else recipe.name) for recipe in recipes)
-    for passed, own in zip(recipes, registered, strict=True):
-        if not isinstance(passed, str) and passed != own:
+    registered: dict[str, AnyRecipe] = {}
+    for recipe in recipes:
+        own = recipe_named(recipe if isinstance(recipe, str) else recipe.name)
+        if not isinstance(recipe, str) and recipe != own:
             raise PolarguideError(
                 "recipes",
                 expected=f"the registered recipe {own.name}",
                 found="a recipe of this name with other values",
                 remedy="Give it another name, and register it under the entry points polarguide.recipes.",
             )
+        if own.name in registered:
+            raise PolarguideError(
+                "recipes",
+                expected="no name more than once",
+                found=f"{own.name} twice",
+                remedy="Name each once.",
+            )
+        registered[own.name] = own
     if not registered:
-        remedy = "Name at least one recipe."
-        raise PolarguideError("compare", expected="a recipe", found="none", remedy=remedy)
-    names = [recipe.name for recipe in registered]
-    if len(set(names)) < len(names):
-        remedy = "Name each once."
         raise PolarguideError(
-            "recipes", expected="no name more than once", found=" ".join(names), remedy=remedy
+            "compare", expected="a recipe", found="none", remedy="Name at least one recipe."
         )
-    return registered
+    return tuple(registered.values())
 
 
 def _train(
@@ -227,9 +243,7 @@ def _train(
     jobs = [_job(comparison, run, alone=alone) for run in unfinished]
 
     def end(job: Job, error: str | None) -> None:
-        if error is None:
-            (job.folder / STDERR).unlink(missing_ok=True)
-        else:
+        if error is not None:
             failures[job.folder] = error
         write_tables(comparison.out, collect(comparison, scenes, plan, failures))
 
@@ -246,7 +260,7 @@ def _train(
 
 def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
     """The tasks that finish a run."""
-    compute = _compute(comparison)
+    compute = ComputeOptions(comparison.options.threads, comparison.options.device)
     folder = str(run.folder.absolute())
     training = Training(
         scene=str(run.scene.path.absolute()),
@@ -269,10 +283,6 @@ def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
     return run_job(run.label, run.folder, tasks, run.steps)
 
 
-def _compute(comparison: Comparison) -> ComputeOptions:
-    return ComputeOptions(comparison.options.threads, comparison.options.device)
-
-
 def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter) -> None:
     """Time the pictures of finished runs that have not been timed alone, one after the other."""
     untimed = [run for run in plan if (record := run.metrics()) is not None and record["fps"] is None]
@@ -291,22 +301,19 @@ def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter
 
 def _timing(comparison: Comparison, run: PlannedRun) -> Job:
     """Score a run again, with its speed."""
-    scoring = Scoring(str(run.folder.absolute()), True, _compute(comparison))
+    compute = ComputeOptions(comparison.options.threads, comparison.options.device)
+    scoring = Scoring(str(run.folder.absolute()), True, compute)
     return run_job(run.label, run.folder, lambda: (scoring,), run.steps)
 
 
-@contextlib.contextmanager
-def locked(folder: Path, what: str = "comparison") -> Iterator[None]:
+def locked(folder: Path, what: str = "comparison") -> contextlib.AbstractContextManager[None]:
     """Keep two comparisons (or two of something else) out of an existing folder.
 
     Children on this machine inherit the lock and hold it if the parent is killed, until they have saved their state.
     """
-    with only_writer(
-        folder / LOCK,
-        expected="a folder that nobody is writing to",
-        found=f"another {what} at work in it",
-    ):
-        yield
+    return only_writer(
+        folder / LOCK, expected="a folder that nobody is writing to", found=f"another {what} at work in it"
+    )
 
 
 def collect(
@@ -344,58 +351,70 @@ def collect(
             "background": settings.background,
             "materials": settings.materials,
         },
-        "scenes": [_scene_record(scene, comparison) for scene in scenes],
+        "scenes": [
+            SceneRecord(
+                name=scene.name,
+                digest=scene.digest,
+                views=scene.views,
+                test_views=list(scene.test_views),
+                black_share=scene.black_share,
+                warnings=list(scene.warnings) or UNSET,
+                refractive_index=comparison.index_of(scene) if settings.refractive_index is None else UNSET,
+            )
+            for scene in scenes
+        ],
         "recipes": [
-            {"name": row.name, "about": row.about, "data": row.recipe.data()}
-            | ({} if row.steps is None else {"steps": row.steps})
+            RecipeRecord(row.name, row.about, row.recipe.data(), UNSET if row.steps is None else row.steps)
             for row in comparison.rows
         ],
         "runs": [_run_record(comparison, run, failures.get(run.folder)) for run in plan],
     }
-    return Results(decode(content, Record, "results.json", remedy=REMEDY))
+    return Results(decode(msgspec.to_builtins(content), Record, "results.json", remedy=REMEDY))
 
 
-def _scene_record(scene: SceneEntry, comparison: Comparison) -> dict[str, Any]:
-    record: dict[str, Any] = {key: getattr(scene, key) for key in ("name", "digest", "views", "black_share")}
-    record["test_views"] = list(scene.test_views)
-    if scene.warnings:
-        record["warnings"] = list(scene.warnings)
-    if comparison.settings.refractive_index is None:
-        record["refractive_index"] = comparison.index_of(scene)
-    return record
-
-
-def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) -> dict[str, Any]:
-    record: dict[str, Any] = {"scene": run.scene.name, "recipe": run.row.name, "seed": run.settings.seed}
-    record["folder"] = run.folder.relative_to(comparison.out).as_posix()
+def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) -> RunRecord:
+    record = RunRecord(
+        scene=run.scene.name,
+        recipe=run.row.name,
+        seed=run.settings.seed,
+        folder=run.folder.relative_to(comparison.out).as_posix(),
+        state="missing" if failure is None else "failed",
+        error=failure,
+        metrics=None,
+        lpips_reason=None,
+        mesh_reason=None,
+        views={},
+    )
     scores = run.metrics() if run.state() == "done" else None
     if scores is None:
-        state = "missing" if failure is None else "failed"
-        record |= {"state": state, "error": failure, "metrics": None, "views": {}}
-        return {**record, "lpips_reason": None, "mesh_reason": None}
+        return record
     metrics = {metric.key: scores.get(metric.key) for metric in COLUMNS}
     if (run.folder / BESIDE_OTHERS).exists():
         metrics["train_seconds"] = None
     parts = {
         kind: {
-            name: {"material": part.get("material"), "pixels": part["pixels"], "views": part["views"]}
-            | {"metrics": {m.key: part[m.key] for m in PART_METRICS if m.key in part}}
+            name: PartScores(
+                part.get("material"),
+                part["pixels"],
+                part["views"],
+                {m.key: part[m.key] for m in PART_METRICS if m.key in part},
+            )
             for name, part in (scores.get(kind) or {}).items()
         }
         for kind in ("objects", "materials")
     }
-    return {
-        **record,
-        "state": "done",
-        "error": None,
-        "metrics": metrics,
-        "lpips_reason": scores.get("lpips_reason"),
-        "mesh_reason": scores.get("mesh_fscore_1_reason"),
-        "views": {
+    return msgspec.structs.replace(
+        record,
+        state="done",
+        error=None,
+        metrics=metrics,
+        lpips_reason=scores.get("lpips_reason"),
+        mesh_reason=scores.get("mesh_fscore_1_reason"),
+        views={
             name: {m.key: of[m.key] for m in COLUMNS if m.key in of} for name, of in scores["views"].items()
         },
         **parts,
-    }
+    )
 
 
 def _write_charts(comparison: Comparison, scenes: Sequence[SceneEntry], results: Results) -> None:

@@ -1,24 +1,33 @@
-"""Jobs on workers: handed out in order, watched, gone on with when their workers are lost, and stopped without loss."""
+"""Jobs on workers of dask.distributed: handed out in order, watched, resumed after a loss, and stopped without loss.
+
+Workers are on this machine, behind a scheduler that runs already, or jobs of SLURM or PBS. dask is imported where
+workers are needed, since importing it takes a while.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import os
+import logging
+import math
+import shutil
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.options import LOOPBACK
 from polarguide.core.progress import Advance, Reporter
+from polarguide.core.system import MEBIBYTE
 from polarguide.results.evaluation.record import code_digest
 from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide_bench.children import (
     POLL_SECONDS,
+    STDERR,
     Message,
     Outcome,
     Task,
@@ -27,10 +36,172 @@ from polarguide_bench.children import (
     kill,
     perform,
 )
-from polarguide_bench.cluster import Workers
+from polarguide_bench.options import ClusterOptions
 
 if TYPE_CHECKING:
-    from distributed import Future
+    from distributed import Client, Future
+
+NOWHERE = f"{LOOPBACK[0]}:0"
+"""Where dask's web servers listen, which cannot be turned off: on the loopback alone, at any free port."""
+WORKER_BYTES = 300_000_000
+"""Memory of a worker of dask and its nanny, beside the process that it starts."""
+CONNECT_SECONDS = 30.0
+"""How long a scheduler that somebody else runs may take to answer."""
+SETTINGS = {
+    # Whoever loses a worker is to hear of it: run_jobs decides whether the job goes on.
+    "distributed.scheduler.allowed-failures": 0,
+    "distributed.deploy.lost-worker-timeout": "2s",
+    "distributed.worker.memory.terminate": False,
+    "distributed.worker.memory.pause": False,
+    # Nobody measures, and nothing is reported to anyone.
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "10s",
+}
+
+
+@dataclass
+class Workers:
+    """Worker processes, of which lost ones are replaced.
+
+    Attributes:
+        client: connection to their scheduler.
+        most: largest number of jobs at a time. Lost workers are replaced up to it.
+        gpus: GPUs of this machine that each worker in turn sees; empty: every worker sees all.
+    """
+
+    client: Client
+    most: int
+    gpus: tuple[str, ...] = ()
+    _cluster: Any = field(default=None, repr=False)
+
+    def slots(self) -> int:
+        """How many jobs have room now."""
+        return sum(self.client.nthreads().values())
+
+    def replace_lost(self) -> None:
+        """Ask for as many workers as at the beginning, where some were lost."""
+        if self._cluster is not None:
+            self._cluster.scale(self.most)
+
+
+@contextlib.contextmanager
+def workers(
+    options: ClusterOptions, *, count: int, threads: int, memory: int, gpus: Sequence[str], reporter: Reporter
+) -> Iterator[Workers]:
+    """Workers as the options say, for as long as the context is open.
+
+    Args:
+        options: where.
+        count: how many jobs work at a time. threads: threads of each. memory: bytes that each takes at most.
+        gpus: GPUs of this machine, for local workers.
+        reporter: is told where workers are.
+
+    Raises:
+        PolarguideError: there is no such scheduler, or dask-jobqueue or the commands of its manager are missing.
+    """
+    import dask
+    from distributed import Client, LocalCluster
+
+    # What matters, run_jobs says. Each of them has a level of its own.
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    with dask.config.set(SETTINGS), contextlib.ExitStack() as stack:
+        if options.scheduler is not None:
+            client = stack.enter_context(_connected(options.scheduler))
+            reporter.say(f"scheduler: {options.scheduler}, workers: {len(client.nthreads())}")
+            yield Workers(client, count)
+            return
+        if options.manager is not None:
+            cluster = stack.enter_context(_queued(options.manager, count, threads, memory))
+            client = stack.enter_context(Client(cluster))
+            reporter.say(
+                f"{options.manager}: asked for {count} jobs of {threads} cores and {_mib(memory)} MiB"
+            )
+            yield Workers(client, count, _cluster=cluster)
+            return
+        # In this process, since each job has one of its own: nothing listens, and nothing has to be started.
+        cluster = stack.enter_context(
+            LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                processes=False,
+                dashboard_address=NOWHERE,
+                worker_dashboard_address=NOWHERE,
+                memory_limit=0,
+                silence_logs=logging.CRITICAL,
+            )
+        )
+        yield Workers(stack.enter_context(Client(cluster)), count, tuple(gpus))
+
+
+def _connected(address: str) -> Client:
+    """A client of a scheduler that runs already."""
+    from distributed import Client
+
+    try:
+        return Client(address, timeout=CONNECT_SECONDS)
+    except (OSError, ValueError, TypeError, ImportError) as error:
+        raise PolarguideError(
+            "scheduler",
+            expected="the address of a scheduler of dask.distributed, such as tcp://10.0.0.5:8786",
+            found=f"{address}: {str(error).splitlines()[0] if str(error) else type(error).__name__}",
+            remedy="Start one (dask scheduler) and workers (dask worker ADDRESS --nthreads 1), or correct the address.",
+        ) from None
+
+
+def _queued(manager: str, count: int, threads: int, memory: int) -> Any:
+    """Workers as jobs of SLURM or PBS, replaced by others when they end.
+
+    Queue, account, time and whatever else a site wants are read from dask's own configuration (jobqueue.yaml).
+    """
+    import dask
+
+    of = f"jobqueue.{manager}"
+    managers: dict[str, tuple[str, str, dict[str, Any]]] = {
+        "slurm": ("sbatch", "SLURMCluster", {"job_cpu": threads}),
+        "pbs": ("qsub", "PBSCluster", {"resource_spec": f"select=1:ncpus={threads}:mem={_mib(memory)}MB"}),
+    }
+    submit, kind, extra = managers[manager]
+    if shutil.which(submit) is None:
+        raise _no_cluster(manager, f"no command {submit}")
+    jobqueue = optional_import("dask_jobqueue", f"--{manager}")
+    try:
+        return getattr(jobqueue, kind)(
+            n_workers=count,  # waits until the jobs are accepted
+            cores=1,
+            processes=1,
+            memory=f"{_mib(memory)} MiB",
+            scheduler_options={
+                "dashboard_address": NOWHERE,
+                **(dask.config.get(f"{of}.scheduler-options", None) or {}),
+            },
+            worker_extra_args=[
+                *(dask.config.get(f"{of}.worker-extra-args", None) or []),
+                "--dashboard-address",
+                NOWHERE,
+            ],
+            silence_logs=logging.CRITICAL,
+            **extra,
+        )
+    except (OSError, ValueError, RuntimeError, AssertionError) as error:
+        reasons = [line for line in str(error.__context__ or error).splitlines() if line.strip()]
+        raise _no_cluster(manager, reasons[-1] if reasons else type(error).__name__) from None
+
+
+def _no_cluster(manager: str, found: str) -> PolarguideError:
+    return PolarguideError(
+        f"--{manager}",
+        expected="a cluster that takes jobs from this machine",
+        found=found,
+        remedy="Run it where jobs are submitted; docs/how-to/cluster.md says what to configure.",
+    )
+
+
+def _mib(memory: int) -> int:
+    """Of a job: a worker and the process that it starts."""
+    return math.ceil((memory + WORKER_BYTES) / MEBIBYTE)
+
 
 ASK_SECONDS = 1.0
 """Between two questions to the scheduler, who may be far away."""
@@ -79,94 +250,39 @@ def training_progress(run: Path, steps: int) -> tuple[int, str]:
     return min(steps, row.step + 1), f"PSNR {row.psnr:.1f} dB{count}"
 
 
+@dataclass(frozen=True)
 class _Active:
-    """A job that was handed to a worker."""
+    """A job that was handed to a worker. ``advance`` moves its bar, which ``bar`` closes."""
 
-    def __init__(self, job: Job, future: Future, advance: Advance) -> None:
-        self.job = job
-        self.future = future
-        self._advance = advance
-
-    def report(self) -> int:
-        """Pass on how far it is; returns how much is done."""
-        done, note = self.job.progress()
-        self._advance(done, note=note)
-        return done
-
-    def outcome(self) -> Outcome:
-        """After the end: what became of it.
-
-        Raises:
-            PolarguideError: the scheduler has gone.
-        """
-        from distributed import KilledWorker
-
-        if self.future.cancelled():
-            raise PolarguideError(
-                "scheduler",
-                expected="a scheduler until the end",
-                found="that the connection to it was lost",
-                remedy="The same command goes on, once there is a scheduler.",
-            )
-        error = self.future.exception() if self.future.status == "error" else None
-        if isinstance(error, KilledWorker):
-            return Outcome("lost", "its worker has gone")
-        if error is not None:
-            return Outcome("failed", f"worker: {(str(error).splitlines() or [type(error).__name__])[0]}")
-        outcome: Outcome = self.future.result()
-        return outcome
+    job: Job
+    future: Future
+    advance: Advance
+    bar: contextlib.ExitStack
 
 
 class _Progress:
     """Progress of many jobs: one bar for all, and one for each running job."""
 
     def __init__(self, jobs: Sequence[Job], reporter: Reporter, stack: contextlib.ExitStack) -> None:
-        self._reporter = reporter
-        self._total = len(jobs)
-        self._ended = 0
+        self._jobs = {job.folder: job for job in jobs}
         self._done = {job.folder: job.progress()[0] for job in jobs}
+        self._ended = 0
         self._all = stack.enter_context(reporter.track("all", sum(job.total for job in jobs)))
-        self._stack = stack
-        self._open: dict[Path, contextlib.ExitStack] = {}
-
-    def begin(self, job: Job) -> Advance:
-        """A job starts, or goes on."""
-        self._open[job.folder] = self._stack.enter_context(contextlib.ExitStack())
-        return self._open[job.folder].enter_context(self._reporter.track(job.label, job.total))
 
     def report(self, active: Sequence[_Active], slots: int) -> None:
         """How far all and each of them are."""
         for each in active:
-            self._done[each.job.folder] = each.report()
+            done, note = each.job.progress()
+            each.advance(done, note=note)
+            self._done[each.job.folder] = done
         waits = "" if slots else "  waiting for a worker"
-        self._all(sum(self._done.values()), note=f"{self._ended} of {self._total} ended{waits}")
+        note = f"{self._ended} of {len(self._jobs)} ended{waits}"
+        self._all(sum(self._done.values()), note=note)
 
-    def pause(self, job: Job, why: str) -> None:
-        """A job was lost, and will go on."""
-        self._open.pop(job.folder).close()
-        self._reporter.say(f"lost  {job.label}: {why}; it goes on from what it has saved")
-
-    def end(self, job: Job, error: str | None) -> None:
-        """A job has ended."""
+    def end(self, job: Job) -> None:
+        """Count a job that has ended."""
         self._ended += 1
         self._done[job.folder] = job.total
-        self._open.pop(job.folder).close()
-        self._reporter.say(f"done  {job.label}" if error is None else f"failed  {job.label}: {error}")
-
-
-class _Losses:
-    """How often jobs were lost without anything new to go on from."""
-
-    def __init__(self) -> None:
-        self._counts: dict[Path, tuple[int, int]] = {}  # when anything was saved, losses since
-
-    def give_up(self, job: Job) -> bool:
-        """Count one more loss; whether it is the last."""
-        saved = max((path.stat().st_mtime_ns for path in job.saved if path.exists()), default=0)
-        before, count = self._counts.get(job.folder, (saved, 0))
-        count = count + 1 if before == saved else 1
-        self._counts[job.folder] = saved, count
-        return count >= MOST_LOSSES
 
 
 def run_jobs(
@@ -190,7 +306,7 @@ def run_jobs(
     """
     waiting = deque(jobs)
     active = list[_Active]()
-    losses = _Losses()
+    losses: dict[Path, tuple[int, int]] = {}
     with contextlib.ExitStack() as stack:
         progress = _Progress(jobs, reporter, stack)
         slots = workers.slots()
@@ -198,16 +314,25 @@ def run_jobs(
         try:
             while waiting or active:
                 while waiting and len(active) < max(1, min(slots, workers.most)):
-                    active.append(_handed_out(waiting.popleft(), workers, progress))
+                    active.append(_handed_out(waiting.popleft(), workers, reporter, stack))
                 for each in [each for each in active if each.future.done()]:
-                    outcome = each.outcome()
+                    outcome = _outcome_of(each.future)
                     active.remove(each)
-                    if outcome.state == "lost" and not losses.give_up(each.job):
-                        progress.pause(each.job, outcome.error)
+                    each.bar.close()
+                    if outcome.state == "lost" and not _lost_too_often(each.job, losses):
+                        reporter.say(
+                            f"lost  {each.job.label}: {outcome.error}; it goes on from what it has saved"
+                        )
                         waiting.appendleft(each.job)
                         continue
                     error = None if outcome.state == "done" else outcome.error
-                    progress.end(each.job, error)
+                    if error is None:
+                        (each.job.folder / STDERR).unlink(missing_ok=True)
+                    progress.end(each.job)
+                    words = (
+                        f"done  {each.job.label}" if error is None else f"failed  {each.job.label}: {error}"
+                    )
+                    reporter.say(words)
                     on_end(each.job, error)
                 progress.report(active, slots)
                 time.sleep(POLL_SECONDS)
@@ -216,11 +341,11 @@ def run_jobs(
                     asked_at = time.monotonic()
                     workers.replace_lost()
         except BaseException:  # whatever happens here, no child goes on unwatched
-            _stop(active, workers)
+            _stop([each.future for each in active], workers.client)
             raise
 
 
-def _handed_out(job: Job, workers: Workers, progress: _Progress) -> _Active:
+def _handed_out(job: Job, workers: Workers, reporter: Reporter, stack: contextlib.ExitStack) -> _Active:
     future = workers.client.submit(
         perform,
         tuple(Message(task, files_digest(), code_digest()) for task in job.tasks()),
@@ -229,15 +354,51 @@ def _handed_out(job: Job, workers: Workers, progress: _Progress) -> _Active:
         key=f"{job.label} {time.monotonic_ns()}",
         pure=False,
     )
-    return _Active(job, future, progress.begin(job))
+    bar = stack.enter_context(contextlib.ExitStack())
+    return _Active(job, future, bar.enter_context(reporter.track(job.label, job.total)), bar)
 
 
-def _stop(active: Sequence[_Active], workers: Workers) -> None:
+def _outcome_of(future: Future) -> Outcome:
+    """The outcome of a job that has ended.
+
+    Raises:
+        PolarguideError: the scheduler has gone.
+    """
+    from distributed import KilledWorker
+
+    if future.cancelled():
+        raise PolarguideError(
+            "scheduler",
+            expected="a scheduler until the end",
+            found="that the connection to it was lost",
+            remedy="The same command goes on, once there is a scheduler.",
+        )
+    error = future.exception() if future.status == "error" else None
+    if isinstance(error, KilledWorker):
+        return Outcome("lost", "its worker has gone")
+    if error is not None:
+        return Outcome("failed", f"worker: {(str(error).splitlines() or [type(error).__name__])[0]}")
+    outcome: Outcome = future.result()
+    return outcome
+
+
+def _lost_too_often(job: Job, losses: dict[Path, tuple[int, int]]) -> bool:
+    """Count one more loss; whether it is the last.
+
+    Args:
+        losses: by the folder of a job, when anything was saved, and losses since.
+    """
+    saved = max((path.stat().st_mtime_ns for path in job.saved if path.exists()), default=0)
+    before, count = losses.get(job.folder, (saved, 0))
+    losses[job.folder] = saved, count + 1 if before == saved else 1
+    return losses[job.folder][1] >= MOST_LOSSES
+
+
+def _stop(futures: Sequence[Future], client: Client) -> None:
     """Cancel all, and wait until their processes have ended; a second Ctrl-C kills these."""
-    client = workers.client
-    keys = [each.future.key for each in active]
+    keys = [future.key for future in futures]
     with contextlib.suppress(Exception):  # the scheduler may be what has gone
-        client.cancel([each.future for each in active], force=True)
+        client.cancel(futures, force=True)
         try:
             while any(client.run(count_at_work, keys).values()):
                 time.sleep(POLL_SECONDS)
@@ -262,7 +423,7 @@ def last_row(log: Path) -> LogRow | None:
         if not log.is_file():  # a pipe would never end
             return None
         with open(log, "rb") as file:
-            file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL_BYTES))
+            file.seek(max(0, log.stat().st_size - TAIL_BYTES))
             lines = file.read(TAIL_BYTES).split(b"\n")
     except OSError:
         return None

@@ -60,8 +60,9 @@ def join_tables(
     """
     paths = [Path(part) / RECORD if Path(part).is_dir() else Path(part) for part in parts]
     if not paths:
-        remedy = "Name at least one results.json."
-        raise PolarguideError("tables", expected="a record", found="none", remedy=remedy)
+        raise PolarguideError(
+            "tables", expected="a record", found="none", remedy="Name at least one results.json."
+        )
     written = os.path.realpath(Path(out) / RECORD)
     if len(paths) > 1 and written in map(os.path.realpath, paths):
         raise PolarguideError(
@@ -77,8 +78,8 @@ def join_tables(
     if layout is not None:
         check_choice("layout", layout, list(LAYOUTS))
         write_publication_tables(Path(out), joined, LAYOUTS[layout])
-    remark = "Pictures are in the reports of the parts."
-    write_text(Path(out) / REPORT, report_html(joined, [], {}, [remark]))
+    html = report_html(joined, [], {}, ["Pictures are in the reports of the parts."])
+    write_text(Path(out) / REPORT, html)
     return joined
 
 

@@ -24,7 +24,7 @@ from polarguide.capture import View
 from polarguide.capture.layout import SHARE
 from polarguide.capture.variants import black_pixels, mask_background
 from polarguide.core.errors import PolarguideError
-from polarguide.core.options import Exposures, SceneOptions, index_of
+from polarguide.core.options import DeviceName, Exposures, SceneOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import free_memory
 from polarguide.raster import Backend
@@ -32,16 +32,16 @@ from polarguide.results.evaluation.record import PACKAGE, _digest, code_digest, 
 from polarguide.results.evaluation.target import SceneFacts
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, PLY, RunConfiguration, most_gaussians
 from polarguide.runs.memory_plan import pixels_of, plan_memory
-from polarguide.runs.opened import read_scene
+from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import STEPS, TrainSettings
 from polarguide_bench.gnerp.memory import plan_field_memory
+from polarguide_bench.gnerp.runs import FieldRun, open_field
 from polarguide_bench.options import ClusterOptions, CompareOptions
-from polarguide_bench.recipes import AnyRecipe, ablations_of
+from polarguide_bench.recipes import AnyRecipe, ablations_of, recipe_named
 
 State = Literal["new", "begun", "trained", "done"]
 RUNS = "runs"
-KEY_DIGITS = 10
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ class TableRow:
     @property
     def about(self) -> str:
         """In one line."""
-        plain = self.name == self.recipe.name
-        about = self.recipe.about if plain else f"{self.recipe.name}, {self.exposures}"
+        named = self.name == self.recipe.name
+        about = self.recipe.about if named else f"{self.recipe.name}, {self.exposures}"
         return about if self.steps is None else f"{about.removesuffix('.')}; {self.steps:,} steps."
 
 
@@ -99,14 +99,13 @@ class Comparison:
         rows = []
         for recipe in self.recipes:
             steps = self.steps_of.get(recipe.name)
-            unpolarized = f"{recipe.name}:unpolarized"
             if not self.options.exposures:
                 rows.append(TableRow(recipe.name, recipe, self.settings.exposures, steps))
             for word in self.options.exposures:
                 name = word if len(self.recipes) == 1 else f"{recipe.name} {word}"
                 # Without any polarization in the pictures, the recipe without its terms, if there is one.
-                others = [r for r in ablations_of(recipe.name) if word == "none" and r.name == unpolarized]
-                rows.append(TableRow(name, next(iter(others), recipe), word, steps))
+                controls = {r.name: r for r in ablations_of(recipe.name) if word == "none"}
+                rows.append(TableRow(name, controls.get(f"{recipe.name}:unpolarized", recipe), word, steps))
         return tuple(rows)
 
     def seeds(self, recipe: AnyRecipe) -> range:
@@ -205,13 +204,15 @@ class PlannedRun:
             )
             == (self.recipe.name, self.reading.downscale, self.reading.transfer, self.scene.test_views)
         )
-        if same and self.metrics() is not None:
+        if not same:
+            return "begun"
+        if self.metrics() is not None:
             return "done"
         # Scoring looks for the scene where the training found it: going on with the training takes up a moved one.
         moved = configuration.scene != str(self.scene.path.resolve())
         leaves = PLY if isinstance(self.recipe, Recipe) else CHECKPOINT
         finished = (self.folder / leaves).exists() and trained_steps(self.folder) == self.steps
-        return "trained" if same and finished and not moved else "begun"
+        return "trained" if finished and not moved else "begun"
 
     def metrics(self) -> dict[str, Any] | None:
         """The record of its scores, or None where there is no valid one by this version."""
@@ -235,23 +236,31 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
         if comparison.settings.background == "masked":
             scene = mask_background(scene)
         if scene.name in [entry.name for entry in entries]:
-            expected = "scenes with names of their own"
-            remedy = "Rename a folder."
-            raise PolarguideError(path, expected=expected, found=f"{scene.name} twice", remedy=remedy)
+            raise PolarguideError(
+                path,
+                expected="scenes with names of their own",
+                found=f"{scene.name} twice",
+                remedy="Rename a folder.",
+            )
         if not scene.test_names:
-            remedy = "Name some in split.json to score on."
-            raise PolarguideError(path, expected="test views", found="none", remedy=remedy)
+            raise PolarguideError(
+                path, expected="test views", found="none", remedy="Name some in split.json to score on."
+            )
         if comparison.settings.refractive_index is None and scene.refractive_index is not None:
             reporter.say(f"{scene.name}: refractive index {scene.refractive_index:g}, as scene.json says")
-        share = black_share(scene.test_views[0])
-        facts = SceneFacts.of(scene)
-        for warning in facts.warnings:
+        warnings = SceneFacts.of(scene).warnings
+        for warning in warnings:
             reporter.warn(f"{scene.name}: {warning}")
-        count = len(scene.views)
-        names = scene.test_names
         entries.append(
             SceneEntry(
-                path, scene.name, scene.digest, count, names, share, facts.warnings, scene.refractive_index
+                path,
+                scene.name,
+                scene.digest,
+                len(scene.views),
+                scene.test_names,
+                black_share(scene.test_views[0]),
+                warnings,
+                scene.refractive_index,
             )
         )
     return entries
@@ -311,7 +320,7 @@ def run_key(
     """
     parts = [scene_digest, recipe, asdict(settings), asdict(reading), code]
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:KEY_DIGITS]
+    return hashlib.sha256(text.encode()).hexdigest()[:10]
 
 
 def most_memory(runs: Sequence[PlannedRun]) -> int:
@@ -328,7 +337,8 @@ def most_memory(runs: Sequence[PlannedRun]) -> int:
 
 def _expected_memory(run: PlannedRun, pixels: Sequence[int]) -> int:
     if isinstance(run.recipe, Recipe):
-        return expected_memory(pixels, run.recipe, run.settings, run.reading)
+        gaussians = most_gaussians(sum(pixels), run.recipe, run.settings, None)
+        return plan_memory(pixels, run.recipe, gaussians, limit=run.reading.memory).peak
     return plan_field_memory(pixels, run.recipe, limit=run.reading.memory).peak
 
 
@@ -377,22 +387,19 @@ def compared_steps(*specified: int | None) -> int:
     return next((steps for steps in specified if steps is not None), STEPS)
 
 
-def expected_memory(
-    pixels: Sequence[int], recipe: Recipe, settings: TrainSettings, reading: SceneOptions
-) -> int:
-    """Bytes that the process of a training takes at most, as far as headers tell.
-
-    Args:
-        pixels: of each view, as ``memory_plan.pixels_of`` reads them. recipe, settings, reading: of the training.
-
-    Raises:
-        PolarguideError: the limit in ``reading`` is too small.
-    """
-    gaussians = most_gaussians(sum(pixels), recipe, settings, None)
-    return plan_memory(pixels, recipe, gaussians, limit=reading.memory).peak
-
-
 def model_digest(kind: type) -> str:
     """Digest of the file that defines a plug-in's shading model; empty for models of this package."""
     file = Path(inspect.getfile(kind))
     return "" if PACKAGE in file.parents else _digest(file.parent, [file])
+
+
+def open_compared(folder: str | Path, device: DeviceName = "auto") -> OpenedRun | FieldRun:
+    """Open a run of a comparison.
+
+    Raises:
+        PolarguideError: the folder is no run, is damaged, or belongs to another version.
+    """
+    recipe = recipe_named(RunConfiguration.load(Path(folder)).recipe)
+    if isinstance(recipe, Recipe):
+        return OpenedRun.open(folder, recipe=recipe, device=device)
+    return open_field(folder, recipe, device=device)

@@ -124,8 +124,7 @@ def measured_section(results: Results, layout: PublicationLayout) -> Section:
         stated.append(f"The record has no runs of {', '.join(absent)}.")
     if not any(row.cells["fps"].count for row in results.table):
         stated.append("FPS was not measured: give the command of the comparison again with --speed.")
-    headings = list(columns)
-    return Section(layout.name, layout.title, ("metric",), headings, blocks, [*replaced, *stated])
+    return Section(layout.name, layout.title, ("metric",), [*columns], blocks, [*replaced, *stated])
 
 
 def _earlier_versions(results: Results, names: Iterable[str]) -> Iterator[str]:
@@ -144,10 +143,10 @@ def published_section(layout: PublicationLayout) -> Section:
     blocks: list[tuple[str, list[TableRow]]] = []
     for dataset, rows in frame.groupby("dataset", sort=False):
         block: list[TableRow] = []
-        for row in rows.to_dict("records"):
+        for _, row in rows.iterrows():
             metric = _column(METRICS[row["metric"]][0])
-            values = {method: float(row[method]) for method in methods}
-            best = max(values.values()) if metric.better == "higher" else min(values.values())
+            values = row[methods].astype(float)
+            best = values.max() if metric.better == "higher" else values.min()
             cells = [(row[m], "", values[m] == best and row["metric"] != "FPS") for m in methods]
             block.append(([(_label(metric), False, "")], cells))
         blocks.append((str(dataset), block))
@@ -156,18 +155,12 @@ def published_section(layout: PublicationLayout) -> Section:
 
 
 def _measured_row(results: Results, scene: str, metric: Metric, columns: Mapping[str, str]) -> TableRow:
-    of_recipe = {row.recipe: row for row in results.table if row.scene == scene}
-    rows = [of_recipe[name] for name in columns.values()]
-    values = {scene: values_of(results.record, metric_of_runs(metric.key), [scene]).get(scene)}
-    known = {name: units for name, units in values.items() if units is not None}
-    places = [results.recipes.index(name) for name in columns.values()]
-    means = {
-        i: mean
-        for i, row in zip(places, rows, strict=True)
-        if (mean := row.cells[metric.key].mean) is not None
-    }
-    bold = leaders(means, known, metric, scatter_on(results.record, known, metric))
-    cells = [score_cell(row, metric, i in bold, results) for i, row in zip(places, rows, strict=True)]
+    all_rows = [row for row in results.table if row.scene == scene]
+    rows = {i: row for name in columns.values() for i, row in enumerate(all_rows) if row.recipe == name}
+    values = values_of(results.record, metric_of_runs(metric.key), [scene])
+    means = {i: mean for i, row in rows.items() if (mean := row.cells[metric.key].mean) is not None}
+    bold = leaders(means, values, metric, scatter_on(results.record, values, metric))
+    cells = [score_cell(row, metric, i in bold, results) for i, row in rows.items()]
     return [(_label(metric), False, "")], cells
 
 

@@ -143,8 +143,11 @@ class Record(msgspec.Struct):
             for kind, names_of_kind in names.items():
                 _require(f"runs[{index}].{kind}", getattr(run, kind), names_of_kind)
             if (run.metrics is None) == (run.state == "done"):
-                expected = "values for a run that is done and null for another"
-                raise _fault(f"runs[{index}].metrics", expected, run.metrics)
+                raise _fault(
+                    f"runs[{index}].metrics",
+                    "values for a run that is done and null for another",
+                    run.metrics,
+                )
 
 
 def read_results(path: Path) -> Record:

@@ -31,11 +31,9 @@ from polarguide.runs.health import Health
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.visualization import figures
 from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture
-from polarguide.visualization.pages import BASE, LAYERS, page, page_part, templates
-from polarguide_bench.embedding import EmbeddedView, Tile, chosen_views, embed
+from polarguide.visualization.pages import BASE, LAYERS, data_uri, page, page_part, templates
 from polarguide_bench.gnerp.runs import FieldRun
-from polarguide_bench.opened import open_compared
-from polarguide_bench.plan import Comparison, PlannedRun, SceneEntry
+from polarguide_bench.plan import Comparison, PlannedRun, SceneEntry, open_compared
 from polarguide_bench.results import Results
 from polarguide_bench.tables import formatted, sections, seed_counts
 
@@ -83,16 +81,14 @@ def panel(title: str, axis: str, series: list[Series], columns: Sequence[list[st
         columns: words at the places 0, 1, ... of the x axis; without any, it has round numbers.
     """
     points = [point for of in series for point in of.points]
-    first = min(x for x, _, _ in points)
-    last = max(x for x, _, _ in points)
-    numbers = ticks(first if first > last / 2 else 0.0, last)
-    x_ticks = [(float(place), words) for place, words in enumerate(columns)] or [
-        (number, [f"{number:,g}"]) for number in numbers
-    ]
-    x_ends = (-0.5, len(columns) - 0.5) if columns else (numbers[0], numbers[-1])
-    return Panel(
-        title, axis, series, x_ticks, x_ends, ticks(min(p[1] for p in points), max(p[1] for p in points))
-    )
+    x, y, _ = zip(*points, strict=True)
+    y_ticks = ticks(min(y), max(y))
+    if columns:
+        x_ticks = [(float(place), words) for place, words in enumerate(columns)]
+        return Panel(title, axis, series, x_ticks, (-0.5, len(columns) - 0.5), y_ticks)
+    numbers = ticks(min(x) if min(x) > max(x) / 2 else 0.0, max(x))
+    x_ticks = [(number, [f"{number:,g}"]) for number in numbers]
+    return Panel(title, axis, series, x_ticks, (numbers[0], numbers[-1]), y_ticks)
 
 
 def ticks(low: float, high: float) -> list[float]:
@@ -105,14 +101,19 @@ def ticks(low: float, high: float) -> list[float]:
     return [round(index * step, 10) for index in range(first, max(last, first + 1) + 1)]
 
 
-def chart(panels: Sequence[Panel], legend: Sequence[str], *, lines: bool = True) -> str:
-    """An SVG file, its colors in the order of the legend."""
-    size = {"width": 430, "height": 330}
-    return _svg(panels=panels, legend=legend, lines=lines, label="scores", **size)
-
-
-def _svg(**values: object) -> str:
-    return templates(BASE).get_template("chart.svg").render(dashes=DASHES, **values)
+def chart(
+    panels: Sequence[Panel],
+    legend: Sequence[str],
+    *,
+    lines: bool = True,
+    label: str = "scores",
+    size: tuple[int, int] = (430, 330),
+) -> str:
+    """An SVG file, its colors in the order of the legend; ``size``: width and height of a panel."""
+    template = templates(BASE).get_template("chart.svg")
+    return template.render(
+        dashes=DASHES, panels=panels, legend=legend, lines=lines, label=label, width=size[0], height=size[1]
+    )
 
 
 class Curve(NamedTuple):
@@ -150,7 +151,7 @@ def curves_svg(curves: Sequence[Curve], axis: str) -> str:
         Series(c.name, [(x, y, "") for x, y in zip(getattr(c, axis), c.psnr, strict=True)]) for c in curves
     ]
     panels = [panel("PSNR (dB), training views", axis, series)]
-    return _svg(panels=panels, legend=(), lines=True, label=f"PSNR over {axis}", width=860, height=340)
+    return chart(panels, (), label=f"PSNR over {axis}", size=(860, 340))
 
 
 def read_study(scene: Path) -> tuple[str, float] | None:
@@ -226,6 +227,64 @@ def _scores(results: Results, metric: Metric) -> list[tuple[str, str, float]]:
     return list(zip(table["scene"], table["recipe"], table[metric.key], strict=True))
 
 
+SIDES = (1600, 1200, 800, 600, 400, 300, 200)
+"""Longest sides in pixels to try until a view fits its share of the file."""
+
+
+class Tile(NamedTuple):
+    """One method (or the ground truth) on one view: its layers, and its scores there as a line of text a layer."""
+
+    name: str
+    pictures: Mapping[str, Picture]
+    scores: Mapping[str, str]
+
+
+class EmbeddedView(NamedTuple):
+    """One view of a scene with all its tiles as data URIs.
+
+    Attributes:
+        scene, view: names. width, height: those of the captured pictures, for the shape of the tiles.
+        tiles: for each its name, its layers as data URIs, and its lines of scores.
+    """
+
+    scene: str
+    view: str
+    width: int
+    height: int
+    tiles: tuple[tuple[str, dict[str, str], dict[str, str]], ...]
+
+
+def embed(scene: str, view: str, tiles: Sequence[Tile], limit: int) -> tuple[EmbeddedView | None, str | None]:
+    """Encode one view, smaller if it has to be.
+
+    Args:
+        scene, view: names.
+        tiles: at least one, of pictures of one size.
+        limit: bytes that the data URIs may take.
+
+    Returns:
+        The view, or None if it does not fit; and a sentence on what was reduced or left out, or None.
+    """
+    height, width = next(iter(tiles[0].pictures.values())).shape[:2]
+    longest = max(height, width)
+    for side in (longest, *(side for side in SIDES if side < longest)):
+        encoded = tuple(
+            (t.name, {key: data_uri(p, key, side) for key, p in t.pictures.items()}, dict(t.scores))
+            for t in tiles
+        )
+        if sum(len(uri) for _, uris, _ in encoded for uri in uris.values()) <= limit:
+            note = f"{scene}, {view}: pictures reduced from {longest} to {side} pixels."
+            return EmbeddedView(scene, view, width, height, encoded), note if side < longest else None
+    return None, f"{scene}, {view}: pictures left out, they would make the file too large."
+
+
+def chosen_views(names: Sequence[str], count: int) -> list[str]:
+    """At most ``count`` of the names, evenly spread, the first among them."""
+    if count >= len(names):
+        return list(names)
+    return [names[index * len(names) // count] for index in range(count)]
+
+
 REPORT = "report.html"
 ERROR_SHEET = "errors.png"
 """What scoring writes into a run's folder where it draws the errors."""
@@ -268,10 +327,8 @@ def write_report(
     sheets: dict[str, list[tuple[str, str]]] = {}
     finished = [run for run in plan if run.state() == "done"]
     for scene in scenes:
-        first: dict[str, PlannedRun] = {}  # by row, the run with the lowest seed
-        for run in finished:
-            if run.scene.name == scene.name:
-                first.setdefault(run.row.name, run)
+        # By row, the run with the lowest seed, which comes first.
+        first = {run.row.name: run for run in reversed(finished) if run.scene.name == scene.name}
         runs = [first[row.name] for row in comparison.rows if row.name in first]
         sheets[scene.name] = [
             (run.row.name, (run.folder / ERROR_SHEET).relative_to(comparison.out).as_posix())
@@ -292,8 +349,8 @@ def write_report(
                 views += [view] if view is not None else []
                 remarks += [remark] if remark is not None else []
                 advance(count)
-    text = report_html(results, views, curves, remarks, sheets, _health(finished))
-    write_text(comparison.out / REPORT, text)
+    html = report_html(results, views, curves, remarks, sheets, _health(finished))
+    write_text(comparison.out / REPORT, html)
 
 
 def _health(runs: Sequence[PlannedRun]) -> list[str]:
@@ -391,7 +448,7 @@ def report_html(
         title=f"Comparison on {', '.join(results.scenes)}",
         summary=_summary(results),
         sections=sections(results),
-        views=[vars(view) for view in views],
+        views=[view._asdict() for view in views],
         layers={key: label for key, label in LAYERS.items() if metal or key != "metalness"},
         legend=LEGEND,
         remarks=remarks,

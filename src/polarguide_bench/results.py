@@ -185,10 +185,10 @@ def training_noise(by_seed: Numbers, scatter: Sequence[float | None]) -> float |
     values = _means_by_seed(by_seed)
     if len(values) >= LEAST_UNITS:
         return t_half_width(values)
-    if None not in scatter:
-        variances = [(s or 0.0) ** 2 / len(known(row)) for s, row in zip(scatter, by_seed, strict=True)]
-        return NORMAL_QUANTILE * math.sqrt(math.fsum(variances)) / len(by_seed)
-    return None
+    if None in scatter:
+        return None
+    variances = [(s or 0.0) ** 2 / len(known(row)) for s, row in zip(scatter, by_seed, strict=True)]
+    return NORMAL_QUANTILE * math.sqrt(math.fsum(variances)) / len(by_seed)
 
 
 def is_noise(by_seed: Numbers, scatter: Sequence[float | None]) -> bool | None:
@@ -221,6 +221,9 @@ def pair(
     place = {entry.name: index for index, entry in enumerate(record.recipes)}
     pairs = {o: [paired(v[place[recipe]], v[place[o]]) for v in values.values()] for o in others}
     whole = [other for other in others if values and all(apart.size for apart in pairs[other])]
+    if not whole:
+        return None
+    chosen = whole[0]
     if len(whole) > 1:
         every = [shared(v[[place[name] for name in (recipe, *whole)]]) for v in values.values()]
         if not all(v.size for v in every):
@@ -228,10 +231,6 @@ def pair(
         sign = 1 if column.better == "higher" else -1
         levels = [fmean([x for v in every for x in known(v[1 + k])]) * sign for k in range(len(whole))]
         chosen = whole[levels.index(max(levels))]
-    elif whole:
-        (chosen,) = whole
-    else:
-        return None
     scatters = scatter_on(record, values, column) if scatter else [None] * len(values)
     left_out = [o for o in others if o not in whole]
     return {"other": chosen, **estimate(pairs[chosen], scatters), "left_out": left_out}
@@ -307,7 +306,7 @@ def cell_of(values: Sequence[float | None]) -> Cell:
     return Cell(fmean(numbers), spread, len(numbers)) if numbers else Cell()
 
 
-class Row(NamedTuple):
+class ScoreRow(NamedTuple):
     """One recipe on one scene (None: the mean over scenes), of ``finished`` runs; cells by metric."""
 
     scene: str | None
@@ -378,7 +377,7 @@ class Results:
         return differences(self.record, COMPARED)
 
     @cached_property
-    def table(self) -> list[Row]:
+    def table(self) -> list[ScoreRow]:
         """A row for every scene and recipe, and, with several scenes, one for the mean over scenes of every recipe.
 
         In that mean every scene has one weight, and a quantity is given only where the recipe has it on every scene on
@@ -394,7 +393,7 @@ class Results:
                     numbers = [v[index, :, 0] for s, v in of.items() if scene in (None, s)]
                     cells[key] = cell_of(known(numbers[0])) if scene and numbers else _over_scenes(numbers)
                 finished = len(scored) if scene is None else scored.count(scene)
-                rows.append(Row(scene, recipe, finished, cells))
+                rows.append(ScoreRow(scene, recipe, finished, cells))
         return rows
 
     def content(self) -> dict[str, Any]:

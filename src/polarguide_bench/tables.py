@@ -11,18 +11,25 @@ from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from msgspec import UNSET
 
 from polarguide.core.files import write_text
-from polarguide.core.text import printable
-from polarguide.results.evaluation.table import COLUMNS, MESH_LABEL, PART_METRICS, Metric
+from polarguide.core.text import plain, printable
+from polarguide.results.evaluation.table import (
+    COLUMNS,
+    MESH_LABEL,
+    METAL_SHARE,
+    METRICS,
+    PART_METRICS,
+    Metric,
+)
 from polarguide.visualization.pages import templates
-from polarguide_bench.csv_files import csv_text
 from polarguide_bench.record import RunRecord
 from polarguide_bench.results import (
     Cell,
     Results,
-    Row,
+    ScoreRow,
     Values,
     controlled,
     known,
@@ -81,9 +88,9 @@ class Section(NamedTuple):
     notes: list[str]
 
 
-def formatted(value: float, column: Metric) -> str:
-    """A recorded value as tables show it, without its unit."""
-    return f"{value * column.factor:,.{column.digits}f}"
+def formatted(value: float | None, column: Metric) -> str:
+    """A recorded value as tables show it, without its unit; empty for None."""
+    return "" if value is None else f"{value * column.factor:,.{column.digits}f}"
 
 
 def signed(value: float, column: Metric) -> str:
@@ -154,7 +161,7 @@ def leaders(
     return same_digits | {index for index, told in apart.items() if told is False}
 
 
-def score_cell(row: Row, column: Metric, bold: bool, results: Results) -> TableCell:
+def score_cell(row: ScoreRow, column: Metric, bold: bool, results: Results) -> TableCell:
     """The cell of a recipe's score on a scene."""
     cell: Cell = row.cells[column.key]
     if cell.mean is None:
@@ -171,7 +178,7 @@ def seed_counts(results: Results) -> list[int]:
     return sorted(set(Counter((run.scene, run.recipe) for run in results.record.runs).values()))
 
 
-def _remark(row: Row, results: Results) -> str:
+def _remark(row: ScoreRow, results: Results) -> str:
     """Its number of steps where that is not the others', and what is missing of it, else its seeds if rows differ."""
     (steps,) = (recipe.steps for recipe in results.record.recipes if recipe.name == row.recipe)
     states = [r.state for r in results.record.runs if r.recipe == row.recipe and row.scene in (None, r.scene)]
@@ -432,3 +439,28 @@ def write_tables(out: Path, results: Results) -> None:
 def readable(tables: Sequence[Section], name: str) -> str:
     """Tables with their notes, as ``results.md`` or ``results.tex``."""
     return _TEXTS.get_template(name).render(sections=tables)
+
+
+def csv_text(frame: pd.DataFrame) -> str:
+    """A frame in full precision, with the numbers that pages show; nothing in it is a formula to a spreadsheet.
+
+    Metrics have the unit of tables where records have another, and keys that end with it: ``haze_percent``.
+
+    Args:
+        frame: metrics are columns by their keys, with their ``_spread``; or lines, of which ``metric`` has the key.
+    """
+    frame = frame.copy()
+    names = {}
+    for metric in (*METRICS, METAL_SHARE):
+        if metric.factor == 1:
+            continue
+        shown = f"{metric.key}_{'percent' if metric.unit == '%' else metric.unit}"
+        for suffix in ("", "_spread"):
+            names[metric.key + suffix] = shown + suffix
+            if metric.key + suffix in frame:
+                frame[metric.key + suffix] = frame[metric.key + suffix].astype(float) * metric.factor
+        if "metric" in frame:
+            frame.loc[frame["metric"] == metric.key, ["mean", "low", "high"]] *= metric.factor
+    if "metric" in frame:
+        frame["metric"] = frame["metric"].replace(names)
+    return frame.rename(columns=names).map(plain).to_csv(index=False, lineterminator="\n")

@@ -6,13 +6,13 @@ Of a batch it takes one capture through all its steps: prepare, inspect, train, 
 from __future__ import annotations
 
 import _thread
+import io
 import os
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ from polarguide.training.recipe import Recipe
 from polarguide.visualization import figures
 from polarguide.visualization.layers import layer_picture
 from polarguide.visualization.pages import data_uri
-from polarguide_bench.children import Message, Scoring, Task, files_digest
+from polarguide_bench.children import Message, Task, Training, files_digest
 from polarguide_bench.collection import (
     EXPORT,
     FORMAT,
@@ -54,7 +54,7 @@ from polarguide_bench.collection import (
     prepare_settings,
 )
 from polarguide_bench.gnerp.runs import FieldRun, train_field
-from polarguide_bench.opened import open_compared
+from polarguide_bench.plan import open_compared
 from polarguide_bench.recipes import recipe_named
 
 THUMBNAIL = 320
@@ -72,117 +72,89 @@ def process(task: Processing) -> None:
     make_folder(folder)
     record = CaptureRecord.load(folder) or CaptureRecord(FORMAT, task.request)
     record.require(task.request, folder)
-    work = _Work(task, folder)
+    scene = Path(task.request.source) if task.request.prepare is None else folder / SCENE
     for step in STEPS:
-        if step in record.done:
-            continue
-        record = msgspec.structs.replace(record, at=step)
-        record.save(folder)
-        results = work.steps[step]()
-        record = msgspec.structs.replace(record, done=(*record.done, step), **results)
-        record.save(folder)
+        if step not in record.done:
+            record = msgspec.structs.replace(record, at=step)
+            record.save(folder)
+            results = _ACTIONS[step](task, scene, folder) or {}
+            record = msgspec.structs.replace(record, done=(*record.done, step), **results)
+            record.save(folder)
 
 
-@dataclass
-class _Work:
-    """The steps of one capture; each returns what its record is to hold."""
-
-    task: Processing
-    folder: Path
-    steps: dict[Step, Callable[[], dict[str, Any]]] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.steps = {
-            "prepare": self._prepare,
-            "inspect": self._inspect,
-            "train": self._train,
-            "eval": self._evaluate,
-            "share": self._share,
-            "export": self._export,
-        }
-
-    @property
-    def _scene(self) -> Path:
-        request = self.task.request
-        return Path(request.source) if request.prepare is None else self.folder / SCENE
-
-    def _prepare(self) -> dict[str, Any]:
-        request = self.task.request
-        if request.prepare is None:
-            return {}
-        prepared = prepare_scene(request.source, self._scene, prepare_settings(request.prepare))
-        if not prepared.posed:
-            raise PolarguideError(
-                prepared.folder,
-                expected="a scene with poses",
-                found="none",
-                remedy="Give --poses sfm or --poses PATH among its options.",
-            )
-        return {}
-
-    def _inspect(self) -> dict[str, Any]:
-        out = self.folder / INSPECTION
-        reading = self.task.request.reading
-        settings = self.task.request.settings
-        inspect_settings = InspectSettings(
-            refractive_index=settings.refractive_index, transfer=reading.transfer
+def _prepare(task: Processing, scene: Path, folder: Path) -> None:
+    if task.request.prepare is None:
+        return
+    prepared = prepare_scene(task.request.source, scene, prepare_settings(task.request.prepare))
+    if not prepared.posed:
+        raise PolarguideError(
+            prepared.folder,
+            expected="a scene with poses",
+            found="none",
+            remedy="Give --poses sfm or --poses PATH among its options.",
         )
-        inspected = inspect_scene(
-            self._scene, out, inspect_settings, choose_backend(self.task.compute.device)
+
+
+def _inspect(task: Processing, scene: Path, folder: Path) -> dict[str, Any]:
+    out = folder / INSPECTION
+    settings = InspectSettings(
+        refractive_index=task.request.settings.refractive_index, transfer=task.request.reading.transfer
+    )
+    inspected = inspect_scene(scene, out, settings, choose_backend(task.compute.device))
+    write_inspection(inspected, out)
+    findings = tuple(
+        f"{check.verdict}: {check.title}: {check.finding}"
+        for check in inspected.checks
+        if check.verdict not in ("ok", "n/a")
+    )
+    return {"verdict": inspected.verdict, "findings": findings}
+
+
+def _train(task: Processing, scene: Path, folder: Path) -> None:
+    request = task.request
+    _train_run(
+        Training(
+            str(scene), str(folder / RUN), request.recipe, request.settings, request.reading, task.compute
         )
-        write_inspection(inspected, out)
-        findings = tuple(
-            f"{check.verdict}: {check.title}: {check.finding}"
-            for check in inspected.checks
-            if check.verdict not in ("ok", "n/a")
-        )
-        return {"verdict": inspected.verdict, "findings": findings}
-
-    def _train(self) -> dict[str, Any]:
-        request = self.task.request
-        run = self.folder / RUN
-        with StopSignals() as should_stop:
-            train(
-                self._scene,
-                run,
-                recipe=request.recipe,
-                settings=request.settings,
-                session=SessionOptions(self.task.compute.threads, self.task.compute.device),
-                reading=request.reading,
-                resume=os.path.lexists(run / CONFIGURATION),
-                should_stop=should_stop,
-            )
-        return {}
-
-    def _opened(self) -> OpenedRun:
-        return OpenedRun.open(self.folder / RUN, device=self.task.compute.device)
-
-    def _evaluate(self) -> dict[str, Any]:
-        run = self._opened()
-        evaluate(run, speed=False)
-        view = (run.scene.test_views or run.scene.train_views)[0]
-        pictures = [("photograph", figures.radiance_to_rgb(view.photograph()))]
-        result = run.model.render(view.camera, surface=True).to("cpu")
-        for layer in ("final", "specular", "normal"):
-            picture = layer_picture(result, layer, view.camera)
-            if picture is not None:
-                pictures.append((layer, picture))
-        return {
-            "pictures": tuple((label, data_uri(picture, label, THUMBNAIL)) for label, picture in pictures)
-        }
-
-    def _share(self) -> dict[str, Any]:
-        web_page.share(self._opened(), self.folder / SHARE, title=self.task.name)
-        return {}
-
-    def _export(self) -> dict[str, Any]:
-        run = self._opened()
-        out = self.folder / EXPORT
-        files = [path for kind in self.task.request.formats for path in formats.export(run, kind, out)]
-        return {"files": tuple(path.relative_to(self.folder).as_posix() for path in files)}
+    )
 
 
-STDIN = 0
+def _evaluate(task: Processing, scene: Path, folder: Path) -> dict[str, Any]:
+    run = OpenedRun.open(folder / RUN, device=task.compute.device)
+    evaluate(run, speed=False)
+    view = (run.scene.test_views or run.scene.train_views)[0]
+    result = run.model.render(view.camera, surface=True).to("cpu")
+    pictures = {"photograph": figures.radiance_to_rgb(view.photograph())}
+    pictures |= {
+        layer: picture
+        for layer in ("final", "specular", "normal")
+        if (picture := layer_picture(result, layer, view.camera)) is not None
+    }
+    return {"pictures": tuple((label, data_uri(p, label, THUMBNAIL)) for label, p in pictures.items())}
+
+
+def _share(task: Processing, scene: Path, folder: Path) -> None:
+    run = OpenedRun.open(folder / RUN, device=task.compute.device)
+    web_page.share(run, folder / SHARE, title=task.name)
+
+
+def _export(task: Processing, scene: Path, folder: Path) -> dict[str, Any]:
+    run = OpenedRun.open(folder / RUN, device=task.compute.device)
+    files = [path for kind in task.request.formats for path in formats.export(run, kind, folder / EXPORT)]
+    return {"files": tuple(path.relative_to(folder).as_posix() for path in files)}
+
+
+_ACTIONS: dict[Step, Callable[[Processing, Path, Path], dict[str, Any] | None]] = {
+    "prepare": _prepare,
+    "inspect": _inspect,
+    "train": _train,
+    "eval": _evaluate,
+    "share": _share,
+    "export": _export,
+}
+"""Function of each step of a capture; it returns fields of the capture's record."""
+
+
 PATIENCE_SECONDS = 120.0
 """How long to wait for a process that has lost its worker: it still saves the state that this one goes on from."""
 
@@ -193,40 +165,29 @@ def main() -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.default_int_handler)
     keep_freed_memory()
+    # Unbuffered: a thread that waits for more would hold the buffer at the process's end.
+    stdin = io.FileIO(0, closefd=False)
+
+    def stop_at_end_of_input() -> None:
+        """Interrupt the main thread when the other end is closed: a worker asks to stop, or was killed."""
+        stdin.readall()
+        _thread.interrupt_main()
+
     try:
-        line = _read_line()
-        if not line.endswith(b"\n"):  # nobody has sent a whole one
-            return obey(line)
-        threading.Thread(target=_stop_at_end_of_input, daemon=True).start()
+        line = stdin.readline()
+        if line.endswith(b"\n"):  # nobody waits for the end of a line that is cut short
+            threading.Thread(target=stop_at_end_of_input, daemon=True).start()
         return obey(line)
     except KeyboardInterrupt:
         return 130
-
-
-def _read_line() -> bytes:
-    """A line of standard input. Unbuffered: a thread that waits for more would hold the buffer at the process's end."""
-    data = b""
-    while not data.endswith(b"\n") and (more := os.read(STDIN, 1 << 16)):
-        data += more
-    return data
-
-
-def _stop_at_end_of_input() -> None:
-    """Interrupt the main thread when nobody holds the other end of standard input any more.
-
-    That is how a worker asks to stop, and what happens when it is killed: no child goes on unwatched.
-    """
-    while os.read(STDIN, 1 << 16):
-        pass
-    _thread.interrupt_main()
 
 
 def obey(line: bytes) -> int:
     """Do a task; returns the exit status (0 done, 130 stopped, 2 wrong input, with one line)."""
     try:
         message: Any = decode(line, Message, "task")
-        check_code(message)
-        do(message.task)
+        _check_code(message)
+        _do(message.task)
     except PolarguideError as error:
         print(error, file=sys.stderr)
         return 2
@@ -238,7 +199,7 @@ def obey(line: bytes) -> int:
     return 0
 
 
-def check_code(message: Message) -> None:
+def _check_code(message: Message) -> None:
     """Refuse to compute with other code than that of the command: results would be mixed. Comments do not count.
 
     Raises:
@@ -253,22 +214,21 @@ def check_code(message: Message) -> None:
         )
 
 
-def do(task: Task) -> None:
-    """Train, score, or process a capture.
-
-    Raises:
-        PolarguideError: the input is wrong, or the training has diverged.
-        KeyboardInterrupt: stopped; a training has saved its state.
-    """
+def _do(task: Task) -> None:
     use_threads(task.compute.threads)
     if isinstance(task, Processing):
         _wait_for_others(Path(task.folder) / RUN)
         process(task)
-        return
-    if isinstance(task, Scoring):
-        score(task)
-        return
-    _wait_for_others(Path(task.folder))
+    elif isinstance(task, Training):
+        _wait_for_others(Path(task.folder))
+        _train_run(task)
+    else:
+        run = open_compared(task.folder, task.compute.device)
+        evaluate(run, speed=task.speed, surface=run.surface if isinstance(run, FieldRun) else None)
+
+
+def _train_run(task: Training) -> None:
+    """Train a run, or go on with the one in its folder."""
     recipe = recipe_named(task.recipe)
     trains: Any = train if isinstance(recipe, Recipe) else train_field
     with StopSignals() as should_stop:
@@ -282,17 +242,6 @@ def do(task: Task) -> None:
             resume=os.path.lexists(Path(task.folder) / CONFIGURATION),
             should_stop=should_stop,
         )
-
-
-def score(task: Scoring) -> None:
-    """Score a run.
-
-    Raises:
-        PolarguideError: the run or its scene cannot be read.
-    """
-    run = open_compared(task.folder, task.compute.device)
-    surface = run.surface if isinstance(run, FieldRun) else None
-    evaluate(run, speed=task.speed, surface=surface)
 
 
 def _wait_for_others(run: Path) -> None:
@@ -309,4 +258,4 @@ def _wait_for_others(run: Path) -> None:
         except PolarguideError:
             if time.monotonic() > end:
                 raise
-        time.sleep(0.2)
+            time.sleep(0.2)

@@ -13,18 +13,22 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, write_whole
+from polarguide.core.records import decode
 from polarguide.geometry.vectors import unit_array as unit
 from polarguide_synth.mesh import Array, Mesh, grid_faces, joined, rotation, smooth_normals, solid, write_ply
 from polarguide_synth.schema import (
     REMEDY,
+    Ball,
+    Light,
     Material,
+    MeshFile,
     SceneSpec,
     Thing,
     make,
-    only_fields,
     require_light,
     require_solid,
     require_unicode,
@@ -247,33 +251,21 @@ def area_light_dict(light: dict[str, Any], channel: int | None, where: str) -> d
     Raises:
         PolarguideError: a field is missing or has another type; ``where`` names the scene.
     """
-    try:
-        position = list(light["position"])
-        toward = list(light["toward"])
-        half = [float(s) / 2 for s in light["size"]]
-        radiance = [float(v) for v in light["radiance"]]
-    except (KeyError, TypeError, ValueError) as error:
+    placed = decode(light, Light, f"{where} (lights)", remedy=REMEDY)
+    way = np.subtract(placed.toward, placed.position)
+    if not way.any():
         raise PolarguideError(
             f"{where} (lights)",
-            expected="position, toward, size and radiance of each light",
-            found=repr(error),
-            remedy="docs/reference/scene-files.md describes them.",
-        ) from error
-    plain = len(position) == len(toward) == len(radiance) == 3 and len(half) == 2
-    if not plain or position == toward or min(half) <= 0 or min(radiance) < 0:
-        raise PolarguideError(
-            f"{where} (lights)",
-            expected="two different places, a size above 0, and radiance of 0 or more, of each light",
+            expected="two different places of each light",
             found=str(light)[:200],
-            remedy="docs/reference/scene-files.md describes them.",
+            remedy=REMEDY,
         )
-    up = (
-        [0, 0, 1]
-        if abs(toward[2] - position[2]) < 0.99 * np.linalg.norm(np.subtract(toward, position))
-        else [0, 1, 0]
-    )
-    place = mi.ScalarTransform4f().look_at(position, toward, up) @ mi.ScalarTransform4f().scale([*half, 1.0])
-    return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": _value(radiance, channel)},
+    up = [0, 0, 1] if abs(way[2]) < 0.99 * np.linalg.norm(way) else [0, 1, 0]
+    width, height = placed.size
+    place = mi.ScalarTransform4f().look_at(list(placed.position), list(placed.toward), up)
+    place @= mi.ScalarTransform4f().scale([width / 2, height / 2, 1.0])
+    return {"type": "rectangle", "to_world": place,
+            "emitter": {"type": "area", "radiance": _value(placed.radiance, channel)},
             "bsdf": {"type": "diffuse", "reflectance": _value((0.0, 0.0, 0.0), channel)}}  # fmt: skip
 
 
@@ -295,6 +287,11 @@ class BuiltScene:
     panorama: Array
     textures: list[Array | None]
 
+    @property
+    def drawn(self) -> NDArray[np.bool_]:
+        """Whether the camera sees an object, by its number; number 0 is no object."""
+        return np.array([False, *self.spec.shown])
+
 
 def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
     """Generate meshes, textures and the environment, write them to ``folder`` and load them.
@@ -311,7 +308,7 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
     write_whole(folder / "environment.hdr", encoded.tobytes())
     pictures = [_texture(thing, mesh, spec.folder) for thing, mesh in zip(spec.things, meshes, strict=True)]
     scenes: list[Any] = []
-    first: list[Any] = []
+    shapes: list[list[Any]] = []
     for channel in range(3) if variant.channels == 3 else (None,):
         content: dict[str, Any] = {"type": "scene", "sky": environment_dict(panorama, channel)}
         for number, thing in enumerate(spec.things):
@@ -321,41 +318,22 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
             content[f"thing{number}"] = _shape(thing, meshes[number], place, surface)
         for number, light in enumerate(spec.lights):
             content[f"light{number}"] = area_light_dict(light, channel, spec.name) | shown_dict(spec, False)
-        scene = mi.load_dict(content)
-        scenes.append(scene)
-        if not first:
-            first = [content[f"thing{number}"] for number in range(len(spec.things))]
-    return BuiltScene(spec, scenes, first, panorama, pictures)
+        scenes.append(mi.load_dict(content))
+        shapes.append([content[f"thing{number}"] for number in range(len(spec.things))])
+    return BuiltScene(spec, scenes, shapes[0], panorama, pictures)
 
 
 def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:
-    turn = rotation(thing.rotation)
-    position = np.array(thing.position, float)
     if thing.shape.get("type") == "ball":
-        mesh = sphere(_radius(thing))
+        mesh = sphere(decode(thing.shape, Ball, f"{thing.name} shape", remedy=REMEDY).radius)
     elif thing.shape.get("type") == "mesh":
-        only_fields(thing.shape, ("type", "file"), f"{thing.name} shape")
-        mesh = _user_mesh(spec.folder / str(thing.shape.get("file")))
+        file = decode(thing.shape, MeshFile, f"{thing.name} shape", remedy=REMEDY).file
+        mesh = _user_mesh(spec.folder / file)
     else:
         mesh = make_mesh(thing.shape, thing.name)
-    moved = mesh.moved(thing.scale, turn, position)
+    moved = mesh.moved(thing.scale, rotation(thing.rotation), np.array(thing.position, float))
     require_solid(moved.points, thing.name)
     return moved
-
-
-def _radius(thing: Thing) -> float:
-    """Of a ball.
-
-    Raises:
-        PolarguideError: the file is no such shape, or the ball has other fields.
-    """
-    only_fields(thing.shape, ("type", "radius"), f"{thing.name} shape")
-    radius = thing.shape.get("radius", 1.0)
-    if isinstance(radius, bool) or not isinstance(radius, int | float) or not radius > 0:
-        raise PolarguideError(
-            f"{thing.name} shape.radius", expected="a number above 0", found=str(radius)[:100], remedy=REMEDY
-        )
-    return float(radius)
 
 
 def _user_mesh(path: Path) -> Mesh:
@@ -424,7 +402,7 @@ def _texture(thing: Thing, mesh: Mesh, folder: Path) -> Array | None:
 def _shape(thing: Thing, mesh: Mesh, path: Path, surface: dict[str, Any]) -> Any:
     """Mitsuba's shape with its BSDF and attributes."""
     if thing.shape.get("type") == "ball":
-        radius = _radius(thing) * thing.scale
+        radius = decode(thing.shape, Ball, f"{thing.name} shape", remedy=REMEDY).radius * thing.scale
         return mi.load_dict({"type": "sphere", "center": list(thing.position), "radius": radius, **surface})
     flat = mesh.normals is None
     return mi.load_dict({"type": "ply", "filename": str(path), "face_normals": flat, **surface})

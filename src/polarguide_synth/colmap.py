@@ -28,8 +28,7 @@ def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[
     ends = np.round(np.cumsum(shares) / shares.sum() * path.views).astype(int)
     counts = np.diff(np.concatenate([[0], ends]))
     focal = float(width / 2 / np.tan(np.radians(path.fov) / 2))
-    size = (width, height)
-    center = (width / 2, height / 2)
+    inner = (width, height, focal, focal, width / 2, height / 2)
     cameras = []
     for ring, count in zip(path.rings, counts, strict=True):
         start = float(ring.get("from", 0.0))
@@ -43,15 +42,10 @@ def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[
             angle = np.radians(start + step * (k + random.uniform(-0.15, 0.15)))
             radius = float(ring["radius"]) * (1 + random.uniform(-0.03, 0.03))
             z = float(ring["height"]) * (1 + random.uniform(-0.04, 0.04))
-            target = np.array(path.target, float) + path.wander * random.uniform(-1, 1, 3) * np.array(
-                [1, 1, 0.4]
-            )
-            eye = np.array(path.target, float) * [1, 1, 0] + [
-                radius * np.cos(angle),
-                radius * np.sin(angle),
-                z,
-            ]
-            cameras.append(Camera(*size, focal, focal, *center, *look_at(eye, target, (0.0, 0.0, 1.0))))
+            target = np.array(path.target, float) + path.wander * random.uniform(-1, 1, 3) * [1, 1, 0.4]
+            around = [radius * np.cos(angle), radius * np.sin(angle), z]
+            eye = np.array(path.target, float) * [1, 1, 0] + around
+            cameras.append(Camera(*inner, *look_at(eye, target, (0.0, 0.0, 1.0))))
     return cameras
 
 
@@ -102,24 +96,16 @@ def sample_sparse_points(
         seed: seed of the random numbers.
     """
     random = np.random.default_rng((seed, 23))
-    origins = []
-    rays = []
-    colors = []
-    home = []
+    samples = []
+    amount = -(-count * 13 // 10 // len(cameras))
     for number, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
         gray = picture.mean(-1)
         contrast = np.hypot(*np.gradient(gray)) + 2
-        amount = -(-count * 13 // 10 // len(cameras))
         chosen = random.choice(gray.size, amount, p=(contrast / contrast.sum()).ravel())
+        centers = np.broadcast_to(camera.center.numpy(), (amount, 3))
         world = camera.world_rays().numpy().astype(np.float64).reshape(-1, 3)
-        rays.append(world[chosen])
-        origins.append(np.broadcast_to(camera.center.numpy(), (amount, 3)))
-        colors.append(picture.reshape(-1, 3)[chosen])
-        home.append(np.full(amount, number))
-    origin = np.concatenate(origins)
-    ray = np.concatenate(rays)
-    color = np.concatenate(colors)
-    view = np.concatenate(home)
+        samples.append((centers, world[chosen], picture.reshape(-1, 3)[chosen], np.full(amount, number)))
+    origin, ray, color, view = (np.concatenate(column) for column in zip(*samples, strict=True))
     hits = intersect(built, origin, ray)
     places = origin + hits.distance[:, None] * ray
     visible = _visible(built, cameras, places) & (random.random((len(places), len(cameras))) < MATCHED_SHARE)
@@ -128,8 +114,7 @@ def sample_sparse_points(
     near = np.abs(np.arange(len(cameras)) - view[:, None]) <= 1
     visible = np.where(ghost[:, None], near, visible)
     visible[np.arange(len(view)), view] = True
-    drawn = np.array([False, *built.spec.shown])[hits.thing]
-    keep = np.flatnonzero(drawn & (visible.sum(1) >= 2))
+    keep = np.flatnonzero(built.drawn[hits.thing] & (visible.sum(1) >= 2))
     keep = np.sort(random.permutation(keep)[:count])
     tracks = [_track(places[k], np.flatnonzero(visible[k]), cameras, random) for k in keep]
     reach = np.linalg.norm(places - origin, axis=1)[keep]
@@ -178,8 +163,7 @@ def _mirrored(
         return ghost, places
     d = ray[chosen]
     n = normal[chosen]
-    back = d - 2 * (d * n).sum(-1, keepdims=True) * n
-    hits = intersect(built, places[chosen] + 1e-4 * n, back)
+    hits = intersect(built, places[chosen] + 1e-4 * n, d - 2 * (d * n).sum(-1, keepdims=True) * n)
     hit = hits.distance > 0
     ghost[chosen[hit]] = True
     places = places.copy()
@@ -228,8 +212,7 @@ def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], s
         for view, x, y in track:
             parts.append(f"{view + 1} {len(observations[view])}")
             observations[view].append(f"{x:.3f} {y:.3f} {number}")
-            px, py, _ = _project(cameras[view], place[None])[0]
-            errors.append(np.hypot(px - x, py - y))
+            errors.append(np.hypot(*(_project(cameras[view], place[None])[0, :2] - (x, y))))
         xyz = " ".join(f"{v:.6f}" for v in place)
         rgb = " ".join(str(int(c)) for c in color)
         rows.append(f"{number} {xyz} {rgb} {np.mean(errors):.4f} {' '.join(parts)}")

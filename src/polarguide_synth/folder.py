@@ -101,8 +101,7 @@ def sensor_codes(stokes: Array, change: Callable[[Array], Array]) -> NDArray[np.
 def clipped_share(out: Path, names: Sequence[str]) -> float:
     """Share of the samples of these views' pictures that are at full scale."""
     files = [file for name in names for file in view_files(out, name, ground_truth=False, raw=False)]
-    pictures = (np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64) for file in files)
-    return float(np.mean([(picture == TOP * STEP).mean() for picture in pictures]))
+    return float(np.mean([(_picture(file) == TOP * STEP).mean() for file in files]))
 
 
 def view_files(out: Path, name: str, *, ground_truth: bool, raw: bool) -> list[Path]:
@@ -115,14 +114,13 @@ def view_files(out: Path, name: str, *, ground_truth: bool, raw: bool) -> list[P
 def photograph(out: Path, name: str) -> NDArray[np.uint8]:
     """The mean of a view's four pictures as 8-bit sRGB, [H, W, 3]."""
     files = view_files(out, name, ground_truth=False, raw=False)
-    parts = [np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64) for file in files]
-    mean = np.mean(parts, axis=0) / 65535
-    return display_encoded(mean[..., ::-1] if mean.ndim == 3 else np.repeat(mean[..., None], 3, axis=2))
+    mean = np.mean([_picture(file) for file in files], axis=0) / 65535
+    colors = mean[..., ::-1] if mean.ndim == 3 else np.repeat(mean[..., None], 3, axis=2)
+    return np.asarray(np.round(255 * srgb_encode_array(np.clip(colors, 0, 1))), np.uint8)
 
 
-def display_encoded(linear: Array) -> NDArray[np.uint8]:
-    """Linear values in [0, 1] as 8-bit sRGB."""
-    return np.asarray(np.round(255 * srgb_encode_array(np.clip(linear, 0, 1))), np.uint8)
+def _picture(file: Path) -> Array:
+    return np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), np.float64)
 
 
 MANIFEST = "checksums.txt"
@@ -206,16 +204,11 @@ def scene_record(
     clipped: float,
 ) -> dict[str, Any]:
     """The content of ``scene.json``."""
-    objects = []
-    for number, thing in enumerate(spec.things, 1):
-        source = thing.material
-        material: dict[str, Any] = {"type": source.type, "diffuse": source.color}
-        if source.type == "plastic":
-            material |= {"alpha": source.roughness, "ior": source.index}
-        elif source.type == "metal":
-            material = {"type": "metal", "alpha": source.roughness, "eta": source.eta, "k": source.k}
-        objects.append({"id": number, "name": thing.name, "mesh": f"mesh/{thing.name}.ply",
-                        "foreground": thing.foreground, "material": material})  # fmt: skip
+    objects = [
+        {"id": number, "name": thing.name, "mesh": f"mesh/{thing.name}.ply", "foreground": thing.foreground,
+         "material": thing.material.record()}
+        for number, thing in enumerate(spec.things, 1)
+    ]  # fmt: skip
     return {
         "scene": spec.name,
         "about": spec.about,

@@ -74,11 +74,10 @@ def ground_truth_maps(built: BuiltScene, camera: Camera) -> dict[str, NDArray[An
     """Normals, depth, mask, object numbers and materials at pixel centers, and base color as the mean of each pixel,
     with the keys of a ground-truth file; nothing of what is black to the camera."""
     rays = camera.world_rays().numpy().astype(np.float64).reshape(-1, 3)
-    origins = np.broadcast_to(camera.center.numpy(), rays.shape)
-    hits = intersect(built, origins, rays)
+    hits = intersect(built, np.broadcast_to(camera.center.numpy(), rays.shape), rays)
     shape = (camera.height, camera.width)
     front = np.array([False] + [thing.foreground for thing in built.spec.things])
-    drawn = np.array([False, *built.spec.shown])[hits.thing]
+    drawn = built.drawn[hits.thing]
     depth = drawn * hits.distance * (rays @ camera.rotation[2].numpy())
     return {
         "normal": (drawn[:, None] * hits.normal).reshape(*shape, 3).astype(np.float16),
@@ -138,7 +137,7 @@ def _pixel_albedo(built: BuiltScene, camera: Camera) -> Array:
     fine = camera.scaled(SUBPIXELS, SUBPIXELS * camera.width, SUBPIXELS * camera.height)
     rays = fine.world_rays().numpy().astype(np.float64).reshape(-1, 3)
     hits = intersect(built, np.broadcast_to(fine.center.numpy(), rays.shape), rays)
-    drawn = np.array([False, *built.spec.shown])[hits.thing]
+    drawn = built.drawn[hits.thing]
     boxes = (camera.height, SUBPIXELS, camera.width, SUBPIXELS, -1)
     colors = (drawn[:, None] * base_colors(built, hits)).reshape(boxes).sum((1, 3))
     return np.asarray(colors / np.maximum(drawn.reshape(boxes).sum((1, 3)), 1))

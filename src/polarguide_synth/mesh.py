@@ -6,6 +6,7 @@ Newton's method, and have the gradient of the distance as normal, so that highli
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.core.files import write_whole
-from polarguide.geometry.vectors import unit_array
 from polarguide.geometry.vectors import unit_array as unit
 
 Array = NDArray[np.float64]
@@ -65,29 +65,21 @@ def smooth_normals(points: Array, faces: NDArray[np.int64]) -> Array:
     total = np.zeros_like(points)
     for k in range(3):
         np.add.at(total, place.reshape(-1)[faces[:, k]], across)
-    return unit_array(total[place.reshape(-1)])
+    return unit(total[place.reshape(-1)])
 
 
-def grid_faces(rows: int, columns: int, *, wrap: bool = False) -> NDArray[np.int64]:
-    """Triangles between points [rows, columns] in row order; ``wrap`` joins the last column to the first."""
-    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns - (not wrap)), indexing="ij")
-    after = (column + 1) % columns
-    a = row * columns + column
-    b = row * columns + after
-    c = (row + 1) * columns + column
-    d = (row + 1) * columns + after
-    return np.concatenate([np.stack((a, b, d), -1).reshape(-1, 3), np.stack((a, d, c), -1).reshape(-1, 3)])
+def grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
+    """Triangles between points [rows, columns] in row order."""
+    index = np.arange(rows * columns).reshape(rows, columns)
+    corners = (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:])
+    a, b, c, d = (corner.ravel() for corner in corners)
+    return np.concatenate([np.stack((a, b, d), -1), np.stack((a, d, c), -1)])
 
 
 def rotation(degrees: tuple[float, float, float]) -> Array:
     """Rotation matrix: about x, then y, then z."""
-    x, y, z = np.radians(degrees)
-    cx = np.cos(x)
-    sx = np.sin(x)
-    cy = np.cos(y)
-    sy = np.sin(y)
-    cz = np.cos(z)
-    sz = np.sin(z)
+    cx, cy, cz = np.cos(np.radians(degrees))
+    sx, sy, sz = np.sin(np.radians(degrees))
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
     about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
@@ -100,9 +92,9 @@ def write_ply(path: Path, mesh: Mesh) -> None:
     Raises:
         PolarguideError: the file cannot be written.
     """
-    names = ["x", "y", "z"] + (["nx", "ny", "nz"] if mesh.normals is not None else []) + ["u", "v"]
-    parts = [mesh.points] + ([mesh.normals] if mesh.normals is not None else []) + [mesh.uv]
-    rows = np.concatenate(parts, axis=1).astype("<f4")
+    parts = {"x y z": mesh.points, "nx ny nz": mesh.normals, "u v": mesh.uv}
+    names = [name for names, part in parts.items() if part is not None for name in names.split()]
+    rows = np.concatenate([part for part in parts.values() if part is not None], axis=1).astype("<f4")
     faces = np.empty(len(mesh.faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
     faces["n"], faces["v"] = 3, mesh.faces
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
@@ -161,18 +153,14 @@ def surface_nets(values: Array) -> tuple[Array, np.ndarray]:
     shape = tuple(n - 1 for n in values.shape)
     sums = np.zeros((*shape, 3))
     counts = np.zeros(shape)
-    corners = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]
 
-    def corner(array: np.ndarray, at: tuple[int, ...]) -> np.ndarray:
-        return np.asarray(array[tuple(slice(o, o + n) for o, n in zip(at, shape, strict=True))])
+    def values_at(corner: tuple[int, ...]) -> Array:
+        return values[tuple(slice(o, o + n) for o, n in zip(corner, shape, strict=True))]
 
-    for first in corners:
-        for axis in range(3):
-            if first[axis]:
-                continue
-            second = tuple(1 if k == axis else first[k] for k in range(3))
-            a = corner(values, first)
-            b = corner(values, second)
+    for first in itertools.product((0, 1), repeat=3):
+        for axis in (k for k in range(3) if first[k] == 0):
+            a = values_at(first)
+            b = values_at(tuple(1 if k == axis else first[k] for k in range(3)))
             crossed = (a < 0) != (b < 0)
             t = np.where(crossed, a / np.where(crossed, a - b, 1), 0)
             place = np.array(first) + t[..., None] * np.eye(3)[axis]
@@ -184,14 +172,13 @@ def surface_nets(values: Array) -> tuple[Array, np.ndarray]:
     points = np.argwhere(used) + sums[used] / counts[used][:, None]
     faces = []
     for axis in range(3):
-        one = (axis + 1) % 3
-        two = (axis + 2) % 3
-        low = np.moveaxis(inside, (axis, one, two), (0, 1, 2))[:-1, 1:-1, 1:-1]
-        high = np.moveaxis(inside, (axis, one, two), (0, 1, 2))[1:, 1:-1, 1:-1]
-        cells = np.moveaxis(index, (axis, one, two), (0, 1, 2))
+        order = [axis, (axis + 1) % 3, (axis + 2) % 3]
+        low = inside.transpose(order)[:-1, 1:-1, 1:-1]
+        high = inside.transpose(order)[1:, 1:-1, 1:-1]
+        cells = index.transpose(order)
         around = [cells[:, :-1, :-1], cells[:, 1:, :-1], cells[:, 1:, 1:], cells[:, :-1, 1:]]
-        for mask, order in ((low & ~high, (0, 1, 2, 3)), (high & ~low, (3, 2, 1, 0))):
-            quad = np.stack([around[k][mask] for k in order], -1)
+        for mask, turned in ((low & ~high, around), (high & ~low, around[::-1])):
+            quad = np.stack([corner[mask] for corner in turned], -1)
             faces += [quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]]
     return points, np.concatenate(faces)
 
@@ -215,9 +202,7 @@ def solid(parts: list[dict[str, Any]], blend: float = 0.03, detail: int = 96) ->
         blend: width of the transition between neighboring parts.
         detail: grid cells along the longest side.
     """
-    whole = []
-    for part in parts:
-        whole += [part, *([_mirrored(part)] if "mirror" in part else [])]
+    whole = [one for part in parts for one in (part, *([_mirrored(part)] if "mirror" in part else []))]
     low, high = _bounds(whole)
     step = float((high - low).max()) / detail
     points, faces = surface_nets(_sampled(whole, blend, low, high, step))
@@ -324,8 +309,7 @@ def _smooth_minimum(a: Array, b: Array, width: float) -> Array:
 
 def _gradient(points: Array, parts: list[dict[str, Any]], blend: float, step: float, block: float) -> Array:
     slopes = []
-    for k in range(3):
-        offset = np.eye(3)[k] * step
+    for offset in np.eye(3) * step:
         ahead, behind = (_distance(points + side * offset, parts, blend, block) for side in (1, -1))
         slopes.append((ahead - behind) / (2 * step))
     return np.stack(slopes, -1)

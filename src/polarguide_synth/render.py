@@ -66,6 +66,16 @@ class Plan:
         """The content of the folder's ``request.json``."""
         return folder.scene_request(self.spec, self.settings)
 
+    def checked_state(self) -> folder.State:
+        """How far the rendering in the folder is.
+
+        Raises:
+            PolarguideError: a setting is wrong, or the folder holds something else.
+        """
+        self.settings.check()
+        require_unicode(self.out)
+        return folder.folder_state(self.out, self.request)
+
     @cached_property
     def names(self) -> list[str]:
         """Of all views."""
@@ -78,14 +88,16 @@ class Plan:
 
     def left(self) -> list[int]:
         """The numbers of the views that are not finished."""
-        views = enumerate(self.names)
-        return [number for number, name in views if not all(file.exists() for file in self.files(name))]
+        return [
+            number
+            for number, name in enumerate(self.names)
+            if not all(file.exists() for file in self.files(name))
+        ]
 
     def paths_left(self) -> int:
         """How many paths it takes to finish."""
-        settings = self.settings
         views = sum(TEST_SAMPLES if self.names[number] in self.tests else 1 for number in self.left())
-        return settings.width * settings.height * settings.samples * views
+        return self.settings.width * self.settings.height * self.settings.samples * views
 
     @property
     def mosaics(self) -> bool:
@@ -132,12 +144,7 @@ def expected_time(plans: Sequence[Plan], reporter: Reporter, *, threads: int = 0
     Raises:
         PolarguideError: as ``synthesize``.
     """
-    left = []
-    for plan in plans:
-        plan.settings.check()
-        require_unicode(plan.out)
-        if folder.folder_state(plan.out, plan.request) != "finished":
-            left.append(plan)
+    left = [plan for plan in plans if plan.checked_state() != "finished"]
     if not left:
         return 0.0
     variant = choose_variant(left[0].settings.color, threads=threads)
@@ -166,10 +173,8 @@ def synthesize(
     Raises:
         PolarguideError: Mitsuba is missing, the folder holds something else, or the scene has a mistake.
     """
-    settings.check()
-    require_unicode(out)
     plan = Plan(spec, settings, out)
-    state = folder.folder_state(out, plan.request)
+    state = plan.checked_state()
     if state == "finished":
         verify_scene(out)
         reporter.say(f"{out} is finished already; all its files have their checksums.")
@@ -178,15 +183,14 @@ def synthesize(
     if state == "new":
         folder.write_file(out / folder.REQUEST, json.dumps(plan.request, indent=1).encode())
     names = plan.names
-    tests = plan.tests
     built = build_scene(spec, out, variant)
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
     exposure = spec.exposure or _metered_exposure(built, cameras, settings.seed)
     job = Job(spec, settings, out, built, cameras, exposure, Sensor())
     _render_all(job, reporter)
-    write_sparse(built, cameras, names, tests, out, settings)
+    write_sparse(built, cameras, names, plan.tests, out, settings)
     clipped = folder.clipped_share(out, names)
-    record = scene_record(spec, settings, variant, names, tests, exposure=exposure, clipped=clipped)
+    record = scene_record(spec, settings, variant, names, plan.tests, exposure=exposure, clipped=clipped)
     if job.mosaics:
         gains = {str(45 * k): gain for k, gain in enumerate(job.sensor.gains)}
         folder.write_file(out / "calibration.json", json.dumps({"gains": gains}).encode())
@@ -241,8 +245,8 @@ def render_view(job: Job, number: int) -> None:
         folder.write_file(job.out / "gt" / f"{name}.npz", data.getvalue())
     photograph = job.photograph(number)
     if photograph is not None:
-        rays = camera.rays(dtype=torch.float64).numpy()
         shot, path = photograph
+        rays = camera.rays(dtype=torch.float64).numpy()
         folder.write_file(path, filter_jpeg(stokes, rays, shot, settings.noise, random, job.sensor))
     # With a sensor the noise is in its files, and these pictures are what they should lead to.
     noise = settings.noise if settings.sensor == "ideal" else 0.0
@@ -306,10 +310,11 @@ def parse_sweep(text: str) -> Sweep:
         values = tuple(sorted({float(value) for value in listed.split(",")}))
     except ValueError:
         values = ()
-    if not all(math.isfinite(value) for value in values):
-        values = ()
-    whole = parameter != "views" or all(value == int(value) and value >= 2 for value in values)
-    if parameter not in PARAMETERS or not values or not whole:
+    least = 2 if parameter == "views" else -math.inf
+    possible = all(
+        math.isfinite(v) and (parameter != "views" or v.is_integer()) and v >= least for v in values
+    )
+    if parameter not in PARAMETERS or not values or not possible:
         raise PolarguideError(
             "--sweep",
             expected=f"one of {', '.join(PARAMETERS)} with values, such as noise=0,1,2 or views=9,18,36",
@@ -334,7 +339,8 @@ def sweep_scenes(
     folders = []
     for value, plan in zip(sweep.values, plans, strict=True):
         folders.append(synthesize(plan.spec, plan.out, plan.settings, reporter, threads=threads))
-        _note(folders[-1], sweep.parameter, value)
+        record = json.loads((folders[-1] / "scene.json").read_text(encoding="utf-8"))
+        _write_record(folders[-1], record, sweep.parameter, value)
     return folders
 
 
@@ -346,14 +352,12 @@ def sweep_plans(
         return [Plan(overrides.apply(spec), settings, out / "all")]
     plans = []
     for value in sweep.values:
-        one = overrides
-        how = settings
+        change: dict[str, Any] = {sweep.parameter: value}
+        member = _member(out, sweep, value)
         if sweep.parameter == "noise":
-            how = replace(settings, noise=value)
+            plans.append(Plan(overrides.apply(spec), replace(settings, **change), member))
         else:
-            change: dict[str, Any] = {sweep.parameter: value}
-            one = replace(overrides, **change)
-        plans.append(Plan(one.apply(spec), how, _member(out, sweep, value)))
+            plans.append(Plan(replace(overrides, **change).apply(spec), settings, member))
     return plans
 
 
@@ -364,10 +368,9 @@ def _member(out: Path, sweep: Sweep, value: float) -> Path:
     return out / f"{sweep.parameter}-{'.'.join([whole.zfill(digits), *rest])}"
 
 
-def _note(scene: Path, parameter: str, value: float) -> None:
-    """Write the number under study into ``scene.json``."""
-    record = json.loads((scene / "scene.json").read_text(encoding="utf-8"))
-    record["study"] = {"parameter": parameter, "value": value}
+def _write_record(scene: Path, record: dict[str, Any], parameter: str, value: float) -> None:
+    """Write ``scene.json`` with the number under study."""
+    record = {**record, "study": {"parameter": parameter, "value": value}}
     folder.write_file(scene / "scene.json", json.dumps(record, indent=1).encode())
 
 
@@ -376,9 +379,8 @@ def _fewer_views(plan: Plan, out: Path, sweep: Sweep, reporter: Reporter, thread
     spec = plan.spec
     settings = plan.settings
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
-    by_name = dict(zip(view_names(len(cameras)), cameras, strict=True))
-    tests = held_out_names(list(by_name), settings.test_every)
-    train = [name for name in by_name if name not in tests]
+    by_name = dict(zip(plan.names, cameras, strict=True))
+    train = [name for name in plan.names if name not in plan.tests]
     if sweep.values[-1] > len(train):
         raise PolarguideError(
             "--sweep",
@@ -396,15 +398,12 @@ def _fewer_views(plan: Plan, out: Path, sweep: Sweep, reporter: Reporter, thread
             verify_scene(member)
             continue
         chosen = [train[k] for k in np.unique(np.linspace(0, len(train) - 1, int(value)).round().astype(int))]
-        names = sorted([*chosen, *tests])
+        names = sorted([*chosen, *plan.tests])
         _link(whole, member, names)
-        variant = choose_variant(settings.color, threads=threads)
-        built = build_scene(spec, member, variant)
-        some = [by_name[name] for name in names]
-        write_sparse(built, some, names, tests, member, settings)
+        built = build_scene(spec, member, choose_variant(settings.color, threads=threads))
+        write_sparse(built, [by_name[name] for name in names], names, plan.tests, member, settings)
         smaller = {**record, "views": names, "train": chosen, "sha256": write_manifest(member)}
-        folder.write_file(member / "scene.json", json.dumps(smaller, indent=1).encode())
-        _note(member, "views", value)
+        _write_record(member, smaller, "views", value)
         reporter.say(f"{member}: {len(chosen)} training views")
     return folders
 
@@ -412,14 +411,11 @@ def _fewer_views(plan: Plan, out: Path, sweep: Sweep, reporter: Reporter, thread
 def _link(whole: Path, member: Path, names: list[str]) -> None:
     """Share the files of views between two scenes: one file under two names where the disk allows it."""
     for name in names:
-        ground_truth = (whole / "gt" / f"{name}.npz").exists()
-        raw = (whole / "raw" / f"{name}.png").exists()
-        for source in folder.view_files(whole, name, ground_truth=ground_truth, raw=raw):
+        for source in folder.view_files(whole, name, ground_truth=True, raw=True):
             target = member / source.relative_to(whole)
-            if target.exists():
-                continue
-            target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                os.link(source, target)
-            except OSError:
-                folder.write_file(target, source.read_bytes())
+            if source.exists() and not target.exists():
+                target.parent.mkdir(parents=True, exist_ok=True)
+                try:
+                    os.link(source, target)
+                except OSError:
+                    folder.write_file(target, source.read_bytes())

@@ -7,7 +7,7 @@ linear sRGB in [0, 1], radiance is linear and unbounded, angles are degrees.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -58,8 +58,9 @@ def check_file_name(name: str, where: str) -> None:
     """
     plain = name.isprintable() and not set(name) & set('/\\:*?"<>|') and not name.startswith(".")
     if not (plain and 0 < len(name) <= LONGEST_NAME):
-        expected = f"a name of 1 to {LONGEST_NAME} characters that a file can have"
-        raise _fault(where, expected, repr(name)[:LONGEST_NAME])
+        raise _fault(
+            where, f"a name of 1 to {LONGEST_NAME} characters that a file can have", repr(name)[:LONGEST_NAME]
+        )
 
 
 def require_unicode(path: Path) -> None:
@@ -76,17 +77,6 @@ def require_unicode(path: Path) -> None:
         ) from None
 
 
-def only_fields(data: Mapping[str, Any], allowed: Sequence[str], where: str) -> None:
-    """Refuse fields that nothing reads.
-
-    Raises:
-        PolarguideError: there are some.
-    """
-    unknown = sorted(data.keys() - set(allowed))
-    if unknown:
-        raise _fault(where, f"only {', '.join(allowed)}", ", ".join(unknown)[:LONGEST_NAME])
-
-
 def check_color(color: Any, where: str) -> None:
     """Refuse what is no color: three numbers from 0 to 1, "own", or a texture, which is checked where it is made.
 
@@ -95,11 +85,11 @@ def check_color(color: Any, where: str) -> None:
     """
     if color == "own" or isinstance(color, dict):
         return
-    numbers = color if isinstance(color, list | tuple) else ()
-    plain = all(isinstance(c, int | float) and not isinstance(c, bool) and 0 <= c <= 1 for c in numbers)
-    if len(numbers) != 3 or not plain:
+    try:
+        msgspec.convert(color, tuple[Share, Share, Share])
+    except msgspec.ValidationError:
         expected = 'three numbers from 0 to 1, "own", or a texture {"type": ...}'
-        raise _fault(where, expected, repr(color)[:LONGEST_NAME])
+        raise _fault(where, expected, repr(color)[:LONGEST_NAME]) from None
 
 
 def require_light(panorama: NDArray[Any], where: str) -> None:
@@ -152,6 +142,7 @@ def make(makers: Mapping[str, Callable[..., T]], data: Mapping[str, Any], where:
         ) from error
 
 
+Share = Annotated[float, Meta(ge=0, le=1)]
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 Vector = tuple[Number, Number, Number]
 Refraction = Annotated[float, Meta(gt=0, le=100)]
@@ -161,6 +152,18 @@ MOST_VIEWS = 10_000
 MOST_SURFACES = 1000
 OLD_KEYS = {"colour": "color", "colours": "colors", "towards": "toward", "truth": "ground_truth"}
 """Names that fields had in earlier scene files and requests."""
+
+
+class Ball(Struct, frozen=True, forbid_unknown_fields=True, tag_field="type", tag="ball"):
+    """A shape that Mitsuba itself has, without triangles."""
+
+    radius: Annotated[float, Meta(gt=0, le=LARGEST)] = 1.0
+
+
+class MeshFile(Struct, frozen=True, forbid_unknown_fields=True, tag_field="type", tag="mesh"):
+    """The shape in a PLY or OBJ file, whose name starts at the folder of the scene file."""
+
+    file: str
 
 
 class Material(Struct, frozen=True, forbid_unknown_fields=True):
@@ -181,6 +184,15 @@ class Material(Struct, frozen=True, forbid_unknown_fields=True):
     index: Annotated[float, Meta(gt=1, lt=4)] = 1.5
     eta: tuple[Refraction, Refraction, Refraction] = (1.35, 0.97, 0.62)
     k: tuple[Extinction, Extinction, Extinction] = (7.5, 6.4, 5.3)
+
+    def record(self) -> Data:
+        """The surface as ``scene.json`` has it."""
+        fields = {
+            "plastic": {"diffuse": self.color, "alpha": self.roughness, "ior": self.index},
+            "metal": {"alpha": self.roughness, "eta": self.eta, "k": self.k},
+            "matte": {"diffuse": self.color},
+        }
+        return {"type": self.type, **fields[self.type]}
 
 
 class Thing(Struct, frozen=True, forbid_unknown_fields=True):
@@ -211,6 +223,19 @@ class Ring(Struct, frozen=True, rename={"start": "from", "stop": "to"}):
     share: Annotated[float, Meta(ge=0, le=LARGEST)] = 1.0
     start: Number = 0.0
     stop: Number = 360.0
+
+
+Positive = Annotated[float, Meta(gt=0, le=LARGEST)]
+Radiance = Annotated[float, Meta(ge=0, le=LARGEST)]
+
+
+class Light(Struct, frozen=True):
+    """A rectangular area light: its center, the point that it faces, width and height, and radiance."""
+
+    position: Vector
+    toward: Vector
+    size: tuple[Positive, Positive]
+    radiance: tuple[Radiance, Radiance, Radiance]
 
 
 class CameraPath(Struct, frozen=True, forbid_unknown_fields=True):

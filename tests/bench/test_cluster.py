@@ -18,9 +18,9 @@ from polarguide.core.errors import optional_import
 from polarguide.core.progress import SILENT
 from polarguide.runs.folder import CHECKPOINT, LOG, RunConfiguration
 from polarguide.training.settings import TrainSettings
-from polarguide_bench import cluster as clusters
-from polarguide_bench.cluster import workers
+from polarguide_bench import job_queue as clusters
 from polarguide_bench.compare import compare
+from polarguide_bench.job_queue import workers
 from polarguide_bench.options import BatchOptions, ClusterOptions, CompareOptions
 from polarguide_bench.plan import jobs_at_a_time
 

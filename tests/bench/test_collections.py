@@ -20,8 +20,8 @@ from polarguide.core.records import decode
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.training.settings import TrainSettings
 from polarguide_bench import job_queue
-from polarguide_bench.batch import Capture, Row, _task, run_batch
-from polarguide_bench.children import Message, encoded
+from polarguide_bench.batch import Capture, CaptureRow, _task, run_batch
+from polarguide_bench.children import Message
 from polarguide_bench.collection import FORMAT, STEPS, CaptureRecord, prepare_settings
 from polarguide_bench.compare import locked
 from polarguide_bench.options import BatchOptions
@@ -138,7 +138,7 @@ def test_damaged_health_is_a_remark_of_its_capture(tmp_path: Path, content: str 
     else:
         (folder / "run" / "health.json").write_text(content)
     request = _task(Capture("a", tmp_path, PrepareSettings()), tmp_path, OPTIONS).request
-    row = Row(
+    row = CaptureRow(
         "a",
         "",
         folder,
@@ -157,4 +157,4 @@ def test_settings_survive_their_way(tmp_path: Path) -> None:
     task = _task(Capture("a", tmp_path, settings), tmp_path, OPTIONS)
     assert task.request.prepare is not None
     assert prepare_settings(task.request.prepare) == settings
-    assert decode(encoded(Message(task, "", "")), Message, "task").task == task
+    assert decode(Message(task, "", "").to_line(), Message, "task").task == task

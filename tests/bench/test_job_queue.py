@@ -21,9 +21,8 @@ from polarguide.core.system import interrupt
 from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide.training.settings import TrainSettings
 from polarguide_bench import children, worker
-from polarguide_bench.children import COMMAND, Message, Scoring, Training, encoded, files_digest
-from polarguide_bench.cluster import Workers, workers
-from polarguide_bench.job_queue import MOST_LOSSES, Job, last_row, run_job, run_jobs
+from polarguide_bench.children import COMMAND, Message, Scoring, Training, files_digest
+from polarguide_bench.job_queue import MOST_LOSSES, Job, Workers, last_row, run_job, run_jobs, workers
 from polarguide_bench.options import ClusterOptions
 
 # Reads its task, writes down that it begins, does what the name of the device asks for, and writes down the end.
@@ -274,7 +273,7 @@ def child(task: Training, folder: Path) -> Iterator["subprocess.Popen[bytes]"]:
     """A child at work on a task, with its standard input open."""
     pipes = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(COMMAND, cwd=folder, **pipes) as process:  # type: ignore[call-overload]
-        process.stdin.write(encoded(Message(task, files_digest(), "")))
+        process.stdin.write(Message(task, files_digest(), "").to_line())
         process.stdin.flush()
         yield process
 
@@ -282,7 +281,7 @@ def child(task: Training, folder: Path) -> Iterator["subprocess.Popen[bytes]"]:
 def test_a_task_survives_its_way(tmp_path: Path) -> None:
     for task in (training(tmp_path, tmp_path / "out"), Scoring("run", True, ComputeOptions(2, "cpu"))):
         message = Message(task, "1f", "2e")
-        assert decode(encoded(message), Message, "task") == message
+        assert decode(message.to_line(), Message, "task") == message
 
 
 @pytest.mark.parametrize(

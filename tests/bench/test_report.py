@@ -19,8 +19,7 @@ from comparison_records import part, results, run, unfinished
 from polarguide.capture import GroundTruth, Scene
 from polarguide.capture.metadata import Material, SceneObject
 from polarguide.visualization.pages import data_uri
-from polarguide_bench.embedding import Tile, chosen_views, embed
-from polarguide_bench.report import Curve, _ground_truth_tile, report_html
+from polarguide_bench.report import Curve, Tile, _ground_truth_tile, chosen_views, embed, report_html
 from polarguide_bench.results import Results
 from polarguide_bench.tables import sections
 

@@ -12,7 +12,6 @@ import pytest
 from comparison_records import part, results, run, unfinished
 
 from polarguide.results.evaluation.table import COLUMNS
-from polarguide_bench.csv_files import csv_text
 from polarguide_bench.report import (
     curves_svg,
     exposure_svg,
@@ -27,6 +26,7 @@ from polarguide_bench.tables import (
     Section,
     against_section,
     control_section,
+    csv_text,
     latex_text,
     notes,
     part_section,

@@ -19,9 +19,8 @@ from polarguide.runs.opened import OpenedRun
 from polarguide.training.settings import TrainSettings
 from polarguide_bench import compare as comparing
 from polarguide_bench.children import Scoring, Training
-from polarguide_bench.cluster import Workers
 from polarguide_bench.compare import BESIDE_OTHERS, collect
-from polarguide_bench.job_queue import Job
+from polarguide_bench.job_queue import Job, Workers
 from polarguide_bench.options import CompareOptions
 from polarguide_bench.plan import (
     Comparison,

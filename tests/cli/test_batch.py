@@ -8,7 +8,7 @@ from faults import Fault
 
 from polarguide.cli.app import run
 from polarguide_bench import batch as batches
-from polarguide_bench.batch import Capture, Row
+from polarguide_bench.batch import Capture, CaptureRow
 from polarguide_bench.options import BatchOptions
 from polarguide_bench.verbs import batch as verb
 
@@ -83,9 +83,12 @@ def test_a_watched_folder_is_taken_once_nothing_in_it_changes(
     """Copies arrive file by file; a capture that fails is told once, and the next one is awaited."""
     asked: list[list[str]] = []
 
-    def instead(captures: list[Capture], out: Path, *_: Any, **__: Any) -> list[Row]:
+    def instead(captures: list[Capture], out: Path, *_: Any, **__: Any) -> list[CaptureRow]:
         asked.append([capture.name for capture in captures])
-        return [Row(name, "", out, "failed" if name == "b" else "done", "broken", None) for name in asked[-1]]
+        return [
+            CaptureRow(name, "", out, "failed" if name == "b" else "done", "broken", None)
+            for name in asked[-1]
+        ]
 
     def copied(name: str, file: str) -> None:
         (tmp_path / "all" / name).mkdir(exist_ok=True)

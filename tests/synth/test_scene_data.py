@@ -10,13 +10,13 @@ import plyfile
 import pytest
 from faults import Fault
 
-from polarguide_synth.build import area_light_dict, make_mesh
+from polarguide.core.errors import PolarguideError
+from polarguide_synth.build import _mesh, area_light_dict, make_mesh
 from polarguide_synth.colmap import place_cameras
 from polarguide_synth.mesh import Mesh, write_ply
 from polarguide_synth.render import parse_sweep
 from polarguide_synth.schema import (
     SceneSpec,
-    only_fields,
     parse_scene,
     read_scene_file,
     require_light,
@@ -282,11 +282,21 @@ def test_a_name_that_is_no_text_is_refused_before_the_renderer_sees_it(tmp_path:
     Fault(expected="a name in UTF-8").raised_by(require_unicode, tmp_path / os.fsdecode(b"\xff"))
 
 
-def test_fields_that_nothing_reads_are_named() -> None:
-    only_fields({"type": "ball"}, ("type", "radius"), "ball shape")
-    Fault("ball shape", "only type, radius", "foo").raised_by(
-        only_fields, {"type": "ball", "foo": 1}, ("type", "radius"), "ball shape"
-    )
+@pytest.mark.parametrize(
+    ("shape", "where"),
+    [
+        ({"type": "ball", "foo": 1}, "foo"),
+        ({"type": "ball", "radius": 0}, "radius"),
+        ({"type": "ball", "radius": True}, "radius"),
+        ({"type": "mesh", "file": "a.ply", "size": 1}, "size"),
+        ({"type": "mesh"}, "file"),
+    ],
+)
+def test_fields_of_balls_and_files_are_checked(shape: dict[str, object], where: str) -> None:
+    scene = parsed(things=[{"name": "a", "shape": shape}])
+    with pytest.raises(PolarguideError, match=where) as caught:
+        _mesh(scene.things[0], scene)
+    assert str(caught.value.where).startswith("a shape")
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ Settings = Annotated[TrainSettings, tyro.conf.arg(name="", constructor=compared_
 Options = Annotated[CompareOptions, tyro.conf.arg(name="")]
 
 
-def compare(
+def compare_recipes(
     scenes: Scenes,
     /,
     *,
@@ -115,7 +115,7 @@ def print_results(results: Results, out: Path) -> None:
         )
 
 
-def ablate(
+def ablate_recipe(
     scenes: Scenes,
     /,
     *,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -44,7 +43,7 @@ Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class PixelFit:
+class AnalyzerFit:
     """Analyzer vectors of single pixels.
 
     Attributes:
@@ -77,7 +76,7 @@ def fit_pixels(
     shots: Iterable[tuple[NDArray[np.float32], NDArray[np.bool_]]],
     light: NDArray[np.float64],
     pattern: Pattern,
-) -> PixelFit:
+) -> AnalyzerFit:
     """Fit the vector of each pixel.
 
     Args:
@@ -91,8 +90,7 @@ def fit_pixels(
             moments = np.zeros((3, *values.shape))
             squares = np.zeros(values.shape)
             saturated = np.zeros(values.shape, bool)
-        for component in range(3):
-            moments[component] += stokes[component] * values
+        moments += stokes[:, None, None] * values
         squares += np.square(values, dtype=np.float64)
         saturated |= clipped
     normal = np.linalg.inv(light.T @ light)
@@ -106,7 +104,7 @@ def fit_pixels(
     )
     sound = ~defects
     noise = float(np.mean((variance / level**2)[sound]) * np.trace(normal)) if sound.any() else 0.0
-    return PixelFit(np.ascontiguousarray(np.moveaxis(vectors, 0, -1), np.float32), noise, defects)
+    return AnalyzerFit(np.ascontiguousarray(np.moveaxis(vectors, 0, -1), np.float32), noise, defects)
 
 
 def plausible(vectors: Any, nominal: Any) -> NDArray[np.bool_]:
@@ -124,12 +122,10 @@ def plausible(vectors: Any, nominal: Any) -> NDArray[np.bool_]:
 
 
 def choose_block(
-    pixels: PixelFit, offset: tuple[int, int], pattern: Pattern, specified: int | None
+    pixels: AnalyzerFit, offset: tuple[int, int], pattern: Pattern, specified: int | None
 ) -> BlockChoice:
     """Choose what shares a vector: single pixels where their noise is less than what their mean over a block hides."""
-    around = _at_pixels(
-        block_means(pixels, offset, BLOCK, pattern), offset, BLOCK, pattern, pixels.vectors.shape
-    )
+    around = _neighborhoods(pixels, offset, pattern)
     deviation = (pixels.vectors - around).astype(np.float64)
     deviation[pixels.defects] = 0.0
     # What is common to the pixels of a cell changes its brightness, not its polarization.
@@ -143,13 +139,11 @@ def choose_block(
     sound = ~pixels.defects
     spread = float((deviation[sound] ** 2).sum(axis=1).mean()) if sound.any() else 0.0
     scatter = max(0.0, spread - pixels.noise)
-    block = BLOCK if scatter <= pixels.noise else pattern.period
-    if specified is not None:
-        block = pattern.period if specified == 1 else specified
-    return BlockChoice(block, 2 * pixels.noise**0.5, 2 * scatter**0.5)
+    block = specified or (BLOCK if scatter <= pixels.noise else pattern.period)
+    return BlockChoice(max(block, pattern.period), 2 * pixels.noise**0.5, 2 * scatter**0.5)
 
 
-def shared(pixels: PixelFit, offset: tuple[int, int], block: int, pattern: Pattern) -> Array:
+def shared(pixels: AnalyzerFit, offset: tuple[int, int], block: int, pattern: Pattern) -> Array:
     """The vectors that go into the file: means over blocks, in which defects have no part.
 
     Where each pixel has its own, a defect gets the mean of its neighborhood.
@@ -163,16 +157,14 @@ def shared(pixels: PixelFit, offset: tuple[int, int], block: int, pattern: Patte
     """
     if block > pattern.period:
         return block_means(pixels, offset, block, pattern)
-    around = _at_pixels(
-        block_means(pixels, offset, BLOCK, pattern), offset, BLOCK, pattern, pixels.vectors.shape
-    )
+    around = _neighborhoods(pixels, offset, pattern)
     vectors = np.where(pixels.defects[..., None], around, pixels.vectors)
     return block_means(
         replace(pixels, vectors=vectors, defects=np.zeros_like(pixels.defects)), offset, block, pattern
     )
 
 
-def block_means(pixels: PixelFit, offset: tuple[int, int], block: int, pattern: Pattern) -> Array:
+def block_means(pixels: AnalyzerFit, offset: tuple[int, int], block: int, pattern: Pattern) -> Array:
     """Mean vectors of blocks by place in the pattern; the mean over the sensor where no pixel is sound."""
     height, width, _ = pixels.vectors.shape
     period = pattern.period
@@ -192,14 +184,13 @@ def block_means(pixels: PixelFit, offset: tuple[int, int], block: int, pattern: 
     return out.astype(np.float32)
 
 
-def _at_pixels(
-    means: Array, offset: tuple[int, int], block: int, pattern: Pattern, shape: tuple[int, ...]
-) -> Array:
-    """The vectors of blocks at each pixel, [H, W, 3]."""
-    y = np.arange(shape[0]) + offset[1]
-    x = np.arange(shape[1]) + offset[0]
-    rows = y // block - offset[1] // block
-    columns = x // block - offset[0] // block
+def _neighborhoods(pixels: AnalyzerFit, offset: tuple[int, int], pattern: Pattern) -> Array:
+    """The mean vector of the block around each pixel, [H, W, 3]."""
+    means = block_means(pixels, offset, BLOCK, pattern)
+    y = np.arange(pixels.vectors.shape[0]) + offset[1]
+    x = np.arange(pixels.vectors.shape[1]) + offset[0]
+    rows = y // BLOCK - offset[1] // BLOCK
+    columns = x // BLOCK - offset[0] // BLOCK
     period = pattern.period
     return np.asarray(means[rows[:, None], columns, (y % period)[:, None], x % period])
 
@@ -216,28 +207,29 @@ def _brightness(throughput: NDArray[np.float64], pattern: Pattern) -> NDArray[np
     height, width = ((length - cut) // 2 for length, cut in zip(throughput.shape, (top, left), strict=True))
     inner = throughput[top : top + 2 * height, left : left + 2 * width]
     cells = inner.reshape(height, 2, width, 2).mean(axis=(1, 3))
-    out = np.empty_like(throughput)
     if pattern.colors is None:
-        return _at_places(_smooth(cells, NEIGHBORHOOD), (left, top), 2, out)
+        return _at_places(_smooth(cells, NEIGHBORHOOD), (left, top), 2, throughput.shape)
+    out = np.empty_like(throughput)
     for row, column in np.ndindex(2, 2):
         plane = _smooth(cells[row::2, column::2], NEIGHBORHOOD // 2)
-        surface = _at_places(plane, (left + 2 * column, top + 2 * row), 4, np.empty_like(out))
+        surface = _at_places(plane, (left + 2 * column, top + 2 * row), 4, out.shape)
         # Pixels beyond the first and last whole cell belong to a cell of this color, too: places repeat every 4.
-        rows = [y for y in range(out.shape[0]) if (y - top) // 2 % 2 == row]
-        columns = [x for x in range(out.shape[1]) if (x - left) // 2 % 2 == column]
-        out[np.ix_(rows, columns)] = surface[np.ix_(rows, columns)]
+        own = np.ix_(
+            (np.arange(out.shape[0]) - top) // 2 % 2 == row,
+            (np.arange(out.shape[1]) - left) // 2 % 2 == column,
+        )
+        out[own] = surface[own]
     return out
 
 
 def _at_places(
-    cells: NDArray[np.float64], corner: tuple[int, int], step: int, out: NDArray[np.float64]
+    cells: NDArray[np.float64], corner: tuple[int, int], step: int, shape: tuple[int, ...]
 ) -> NDArray[np.float64]:
     """A surface of cells, 2x2 pixels that lie ``step`` apart from a corner on, interpolated at all pixels."""
-    x = ((np.arange(out.shape[1]) - corner[0] - 0.5) / step).astype(np.float32)
-    y = ((np.arange(out.shape[0]) - corner[1] - 0.5) / step).astype(np.float32)
-    across, down = np.meshgrid(x, y)
-    out[:] = cv2.remap(cells, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return out
+    x = ((np.arange(shape[1]) - corner[0] - 0.5) / step).astype(np.float32)
+    y = ((np.arange(shape[0]) - corner[1] - 0.5) / step).astype(np.float32)
+    surface = cv2.remap(cells, *np.meshgrid(x, y), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(surface, np.float64)
 
 
 def _smooth(values: NDArray[np.float64], side: int) -> NDArray[np.float64]:
@@ -310,10 +302,21 @@ def calibrate_sensor(
     files = Shots(Path(source), settings)
     _require_apart(out, Path(source), settings)
     known = settings.known_angles(files.files)
+    reference = settings.reference or ("mean" if known is None else "angles")
+    ratio = settings.polarizer_extinction
+    diattenuation = 1.0 if ratio is None else (ratio - 1.0) / (ratio + 1.0)
     measured = files.measure(reporter)
-    fit = _solved(files, measured, settings, known)
+    fit = solve_shots(
+        measured.means,
+        np.radians(files.pattern.angles.ravel().astype(np.float64)),
+        known=known,
+        flat=measured.flat,
+        diattenuation=diattenuation,
+        to_mean=reference == "mean",
+        files=files.files,
+    )
     _say_shots(fit, settings, measured, reporter)
-    light = fit.stokes(_diattenuation(settings))
+    light = fit.stokes(diattenuation)
     pixels = fit_pixels(files.linear(measured.levels, reporter), light, files.pattern)
     defects = int(pixels.defects.sum())
     if defects > MOST_DEFECTS * pixels.defects.size:
@@ -325,10 +328,8 @@ def calibrate_sensor(
         )
     choice = choose_block(pixels, settings.offset, files.pattern, settings.block)
     vectors = shared(pixels, settings.offset, choice.block, files.pattern)
-    reference = settings.reference or ("mean" if known is None else "angles")
     calibration = AnalyzerCalibration(
-        settings.sensor, settings.lens, settings.offset, files.size, choice.block, vectors, reference,
-        settings.polarizer_extinction,
+        settings.sensor, settings.lens, settings.offset, files.size, choice.block, vectors, reference, ratio
     )  # fmt: skip
     make_folder(out.parent)
     analyzers = positions(calibration)
@@ -344,11 +345,7 @@ def calibrate_sensor(
 def _require_apart(out: Path, shots: Path, settings: CalibrateSettings) -> None:
     """Refuse to write the picture among those that are read: the next call would take it for a shot."""
     for folder in (shots, settings.flat, settings.dark_frame):
-        if (
-            folder is not None
-            and folder.is_dir()
-            and os.path.realpath(folder) == os.path.realpath(out.parent)
-        ):
+        if folder is not None and folder.is_dir() and folder.resolve() == out.parent.resolve():
             raise PolarguideError(
                 out,
                 expected=f"a place outside of {folder}",
@@ -373,25 +370,6 @@ def _require_new(out: Path) -> None:
                 found="an existing file",
                 remedy="Give another --out, or remove it; nothing was written.",
             )
-
-
-def _diattenuation(settings: CalibrateSettings) -> float:
-    ratio = settings.polarizer_extinction
-    return 1.0 if ratio is None else (ratio - 1.0) / (ratio + 1.0)
-
-
-def _solved(
-    files: Shots, measured: ShotMeans, settings: CalibrateSettings, known: list[float] | None
-) -> ShotFit:
-    return solve_shots(
-        measured.means,
-        np.radians(files.pattern.angles.ravel().astype(np.float64)),
-        known=known,
-        flat=measured.flat,
-        diattenuation=_diattenuation(settings),
-        to_mean=(settings.reference or ("mean" if known is None else "angles")) == "mean",
-        files=files.files,
-    )
 
 
 def _say_shots(fit: ShotFit, settings: CalibrateSettings, measured: ShotMeans, reporter: Reporter) -> None:

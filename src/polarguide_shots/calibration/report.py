@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -52,18 +53,13 @@ def positions(calibration: AnalyzerCalibration) -> list[Position]:
             if color is not None and pattern.colors is not None:
                 chosen &= pattern.colors == color
             vectors = calibration.vectors[:, :, chosen].astype(np.float64).mean(axis=2)
+            s0, s1, s2 = np.moveaxis(vectors, -1, 0)
+            strength = np.hypot(s1, s2)
+            extinction = (s0 + strength) / np.maximum(s0 - strength, (s0 + strength) / COUNTLESS)
+            turn = np.angle(np.exp(1j * (np.arctan2(s2, s1) - 2 * np.radians(angle)))) / 2
             name = f"{angle}" if color is None else f"{_COLORS[color]} {angle}"
-            rows.append(Position(name, angle, color, *_measures(vectors, np.radians(angle))))
+            rows.append(Position(name, angle, color, 2 * s0, extinction, np.degrees(turn)))
     return rows
-
-
-def _measures(vectors: Array, nominal: float) -> tuple[Array, Array, Array]:
-    s0, s1, s2 = np.moveaxis(vectors, -1, 0)
-    strength = np.hypot(s1, s2)
-    least = (s0 + strength) / COUNTLESS
-    extinction = (s0 + strength) / np.maximum(s0 - strength, least)
-    turn = np.angle(np.exp(1j * (np.arctan2(s2, s1) - 2 * nominal))) / 2
-    return 2 * s0, extinction, np.degrees(turn)
 
 
 def spread(values: Array) -> tuple[float, float, float]:
@@ -79,18 +75,15 @@ def effect(calibration: AnalyzerCalibration) -> tuple[float, float]:
     """
     pattern = calibration.pattern
     vectors = calibration.vectors.astype(np.float64)
-    corners = range(0, pattern.period, 2)
     zero = []
     full = []
     turns = np.radians(np.arange(0, 180, 15))
     light = np.stack([np.ones_like(turns), np.cos(2 * turns), np.sin(2 * turns)], axis=1)
-    for top in corners:
-        for left in corners:
-            cell = vectors[:, :, top : top + 2, left : left + 2].reshape(*vectors.shape[:2], 4, 3)
-            places = [int(a) for a in pattern.angles[top : top + 2, left : left + 2].ravel()]
-            cell = cell[:, :, [places.index(angle) for angle in ANGLES]]
-            zero.append(_dolp(np.moveaxis(cell[..., 0], -1, 0)))
-            full.append(_dolp(np.moveaxis(cell @ light.T, -2, 0)))
+    for top, left in itertools.product(range(0, pattern.period, 2), repeat=2):
+        cell = vectors[:, :, top : top + 2, left : left + 2].reshape(*vectors.shape[:2], 4, 3)
+        cell = cell[:, :, np.argsort(pattern.angles[top : top + 2, left : left + 2].ravel())]
+        zero.append(_dolp(np.moveaxis(cell[..., 0], -1, 0)))
+        full.append(_dolp(np.moveaxis(cell @ light.T, -2, 0)))
     return float(np.median(zero)), float(np.median(full))
 
 
@@ -103,11 +96,11 @@ def lines(calibration: AnalyzerCalibration, analyzers: list[Position]) -> list[s
     """The table for the console."""
     rows = ["position   throughput             extinction ratio       angle error in degrees"]
     for position in analyzers:
-        cells = [
-            _cell(position.throughput, "{:.3f}"),
-            _cell(position.extinction, "{:.0f}"),
-            _cell(position.angle_error, "{:+.2f}"),
-        ]
+        cells = []
+        for name, form in _FORMS.items():
+            values = getattr(position, name)
+            middle, low, high = (form(value) for value in spread(values))
+            cells.append(middle if values.size == 1 else f"{middle} ({low} to {high})")
         rows.append(f"{position.name + ' deg':<10} " + " ".join(f"{cell:<22}" for cell in cells).rstrip())
     unpolarized, polarized = effect(calibration)
     rows.append("(median, and 5 % to 95 % of the blocks)")
@@ -118,12 +111,13 @@ def lines(calibration: AnalyzerCalibration, analyzers: list[Position]) -> list[s
     return rows
 
 
-def _cell(values: Array, form: str) -> str:
-    def text(value: float) -> str:
-        return f">{COUNTLESS:.0f}" if form == "{:.0f}" and value >= 0.999 * COUNTLESS else form.format(value)
+def _ratio(value: float) -> str:
+    """An extinction ratio as text."""
+    return f">{COUNTLESS:.0f}" if value >= 0.999 * COUNTLESS else f"{value:.0f}"
 
-    middle, low, high = spread(values)
-    return text(middle) if values.size == 1 else f"{text(middle)} ({text(low)} to {text(high)})"
+
+_FORMS = {"throughput": "{:.3f}".format, "extinction": _ratio, "angle_error": "{:+.2f}".format}
+"""Text of a number of each measure of a position."""
 
 
 _CURVES = {0: (204, 51, 51), 45: (46, 134, 46), 90: (51, 102, 204), 135: (190, 120, 20)}
@@ -182,14 +176,13 @@ def _maps(analyzers: Sequence[Position]) -> Picture:
                     v for p, v in zip(analyzers, values, strict=True) if p.angle == angle and p.color == color
                 )
                 rows[index].append(scalar_to_rgb(torch.from_numpy(channel.copy()), low, high, colormap))
-    most = 420 if len(colors) == 1 else 256
     return contact_sheet(
         rows,
         [f"{angle} deg" for angle in ANGLES],
         labels,
         footer=footer,
         minimum_width=256,
-        maximum_width=most,
+        maximum_width=420 if len(colors) == 1 else 256,
     )
 
 
@@ -262,20 +255,16 @@ def _curves(
 def _legend(drawn: Picture, analyzers: Sequence[Position], x: int) -> None:
     """Medians of the positions."""
     columns = (90, 168, 242)
-    for text, place in zip(("throughput", "extinction", "angle error"), columns, strict=True):
-        _text(drawn, text, x + place - 4, 50, 0.4)
+    for text, place in zip(_FORMS, columns, strict=True):
+        _text(drawn, text.replace("_", " "), x + place - 4, 50, 0.4)
     for line, position in enumerate(analyzers):
-        throughput, extinction, error = (
-            spread(values)[0] for values in (position.throughput, position.extinction, position.angle_error)
-        )
         y = _TOP + line * (26 if len(analyzers) == len(ANGLES) else 20)
         cv2.circle(drawn, (x + 6, y - 4), 5, _CURVES[position.angle], -1, cv2.LINE_AA)
         _text(drawn, f"{position.name} deg", x + 18, y)
-        ratio = f">{COUNTLESS:.0f}" if extinction > 0.999 * COUNTLESS else f"{extinction:.0f}"
-        for text, place in zip((f"{throughput:.3f}", ratio, f"{error:+.2f}"), columns, strict=True):
-            _text(drawn, text, x + place, y)
+        for (name, form), place in zip(_FORMS.items(), columns, strict=True):
+            _text(drawn, form(spread(getattr(position, name))[0]), x + place, y)
 
 
 def _text(drawn: Picture, text: str, x: int, y: int, scale: float = 0.45) -> None:
-    plain = text.encode("ascii", "replace").decode()
-    cv2.putText(drawn, plain, (x, y), FONT, scale, INK, 1, cv2.LINE_AA)
+    shown = text.encode("ascii", "replace").decode()
+    cv2.putText(drawn, shown, (x, y), FONT, scale, INK, 1, cv2.LINE_AA)

@@ -72,11 +72,10 @@ class CalibrateSettings(MosaicOptions):
         require_sensor(self.sensor)
         check_options(self)
         if not self.lens.isprintable():
-            found = repr(self.lens)
             raise PolarguideError(
                 "--lens",
                 expected="one line of text",
-                found=found,
+                found=repr(self.lens),
                 remedy="Leave control characters out.",
             )
         period = sensor_pattern(self.sensor).period

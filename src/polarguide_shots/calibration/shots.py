@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -104,6 +104,7 @@ class Shots:
             PolarguideError: one cannot be used: damaged, of another size, saturated, dark, not of a uniform light, ...
         """
         files = [*self.files, *self._flat]
+        period = self.pattern.period
         sums: list[Array] = []
         counts: list[NDArray[np.int64]] = []
         blocks: list[NDArray[Any]] = []
@@ -111,7 +112,8 @@ class Shots:
         light = None
         with reporter.track("reading shots", len(files) + len(self._dark)) as advance:
             if self._dark:
-                self._floor = self._mean_of(self._dark)
+                total = sum(self._read(path).astype(np.float64) for path in self._dark)
+                self._floor = np.asarray(total / len(self._dark), np.float32)
             for number, path in enumerate(files, 1):
                 values = self._read(path)
                 counts.append(np.bincount(values.ravel(), minlength=256))
@@ -121,16 +123,23 @@ class Shots:
                     left, top = self.pattern.cell_corner()
                     blocks.append(sample_blocks(values[top:, left:], SIDE))
                 above = values.astype(np.float32) - np.float32(self._floor)
-                sums.append(self._position_means(above))
+                planes = (above[row::period, column::period] for row, column in np.ndindex(period, period))
+                sums.append(np.array([plane.mean(dtype=np.float64) for plane in planes]))
                 mean = float(above.mean())
                 if mean <= 0:
-                    raise self._too_dark(path, values)
+                    dark = "dark frame" if self._dark else "black level"
+                    raise PolarguideError(
+                        path,
+                        expected=f"a shot that is brighter than the {dark}",
+                        found=f"a mean of {values.mean():.1f}, and {np.mean(self._floor):.1f} of the {dark}",
+                        remedy="Take the dark frame with the lens covered, at the same exposure and gain.",
+                    )
                 light = above / mean if light is None else light + above / mean
                 advance(number + len(self._dark))
         assert light is not None
         levels = self._levels(counts, agreed_full_scale(stated) if stated else None)
         for path, count in zip(files, counts, strict=True):
-            self._require_exposed(path, count, levels)
+            _require_exposed(path, count, levels)
         require_kind(self._settings.sensor, np.concatenate(blocks), levels)
         self._require_uniform(light)
         means = np.stack(sums) / (levels.white - levels.black)
@@ -170,49 +179,21 @@ class Shots:
             )
         return values
 
-    def _mean_of(self, paths: Sequence[Path]) -> NDArray[np.float32]:
-        total: Any = 0.0
-        for path in paths:
-            total = total + self._read(path).astype(np.float64)
-        return np.asarray(total / len(paths), np.float32)
-
-    def _position_means(self, values: NDArray[np.float32]) -> Array:
-        period = self.pattern.period
-        planes = (values[row::period, column::period] for row, column in np.ndindex(period, period))
-        return np.array([plane.mean(dtype=np.float64) for plane in planes])
-
     def _levels(self, counts: list[NDArray[np.int64]], stated: int | None) -> Levels:
         used = [np.flatnonzero(count) for count in counts]
         largest = max(int(values[-1]) for values in used)
         bits = int(np.bitwise_or.reduce(np.concatenate(used)))
         assert self._first is not None
-        settings = self._settings
         path, _, kind = self._first
-        container = self._raw.container(path, np.dtype(kind))
-        black = 0.0 if self._dark else settings.black_level
         return estimate_levels(
-            largest, bits, container,
-            bits=settings.bits, black=black, saturation=settings.saturation, stated=stated,
-        )  # fmt: skip
-
-    def _too_dark(self, path: Path, values: NDArray[Any]) -> PolarguideError:
-        dark = "dark frame" if self._dark else "black level"
-        return PolarguideError(
-            f"{path}",
-            expected=f"a shot that is brighter than the {dark}",
-            found=f"a mean of {values.mean():.1f}, and {np.mean(self._floor):.1f} of the {dark}",
-            remedy="Take the dark frame with the lens covered, at the same exposure and gain.",
+            largest,
+            bits,
+            self._raw.container(path, np.dtype(kind)),
+            bits=self._settings.bits,
+            black=0.0 if self._dark else self._settings.black_level,
+            saturation=self._settings.saturation,
+            stated=stated,
         )
-
-    def _require_exposed(self, path: Path, count: NDArray[np.int64], levels: Levels) -> None:
-        share = float(count[levels.saturation :].sum() / count.sum())
-        if share > SATURATED:
-            raise PolarguideError(
-                path,
-                expected=f"at most {SATURATED:.1%} saturated samples",
-                found=f"{share:.1%}",
-                remedy="Expose shorter: the brightest shot should stay below 90 % of full scale.",
-            )
 
     def _require_uniform(self, light: NDArray[np.float32]) -> None:
         """Refuse shots of a scene: light has to be alike over each neighborhood, and nowhere much dimmer."""
@@ -239,14 +220,24 @@ class Shots:
             rest = rest - np.outer(rest @ tilt / (tilt @ tilt), tilt)
         texture = float(np.sqrt(np.mean(rest**2)))
         if low < UNEVEN * high or texture > TEXTURED:
-            found = f"{low / high:.0%} of the brightest part in the dimmest, {texture:.0%} of texture"
             raise PolarguideError(
                 self.files[0].parent,
                 expected=f"a uniform light: its dimmest part above {UNEVEN:.0%}, texture below {TEXTURED:.0%}",
-                found=found,
+                found=f"{low / high:.0%} of the brightest part in the dimmest, {texture:.0%} of texture",
                 remedy="Fill the field with a diffuser or an integrating sphere, out of focus, and all of it with the "
                 "polarizer.",
             )
+
+
+def _require_exposed(path: Path, count: NDArray[np.int64], levels: Levels) -> None:
+    share = float(count[levels.saturation :].sum() / count.sum())
+    if share > SATURATED:
+        raise PolarguideError(
+            path,
+            expected=f"at most {SATURATED:.1%} saturated samples",
+            found=f"{share:.1%}",
+            remedy="Expose shorter: the brightest shot should stay below 90 % of full scale.",
+        )
 
 
 def _files(option: str, path: Path | None) -> list[Path]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -147,16 +148,15 @@ def read_limits(path: Path, regions: Collection[str], *, reference: bool) -> Lim
     limits = read_record(path, Limits, remedy=_REMEDY)
     if limits.format != 1:
         raise _wrong(path, "format", "1", str(limits.format))
-    for region in limits.regions:
+    places = {"limits": limits.limits}
+    for region, bounds in limits.regions.items():
         if region not in regions:
             raise _wrong(path, "regions", f"a region of --roi: {', '.join(regions)}", region)
-    for place, bounds in (
-        ("limits", limits.limits),
-        *((f"regions.{r}", b) for r, b in limits.regions.items()),
-    ):
+        places[f"regions.{region}"] = bounds
+    for place, bounds in places.items():
         for field, bound in bounds.items():
             _check(path, f"{place}.{field}", field, bound, reference)
-    if not any((limits.limits, *limits.regions.values())):
+    if not any(places.values()):
         raise _wrong(path, "limits", "a bound of at least one field", "none")
     return limits
 
@@ -164,7 +164,7 @@ def read_limits(path: Path, regions: Collection[str], *, reference: bool) -> Lim
 def _check(path: Path, place: str, field: str, bound: Bound, reference: bool) -> None:
     if field not in BOUNDED:
         near = difflib.get_close_matches(field, BOUNDED, 3, 0.5)
-        raise _wrong(path, place, "a field of the table", f"{field}", near)
+        raise _wrong(path, place, "a field of the table", field, near)
     if field in COMPARED and not reference:
         raise PolarguideError(
             f"{path} ({place})",
@@ -196,15 +196,14 @@ def faults(figures: Mapping[str, Value], bounds: Mapping[str, Bound]) -> list[st
         if not isinstance(value, int | float):
             beyond.append(f"{field} has no value")
             continue
-        low = bound.min
-        high = bound.max
-        if field in AXIAL and low is not None and high is not None and low > high:
-            # The allowed angles go through 180.
+        low = -math.inf if bound.min is None else bound.min
+        high = math.inf if bound.max is None else bound.max
+        if low > high:  # the allowed angles go through 180
             if high < value < low:
                 beyond.append(f"{field} {value:.5g} outside {low:g} through 180 to {high:g}")
-        elif low is not None and value < low:
+        elif value < low:
             beyond.append(f"{field} {value:.5g} under {low:g}")
-        elif high is not None and value > high:
+        elif value > high:
             beyond.append(f"{field} {value:.5g} over {high:g}")
     return beyond
 

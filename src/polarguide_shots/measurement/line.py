@@ -70,8 +70,7 @@ class MeasuredShot:
 
     def entry(self, files: tuple[FileStamp, ...] = (), picture: str = "") -> Entry:
         """Its line of the table."""
-        maps = self.maps
-        return Entry(FORMAT, maps.name, files, self.status, "", maps.notes, self.regions, picture)
+        return Entry(FORMAT, self.maps.name, files, self.status, "", self.maps.notes, self.regions, picture)
 
 
 class Measurer:
@@ -146,9 +145,8 @@ class Measurer:
             "y": region.y,
             "width": region.width,
             "height": region.height,
-            **verdict(beyond, bounds),
         }
-        return region, {**head, **figures}, beyond
+        return region, {**head, **verdict(beyond, bounds), **figures}, beyond
 
     def judged(self, entry: Entry) -> Entry:
         """A line of a table by the limits; its figures do not change."""
@@ -162,26 +160,18 @@ class Measurer:
     def settings(self) -> dict[str, Any]:
         """The settings that the figures depend on, as JSON."""
         reading = {f.name: getattr(self._reading, f.name) for f in dataclasses.fields(self._reading)}
-        named = [value for value in reading.values() if isinstance(value, Path)]
-        made: dict[str, Any] = msgspec.to_builtins(
-            {
-                "reading": reading,
-                "read_files": stamps(tuple(named)),
-                "regions": [
-                    {
-                        name: value
-                        for name, value in dataclasses.asdict(region).items()
-                        if name != "corners" or value
-                    }
-                    for region in self._regions
-                ],
-                "threshold": self._options.threshold,
-                "limits": self.limits,
-                "reference": stamps(self.reference_files),
-            },
-            enc_hook=str,
-        )
-        return made
+        settings = {
+            "reading": reading,
+            "read_files": stamps([value for value in reading.values() if isinstance(value, Path)]),
+            "regions": [
+                {k: v for k, v in dataclasses.asdict(region).items() if k != "corners" or v}
+                for region in self._regions
+            ],
+            "threshold": self._options.threshold,
+            "limits": self.limits,
+            "reference": stamps(self.reference_files),
+        }
+        return dict(msgspec.to_builtins(settings, enc_hook=str))
 
 
 def unread_entry(shot: ExposureSet, files: tuple[FileStamp, ...], error: BaseException) -> Entry:
@@ -242,7 +232,7 @@ class ChangedWhileRead(PolarguideError):
     """A file was written to while it was read."""
 
 
-class Line:
+class Line(contextlib.AbstractContextManager["Line"]):
     """A ``Measurer`` and the table that it writes into. Use it as a context: it holds the table open."""
 
     def __init__(self, out: Path, options: MeasureOptions, reading: ShotOptions) -> None:
@@ -257,9 +247,6 @@ class Line:
         self.table = Table(
             out, self.measurer.settings(), overwrite=options.overwrite, judged=self.measurer.judged
         )
-
-    def __enter__(self) -> Line:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.table.close()
@@ -295,17 +282,15 @@ class Line:
 
     def _draw(self, shot: ExposureSet, measured: MeasuredShot) -> str:
         """Write pictures before the line of the table: where that is, they are. Their name, "" if there are none."""
-        maps = measured.maps
-        differences = measured.differences
-        if not measured.beyond and differences is None:
+        reference = self.measurer.reference
+        if not measured.beyond and reference is None:
             return ""
-        name = self.table.picture_name(maps.name)
+        name = self.table.picture_name(measured.maps.name)
         if measured.beyond:
             self._draw_beyond(shot, measured, name)
-        reference = self.measurer.reference
-        if differences is not None and reference is not None:
+        if measured.differences is not None and reference is not None:
+            picture = difference_picture(measured.differences, measured.maps.name, reference.name)
             make_folder(self.out / DIFFERENCES)
-            picture = difference_picture(differences, maps.name, reference.name)
             write_png(self.out / DIFFERENCES / f"{name}.png", picture)
         return name
 
@@ -381,20 +366,19 @@ def measure_shots(
             if line is None:
                 entry = measurer.entry(shot)
                 entries.append(entry)
-                status: Status = entry.status
                 heard(entry)
             else:
-                known, status = _measured_into(line, shot, heard)
+                known, entry = _measured_into(line, shot, heard)
                 earlier += known
-            counts[status] += 1
+            counts[entry.status] += 1
             advance(number)
         if line is not None:
             line.table.require_there()
     return Outcome(None if out is None else Path(out), counts, earlier, entries=tuple(entries))
 
 
-def _measured_into(line: Line, shot: ExposureSet, heard: Heard) -> tuple[bool, Status]:
-    """Measure a shot into a table that does not have it; whether it had, and the status."""
+def _measured_into(line: Line, shot: ExposureSet, heard: Heard) -> tuple[bool, Entry]:
+    """Measure a shot into a table that does not have it; whether it had, and the line."""
     files: tuple[FileStamp, ...] = ()
     with contextlib.suppress(OSError):
         files = stamps(shot.paths)
@@ -405,13 +389,13 @@ def _measured_into(line: Line, shot: ExposureSet, heard: Heard) -> tuple[bool, S
                 line.follow_judgment(shot, known)
             if known.status == "beyond":
                 heard(known)
-        return True, known.status
+        return True, known
     try:
         entry = line.measure(shot, files)
     except UNREADABLE as error:
         entry = line.unread(shot, files, error)
     heard(entry)
-    return False, entry.status
+    return False, entry
 
 
 def _shots_of(
@@ -422,20 +406,27 @@ def _shots_of(
 ) -> tuple[Iterable[ExposureSet], int | None]:
     """The shots, and how many there are where that is known."""
     if isinstance(paths, Mapping):
-        return [array_shot(stacked_array(a, name), reading, angles, name) for name, a in paths.items()], len(
-            paths
-        )
+        named = [array_shot(stacked_array(a, name), reading, angles, name) for name, a in paths.items()]
+        return named, len(named)
     if is_array(paths) and not isinstance(paths, list | tuple):
-        remedy = "Put it into a list: measure([array])."
-        raise PolarguideError("paths", expected="several shots", found="one array", remedy=remedy)
+        raise PolarguideError(
+            "paths",
+            expected="several shots",
+            found="one array",
+            remedy="Put it into a list: measure([array]).",
+        )
     if not isinstance(paths, Sequence):
         return (_array_set(shot, number, reading, angles) for number, shot in enumerate(paths, 1)), None
     if paths and all(isinstance(shot, ExposureSet) or is_array(shot) for shot in paths):
         return [_array_set(shot, number, reading, angles) for number, shot in enumerate(paths, 1)], len(paths)
     files = [path for path in paths if isinstance(path, str | os.PathLike)]
     if len(files) < len(paths):
-        remedy = "Measure files and arrays by calls of their own."
-        raise PolarguideError("paths", expected="files, or arrays", found="both, or neither", remedy=remedy)
+        raise PolarguideError(
+            "paths",
+            expected="files, or arrays",
+            found="both, or neither",
+            remedy="Measure files and arrays by calls of their own.",
+        )
     if out is not None:
         require_elsewhere(files, Path(out))
     shots = find_shots(files, reading)
@@ -447,6 +438,10 @@ def _array_set(shot: Source, number: int, reading: ShotOptions, angles: Sequence
         return shot
     name = f"{NAME}-{number}"
     if not is_array(shot):
-        remedy = "An iterator delivers arrays; give paths as a list."
-        raise PolarguideError(name, expected="an array", found=type(shot).__name__, remedy=remedy)
+        raise PolarguideError(
+            name,
+            expected="an array",
+            found=type(shot).__name__,
+            remedy="An iterator delivers arrays; give paths as a list.",
+        )
     return array_shot(stacked_array(shot, name), reading, angles, name)

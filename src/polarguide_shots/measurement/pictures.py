@@ -111,12 +111,14 @@ def _layers(maps: ShotMaps, differences: Differences | None) -> dict[str, tuple[
             maps.s0,
         ),
     }
-    if differences is None:
-        return layers
-    of_part = {}
-    for key, (values, most, name) in _difference_panels(differences).items():
-        title = f"{name} less the golden part's, red more (+{most:g}), blue less"
-        of_part[key] = (title, diverging(values, most), values)
+    of_part = {
+        key: (
+            f"{name} less the golden part's, red more (+{most:g}), blue less",
+            diverging(values, most),
+            values,
+        )
+        for key, (values, most, name) in (_difference_panels(differences) if differences else {}).items()
+    }
     return {**of_part, **layers}
 
 
@@ -125,29 +127,26 @@ def _pixels_beyond(
 ) -> NDArray[np.bool_]:
     """Pixels of a region that are beyond a limit themselves, [H, W]; none for a limit of no single pixel."""
     beyond = np.zeros(maps.reason.shape, bool)
-    at = (region.rows, region.columns)
-    inside = region.inside
     low = -math.inf if bound.min is None else bound.min
     high = math.inf if bound.max is None else bound.max
     if field in _LOST:
-        part = maps.reason[at] == _LOST[field]
+        part = maps.reason[region.place] == _LOST[field]
     elif (_layer_of(field) == PHOTOGRAPH and not field.startswith("s0")) or field.endswith(_OF_NO_PIXEL):
         return beyond
     else:
-        numbers = values[at]
-        signed = field.endswith("_difference") or "_difference" not in field
-        sizes = numbers if signed else np.abs(numbers)
+        sizes = values[region.place]
+        if "_difference_" in field:
+            sizes = np.abs(sizes)
         part = (sizes < low) | (sizes > high) if low <= high else (sizes > high) & (sizes < low)
-        part &= maps.measured[at]
-    beyond[at] = part if inside is None else part & inside
+        part &= maps.measured[region.place]
+    beyond[region.place] = part if region.inside is None else part & region.inside
     return beyond
 
 
 def _outline(panel: Picture, mask: NDArray[np.bool_]) -> None:
     """Draw the outline of pixels; single ones among others are noise."""
     whole = cv2.medianBlur(mask.astype(np.uint8), _SPECKLE)
-    size = panel.shape[1], panel.shape[0]
-    large = cv2.resize(whole, size, interpolation=cv2.INTER_NEAREST)
+    large = cv2.resize(whole, panel.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     outlines, _ = cv2.findContours(large, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     thick = max(1, round(panel.shape[1] / 500))
     cv2.drawContours(panel, outlines, -1, (0, 0, 0), 3 * thick)
@@ -159,15 +158,13 @@ def _boxes(panel: Picture, scale: float, regions: Beyond) -> None:
     thick = max(1, round(panel.shape[1] / 500))
     for region, beyond in sorted(regions, key=lambda pair: bool(pair[1])):
         color = _BEYOND if beyond else _WITHIN
-        width = 2 * thick if beyond else thick
-        right = region.width
-        low = region.height
-        corners = region.corners or ((0, 0), (right, 0), (right, low), (0, low))
-        places = np.rint(scale * (np.array(corners) + (region.x, region.y))).astype(np.int32)
+        size = np.array((region.width, region.height))
+        corners = np.array(region.corners or ((0, 0), (1, 0), (1, 1), (0, 1)) * size)
+        places = np.rint(scale * (corners + (region.x, region.y))).astype(np.int32)
         # What lies beyond the last pixel is drawn on it.
-        ends = np.rint(scale * np.array((region.x + right, region.y + low))).astype(np.int32) - 1
+        ends = np.rint(scale * (size + (region.x, region.y))).astype(np.int32) - 1
         places = np.maximum(np.minimum(places, ends), places.min(axis=0))
-        cv2.polylines(panel, [places], True, color, width)
+        cv2.polylines(panel, [places], True, color, 2 * thick if beyond else thick)
         left, top = places.min(axis=0).tolist()
         _name(panel, region.name, left, top, color)
 
@@ -204,15 +201,15 @@ def _name(picture: Picture, name: str, x: int, y: int, color: tuple[int, int, in
 
 def _wrapped(line: str, width: int) -> list[str]:
     """A line in pieces that fit."""
-    pieces = []
-    piece = ""
-    for word in _ascii(line).split(" "):
-        longer = f"{piece} {word}" if piece else word
-        if piece and cv2.getTextSize(longer, FONT, 0.5, 1)[0][0] > width:
-            pieces.append(piece)
-            longer = f"    {word}"
-        piece = longer
-    return [*pieces, piece]
+    first, *words = _ascii(line).split(" ")
+    pieces = [first]
+    for word in words:
+        longer = f"{pieces[-1]} {word}"
+        if cv2.getTextSize(longer, FONT, 0.5, 1)[0][0] > width:
+            pieces.append(f"    {word}")
+        else:
+            pieces[-1] = longer
+    return pieces
 
 
 def _ascii(text: str) -> str:
@@ -222,7 +219,7 @@ def _ascii(text: str) -> str:
 def difference_picture(differences: Differences, shot: str, reference: str) -> Picture:
     """The three differences beside one another: red more, blue less than the reference, gray not compared."""
     panels = _difference_panels(differences).values()
-    sheet = contact_sheet(
+    return contact_sheet(
         [[diverging(values, most) for values, most, _ in panels]],
         [""],
         [f"{name}: {_short(shot)} - {_short(reference)}" for _, _, name in panels],
@@ -230,7 +227,6 @@ def difference_picture(differences: Differences, shot: str, reference: str) -> P
         minimum_width=480,
         maximum_width=960,
     )
-    return sheet
 
 
 def _difference_panels(differences: Differences) -> dict[str, tuple[Map, float, str]]:

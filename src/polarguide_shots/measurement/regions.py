@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -57,14 +57,9 @@ class Region:
         return _filled(self.corners, self.width, self.height) if self.corners else None
 
     @property
-    def rows(self) -> slice:
-        """Its rows."""
-        return slice(self.y, self.y + self.height)
-
-    @property
-    def columns(self) -> slice:
-        """Its columns."""
-        return slice(self.x, self.x + self.width)
+    def place(self) -> tuple[slice, slice]:
+        """Its rows and columns."""
+        return slice(self.y, self.y + self.height), slice(self.x, self.x + self.width)
 
 
 @lru_cache(maxsize=64)
@@ -119,10 +114,10 @@ def _parse(text: str, number: int) -> Region:
 
 def _polygon(name: str, corners: Sequence[tuple[int, ...]], text: str) -> Region:
     """A polygon of corners (x, y) in pixels of the maps."""
-    (left, right), (top, bottom) = ((min(p[k] for p in corners), max(p[k] for p in corners)) for k in (0, 1))
-    within = tuple((p[0] - left, p[1] - top) for p in corners)
-    region = Region(name, left, top, right - left, bottom - top, within)
-    if max(right, bottom) > _MOST or min(region.width, region.height) < 1 or not np.any(region.inside):
+    left, top = np.min(corners, axis=0).tolist()
+    width, height = np.ptp(corners, axis=0).tolist()
+    region = Region(name, left, top, width, height, tuple((x - left, y - top) for x, y in corners))
+    if max(left + width, top + height) > _MOST or min(width, height) < 1 or not np.any(region.inside):
         raise _wrong("corners around at least one pixel", repr(text))
     return region
 
@@ -160,9 +155,8 @@ def box_of(regions: Sequence[Region]) -> tuple[int, int, int, int] | None:
         return None
     left = min(r.x for r in regions)
     top = min(r.y for r in regions)
-    right = max(r.x + r.width for r in regions)
-    bottom = max(r.y + r.height for r in regions)
-    return left, top, right - left, bottom - top
+    width = max(r.x + r.width for r in regions) - left
+    return left, top, width, max(r.y + r.height for r in regions) - top
 
 
 Floats = NDArray[np.floating[Any]]
@@ -183,7 +177,7 @@ def region_figures(maps: ShotMaps, region: Region, threshold: float) -> dict[str
     Returns:
         By ``Field.key``, ``pixels`` to ``aolp_concentration``; angles in degrees.
     """
-    at = region.rows, region.columns
+    at = region.place
     reason = maps.reason[at]
     inside = region.inside
     if inside is not None:
@@ -232,9 +226,8 @@ def _distribution(key: str, values: Floats, error: float | None) -> dict[str, Va
     if not values.size:
         return dict.fromkeys(names)
     mean, deviation = (float(moment[0, 0]) for moment in cv2.meanStdDev(values))  # one pass, in float64
-    return dict(
-        zip(names, (mean, error, deviation, *map(float, np.percentile(values, PERCENTILES))), strict=True)
-    )
+    percentiles = map(float, np.percentile(values, PERCENTILES))
+    return dict(zip(names, (mean, error, deviation, *percentiles), strict=True))
 
 
 def _angles(aolp: Floats, error: float | None) -> dict[str, Value]:
@@ -352,26 +345,23 @@ def difference_figures(differences: Differences | None, region: Region) -> dict[
     """Figures of the differences in a region, ``compared`` and the fields after it; None without a reference."""
     if differences is None:
         return dict.fromkeys(COMPARED)
-    return dict(_figures(differences, region))
-
-
-def _figures(differences: Differences, region: Region) -> Iterator[tuple[str, Value]]:
-    at = (region.rows, region.columns)
     inside = region.inside
     s0, dolp, aolp = (
-        values[np.isfinite(values) & (True if inside is None else inside)]
-        for values in (differences.s0[at], differences.dolp[at], differences.aolp[at])
+        values[region.place][np.isfinite(values[region.place]) & (True if inside is None else inside)]
+        for values in (differences.s0, differences.dolp, differences.aolp)
     )
-    yield "compared", int(s0.size)
-    yield "compared_angles", int(aolp.size)
+    figures: dict[str, Value] = {
+        **dict.fromkeys(COMPARED),
+        "compared": int(s0.size),
+        "compared_angles": int(aolp.size),
+    }
     for key, values in (("s0", s0), ("dolp", dolp), ("aolp", np.degrees(aolp))):
-        if not values.size:
-            yield from ((f"{key}{name}", None) for name in _NAMES)
-            continue
-        mean = math.degrees(axial_mean(aolp)[0]) if key == "aolp" else float(values.mean(dtype=np.float64))
-        yield f"{key}{_NAMES[0]}", mean
-        yield f"{key}{_NAMES[1]}", float(np.sqrt(np.mean(values.astype(np.float64) ** 2)))
-        yield f"{key}{_NAMES[2]}", float(np.percentile(np.abs(values), DIFFERENCE_PERCENTILE))
-
-
-_NAMES = ("_difference", "_difference_rms", f"_difference_p{DIFFERENCE_PERCENTILE}")
+        if values.size:
+            mean = (
+                math.degrees(axial_mean(aolp)[0]) if key == "aolp" else float(values.mean(dtype=np.float64))
+            )
+            largest = float(np.percentile(np.abs(values), DIFFERENCE_PERCENTILE))
+            figures[f"{key}_difference"] = mean
+            figures[f"{key}_difference_rms"] = float(np.sqrt(np.mean(values.astype(np.float64) ** 2)))
+            figures[f"{key}_difference_p{DIFFERENCE_PERCENTILE}"] = largest
+    return figures

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -88,22 +89,25 @@ class Entry(msgspec.Struct, frozen=True):
     regions: tuple[dict[str, Value], ...]
     picture: str = ""
 
+    def line(self) -> bytes:
+        """The line of ``table.jsonl``; JSON's escapes keep names that are no Unicode."""
+        return json.dumps(msgspec.to_builtins(self)).encode() + b"\n"
+
     def rows(self) -> Iterator[list[Value]]:
         """The lines of the CSV table."""
-        taken = ""
-        if self.files:
-            newest = max(file.modified for file in self.files) / 1e9
-            taken = datetime.fromtimestamp(newest, timezone.utc).isoformat(timespec="milliseconds")
         shared: dict[str, Value] = {
             "shot": self.shot,
             "files": ";".join(file.path for file in self.files),
-            "taken": taken.replace("+00:00", "Z"),
+            "taken": "",
         }
+        if self.files:
+            newest = datetime.fromtimestamp(max(file.modified for file in self.files) / 1e9, timezone.utc)
+            shared["taken"] = newest.isoformat(timespec="milliseconds").replace("+00:00", "Z")
         for figures in self.regions or ({"status": self.status, "why": self.why},):
             yield [{**shared, **figures}.get(key) for key in KEYS]
 
 
-class Table:
+class Table(contextlib.AbstractContextManager["Table"]):
     """A table that is open for more lines. Close it, or use it as a context."""
 
     def __init__(
@@ -133,7 +137,6 @@ class Table:
         self._done: dict[bytes, Entry] = {}
         self._pictures: set[str] = set()
         self._files: list[BinaryIO] = []
-        self._stack = contextlib.ExitStack()
         with contextlib.ExitStack() as stack:
             stack.enter_context(
                 only_writer(
@@ -146,17 +149,11 @@ class Table:
             for name in (LINES, CSV):
                 with writing(folder / name):
                     self._files.append(stack.enter_context(open(folder / name, "ab", buffering=0)))
-            self._stack = stack.pop_all()
-
-    def __enter__(self) -> Table:
-        return self
+            self.close = stack.pop_all().close
+            """Let others write the table."""
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def close(self) -> None:
-        """Let others write the table."""
-        self._stack.close()
 
     def status_of(self, files: tuple[FileStamp, ...]) -> Status | None:
         """The status in the line of these files as they are, None where there is no such line."""
@@ -169,12 +166,8 @@ class Table:
 
     def picture_name(self, shot: str) -> str:
         """A name for the pictures of a shot that those of no other have, upper and lower case taken alike."""
-        name = shot
-        number = 1
-        while name.casefold() in self._pictures:
-            number += 1
-            name = f"{shot}-{number}"
-        return name
+        names = itertools.chain((shot,), (f"{shot}-{number}" for number in itertools.count(2)))
+        return next(name for name in names if name.casefold() not in self._pictures)
 
     def add(self, entry: Entry) -> None:
         """Write the lines of a shot; when this returns, they are on disk.
@@ -184,8 +177,7 @@ class Table:
         """
         self.require_there()
         lines, rows = self._files
-        # JSON's escapes keep names that are no Unicode.
-        _append(self.folder / LINES, lines, json.dumps(msgspec.to_builtins(entry)).encode() + b"\n")
+        _append(self.folder / LINES, lines, entry.line())
         self._note(entry)
         _append(self.folder / CSV, rows, _csv(entry.rows()))
 
@@ -245,7 +237,13 @@ class Table:
                 self._mend()
                 return
             if before is not None and _holds_measurements(lines):
-                raise _other_settings(path, before, now)
+                name, was, is_now = first_difference("", before, now)
+                raise PolarguideError(
+                    f"{path} ({name[1:]})",
+                    expected=shortened(was, 200),
+                    found=shortened(is_now, 200),
+                    remedy=f"One table has one set of options. {_ANEW}",
+                )
         elif lines.exists() and not overwrite:
             raise PolarguideError(
                 path, expected="the options that this table was made with", found="nothing", remedy=_ANEW
@@ -272,9 +270,12 @@ class Table:
                     break
                 entry = decode(line, Entry, f"{path} (line {number})", remedy=_ANEW)
                 if entry.format != FORMAT:
-                    place = f"{path} (line {number}, format)"
-                    found = str(entry.format)
-                    raise PolarguideError(place, expected=str(FORMAT), found=found, remedy=_ANEW)
+                    raise PolarguideError(
+                        f"{path} (line {number}, format)",
+                        expected=str(FORMAT),
+                        found=str(entry.format),
+                        remedy=_ANEW,
+                    )
                 self._note(entry)
                 rows.write(_csv(entry.rows()))
                 whole += len(line)
@@ -292,7 +293,7 @@ class Table:
                 if entry.status == "beyond" and not entry.picture:
                     entry = msgspec.structs.replace(entry, picture=self.picture_name(entry.shot))
                     self._pictures.add(entry.picture.casefold())
-                new.write(json.dumps(msgspec.to_builtins(entry)).encode() + b"\n")
+                new.write(entry.line())
                 self.judged_again += 1
 
 
@@ -322,13 +323,3 @@ def _key(files: tuple[FileStamp, ...]) -> bytes:
 def _holds_measurements(path: Path) -> bool:
     with open(path, "rb") as lines:
         return any(b'"status": "unread"' not in line for line in lines)
-
-
-def _other_settings(path: Path, before: dict[str, Any], now: dict[str, Any]) -> PolarguideError:
-    name, was, is_now = first_difference("", before, now)
-    return PolarguideError(
-        f"{path} ({name[1:]})",
-        expected=shortened(was, 200),
-        found=shortened(is_now, 200),
-        remedy=f"One table has one set of options. {_ANEW}",
-    )

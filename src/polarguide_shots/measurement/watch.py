@@ -74,15 +74,8 @@ class _Folder:
         return [shot for shot in shots if not any(os.path.realpath(p) in self.ignored for p in shot.paths)]
 
     def _mosaics(self) -> list[ExposureSet]:
-        with os.scandir(self.root) as entries:
-            files = [
-                Path(entry.path)
-                for entry in entries
-                if entry.name.lower().endswith(RAW_SUFFIXES)
-                and not entry.name.startswith(".")
-                and entry.is_file()
-            ]
-        return mosaics(sorted(files))
+        files = sorted(path for path in self.root.iterdir() if path.suffix.lower() in RAW_SUFFIXES)
+        return mosaics([path for path in files if not path.name.startswith(".") and path.is_file()])
 
     def trouble(self) -> str:
         """Why nothing can be found in the folder, where that is so and there is something in it."""
@@ -225,14 +218,11 @@ class _Watch:
         except UNREADABLE as error:
             late = time.monotonic() - state.since >= self._options.patience
             try:
-                if stamps(shot.paths) != state.files:
-                    return None
-                if not late and not all(map(_is_whole, shot.paths)):
-                    state.doubtful = True
-                    return None
+                changed = stamps(shot.paths) != state.files
+                state.doubtful = not changed and not late and not all(map(_is_whole, shot.paths))
             except OSError:
                 return None
-            return self._line.unread(shot, state.files, error)
+            return None if changed or state.doubtful else self._line.unread(shot, state.files, error)
 
     def idle(self) -> bool:
         """Whether nothing has come for as long as the options say, and nothing is being waited for to settle."""
