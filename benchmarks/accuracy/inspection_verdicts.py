@@ -19,9 +19,10 @@ import torch
 from numpy.typing import NDArray
 
 from polarguide.capture import checks
+from polarguide.capture.angle_evidence import ORDERS
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.geometry.polarizer import ANGLES
-from polarguide.inspection.angles import ORDERS, combine_evidence, order_check, zero_check
+from polarguide.inspection.angles import angle_checks, combine_evidence
 from polarguide.inspection.capture import Capture, measure_view, read_capture
 from polarguide.inspection.evidence import point_evidence
 from polarguide.inspection.picture_checks import find_pairing, picture_checks
@@ -67,7 +68,7 @@ def angles_line(capture: Capture, refractive_index: float) -> str:
     pairing = find_pairing(capture) or 0
     evidence, _ = point_evidence(capture.posed, capture.model, refractive_index, pairing)
     angles = combine_evidence([evidence], pairing)
-    order, zero = order_check(angles), zero_check(angles)
+    order, _, zero = angle_checks(angles)
     if angles.posterior is None:
         return f"order {order.verdict}: {evidence.note}"
     best = ORDERS[angles.posterior.best].files()

@@ -16,7 +16,7 @@ from polarguide.capture.calibration import Calibration, oriented
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.polarizer import ANGLES
 from polarguide.inspection.capture import InspectedView
-from polarguide.inspection.evidence import Surface
+from polarguide.inspection.evidence import ViewSurface
 
 WIDTH, HEIGHT, INDEX = 72, 64, 1.5
 
@@ -97,13 +97,13 @@ def mistaken(view: InspectedView, *, files: tuple[int, ...] = ANGLES, zero: floa
     return with_intensities(view, values[[ANGLES.index(angle) for angle in files]])
 
 
-def surfaces(views: tuple[InspectedView, ...]) -> list[tuple[InspectedView, Surface]]:
+def surfaces(views: tuple[InspectedView, ...]) -> list[tuple[InspectedView, ViewSurface]]:
     """Views with the true surface."""
     pairs = []
     for view in views:
         assert view.camera is not None
         normal, depth, hit = ball(view.camera)
-        pairs.append((view, Surface(view.camera, normal, depth, hit)))
+        pairs.append((view, ViewSurface(view.camera, normal, depth, hit)))
     return pairs
 
 

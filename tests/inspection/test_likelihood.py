@@ -7,10 +7,10 @@ import math
 import pytest
 import torch
 
-from polarguide.inspection.angles import (
+from polarguide.capture.angle_evidence import (
     FAILURE,
     ORDERS,
-    Evidence,
+    OrderEvidence,
     OrderPosterior,
     combine,
     posterior,
@@ -39,7 +39,7 @@ def test_ratios_for_the_other_side_and_single_clusters_say_nothing() -> None:
     assert tempered(torch.tensor([5.0])) == 0.0
 
 
-def evidence_for(sense: int, zero: float, strength: float, clusters: int = 60) -> Evidence:
+def evidence_for(sense: int, zero: float, strength: float, clusters: int = 60) -> OrderEvidence:
     """Noisy evidence for one sense and zero."""
     generator = torch.Generator().manual_seed(3)
     angles = torch.deg2rad(torch.arange(180, dtype=torch.float64))
@@ -47,7 +47,7 @@ def evidence_for(sense: int, zero: float, strength: float, clusters: int = 60) -
     profile = strength * torch.cos(2 * (angles - torch.deg2rad(shifts)))
     other = 0.1 * strength * torch.randn(clusters, 180, generator=generator, dtype=torch.float64)
     rows = [profile, other] if sense > 0 else [other, profile]
-    return Evidence("test", torch.stack(rows, dim=1), clusters, True, "")
+    return OrderEvidence("test", torch.stack(rows, dim=1), clusters, True, "")
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_order_and_offset_are_found_with_their_error(sense: int, zero: float, be
 def test_weak_evidence_decides_nothing() -> None:
     generator = torch.Generator().manual_seed(5)
     noise = torch.randn(40, 2, 180, generator=generator)
-    assert max(posterior(Evidence("test", noise, 40, True, "")).probabilities) < 0.8
+    assert max(posterior(OrderEvidence("test", noise, 40, True, "")).probabilities) < 0.8
 
 
 def some_odds(best: int, offset: float, error: float) -> OrderPosterior:

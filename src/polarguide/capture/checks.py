@@ -22,6 +22,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.angle_evidence import jackknife_error
 from polarguide.capture.view import FULL_CODE, listed
 from polarguide.geometry.polarizer import ANGLES
 
@@ -51,14 +52,12 @@ class Measures:
         bright: 99th percentile of the linear intensities, in [0, 1].
         residuals: median of |difference of the two pair sums| / S0 for the three ways to pair the pictures:
             (0, 90 | 45, 135), (0, 45 | 90, 135), (0, 135 | 45, 90). The first is zero for an ideal capture.
-        sums: sums of the regression of r = (I0 + I90 - I45 - I135) / S0 on q = ((I0 - I90) / S0)^2 -
-            ((I45 - I135) / S0)^2: number of pixels, sums of q, r, q q, q r. Linear data have slope 0 whatever
-            the gains of the four pictures; a concave encoding bends it down, a convex one up.
+        slopes: ``pair_slopes`` of the two pairs; empty with too few pixels.
     """
 
     bright: float
     residuals: tuple[float, float, float]
-    sums: NDArray[np.float64]
+    slopes: list[NDArray[np.float64]]
 
 
 def sampled(codes: NDArray[Any]) -> NDArray[Any]:
@@ -84,17 +83,15 @@ def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_], *, four: bool 
     sample = (codes if codes.shape[1:3] != usable.shape else codes[:, ::step, ::step]).astype(np.float64)
     bright = float(np.percentile(sample, 99.0)) / FULL_CODE
     gray = sample.mean(axis=3)
-    angles = gray[:, usable[::step, ::step] & (gray.min(axis=0) > _LOW_CODE)]
+    usable = usable[::step, ::step]
+    angles = gray[:, usable & (gray.min(axis=0) > _LOW_CODE)]
     if not four or angles.shape[1] < 16:
-        return Measures(bright, (0.0, 0.0, 0.0), np.zeros(5))
+        return Measures(bright, (0.0, 0.0, 0.0), [])
     i0, i45, i90, i135 = angles
     s0 = (i0 + i45 + i90 + i135) / 2.0
     differences = (i0 + i90 - i45 - i135, i0 + i45 - i90 - i135, i0 + i135 - i45 - i90)
     first, second, third = (float(np.median(np.abs(difference) / s0)) for difference in differences)
-    r = differences[0] / s0
-    q = ((i0 - i90) / s0) ** 2 - ((i45 - i135) / s0) ** 2
-    sums = np.array([len(r), q.sum(), r.sum(), (q * q).sum(), (q * r).sum()])
-    return Measures(bright, (first, second, third), sums)
+    return Measures(bright, (first, second, third), pair_slopes(sample, usable, FOUR_PAIRS))
 
 
 def top_histogram(raw: NDArray[Any]) -> NDArray[np.int64]:
@@ -178,40 +175,24 @@ def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], tr
             f"I0 + I90 differs from I45 + I135 by {pairs[0]:.1%} of S0 (median) in {len(off)} of "
             f"{len(names)} views ({listed(list(off))}); a sound capture stays under {_RESIDUAL:.0%}. {hint}."
         )
-    slope = curvature(measures)
-    if swapped or slope is None:  # the slope is meaningless with wrong pairs
+    curvature = curvature_of([tile for measure in measures for tile in measure.slopes])
+    if swapped or curvature is None:  # the slope is meaningless with wrong pairs
         return warnings
-    if transfer == "linear" and encoding(Curvature(slope)) == "srgb":
+    if transfer == "linear" and encoding(curvature) == "srgb":
         warnings.append(
-            f"The pictures look sRGB-encoded (curvature {slope:.2f}, linear ones have 0): "
+            f"The pictures look sRGB-encoded (curvature {curvature.value:.2f}, linear ones have 0): "
             "if they are, read them with transfer srgb."
         )
-    if transfer == "srgb" and slope > DECODED[1]:
+    if transfer == "srgb" and curvature.value > DECODED[1]:
         warnings.append(
-            f"The pictures look linear already (curvature {slope:.2f} after decoding, 0 is right): "
+            f"The pictures look linear already (curvature {curvature.value:.2f} after decoding, 0 is right): "
             "if they are, read them with transfer linear."
         )
     return warnings
 
 
-def curvature(measures: Sequence[Measures]) -> float | None:
-    """Slope of the regression described in ``Measures``, over all views; None if too few pixels are polarized."""
-    return slope([measure.sums for measure in measures])
-
-
-def slope(sums: Sequence[NDArray[np.float64]]) -> float | None:
-    """The slope of several such regressions together; None if too few pixels are polarized."""
-    if not sums:
-        return None
-    count, q, r, qq, qr = np.sum(sums, axis=0)
-    if count < 1000:
-        return None
-    spread = qq / count - (q / count) ** 2
-    if spread < 0.005**2:
-        return None
-    return float((qr / count - q / count * r / count) / spread)
-
-
+FOUR_PAIRS = ((0, 2), (1, 3))
+"""Places of the perpendicular pictures among four at 0, 45, 90 and 135 degrees."""
 _RIGHT = 1.0
 """Degrees by which two angles may differ from right ones: a pair sum is off by two percent of the polarized light."""
 
@@ -232,30 +213,34 @@ def right_pairs(angles: Sequence[object]) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class Curvature:
-    """A slope of the regression described in ``Measures``, with its standard error (jackknife over tiles)."""
+    """Curvature of the response, with its standard error (jackknife over tiles)."""
 
     value: float
-    error: float = 0.0
+    error: float
 
     def surely_below(self, limit: float) -> bool:
-        """True where the slope is below a limit by more than three standard errors."""
+        """Return true if the curvature is below a limit by more than three standard errors."""
         return self.value + _SURE * self.error < limit
 
     def surely_above(self, limit: float) -> bool:
-        """True where the slope is above a limit by more than three standard errors."""
+        """Return true if the curvature is above a limit by more than three standard errors."""
         return self.value - _SURE * self.error > limit
 
 
 def pair_slopes(
-    codes: NDArray[np.uint16], usable: NDArray[np.bool_], pairs: Sequence[tuple[int, int]]
+    codes: NDArray[Any], usable: NDArray[np.bool_], pairs: Sequence[tuple[int, int]]
 ) -> list[NDArray[np.float64]]:
-    """Sums of the regression described in ``Measures`` over every two of a view's pairs, for each of its tiles.
+    """Return sums of a regression over every two of a view's pairs for each tile: number of pixels, q q, q r.
 
-    Pictures of different exposures add shares of I0 - I90 and I45 - I135 to the difference of the sums (to first order,
-    and before a curve, too). A fit of both is taken off, so that nothing is assumed of the exposures.
+    The regression is that of the difference r of two pair sums over S0, (I0 + I90 - I45 - I135) / S0, on the difference
+    q of the squared polarizations, ((I0 - I90) / S0)^2 - ((I45 - I135) / S0)^2. Linear data have slope 0; a concave
+    encoding bends it down, a convex one up. Pictures of different exposures add shares of I0 - I90 and I45 - I135 to
+    the difference of the sums, to first order. A fit of both is subtracted, so nothing is assumed of the exposures.
 
     Args:
-        codes: linear codes [K, H, W, C] of a sample of the view. usable: [H, W]. pairs: of ``right_pairs``.
+        codes: linear codes [K, H, W, C] of a view, or of a sample of it.
+        usable: [H, W].
+        pairs: places of perpendicular pictures, see ``right_pairs``.
     """
     if len(pairs) < 2:
         return []
@@ -267,25 +252,24 @@ def pair_slopes(
     s0 = (first + second).mean(axis=0)
     sums = (first + second) / s0
     polarized = (first - second) / s0
-    tiles = np.zeros((_TILES**2, 5))
+    tiles = np.zeros((_TILES**2, 3))
     for one, other in itertools.combinations(range(len(pairs)), 2):
         taken_off = np.stack([np.ones_like(s0), polarized[one], polarized[other]], axis=1)
         both = np.stack([polarized[one] ** 2 - polarized[other] ** 2, sums[one] - sums[other]], axis=1)
         q, r = (both - taken_off @ np.linalg.lstsq(taken_off, both, rcond=None)[0]).T
-        for place, values in ((0, np.ones_like(q)), (3, q * q), (4, q * r)):
+        for place, values in enumerate((np.ones_like(q), q * q, q * r)):
             tiles[:, place] += np.bincount(tile, values, len(tiles))
     return [tile for tile in tiles if tile[0] > 0]
 
 
 def curvature_of(tiles: Sequence[NDArray[np.float64]]) -> Curvature | None:
-    """The curvature by the tiles of all views (``pair_slopes``); None if too few pixels are polarized."""
-    value = slope(tiles)
-    if value is None or len(tiles) < 2:
+    """Return the curvature of the response by the ``pair_slopes`` of all views; None with too little polarization."""
+    total = np.sum(tiles, axis=0)
+    if len(tiles) < 2 or total[0] < _FEWEST or total[1] < total[0] * _LEAST_SPREAD**2:
         return None
-    without = np.sum(tiles, axis=0) - np.stack(tiles)
-    slopes = without[:, 4] / without[:, 3]
-    error = math.sqrt(((slopes - value) ** 2).sum() * (len(tiles) - 1) / len(tiles))
-    return Curvature(value, error)
+    value = total[2] / total[1]
+    without = total - np.stack(tiles)
+    return Curvature(float(value), float(jackknife_error(value, without[:, 2] / without[:, 1])))
 
 
 def encoding(found: Curvature | None) -> Literal["linear", "srgb"] | None:
@@ -314,6 +298,7 @@ _TILES = 4
 # Of the largest value; read-out noise hides the polarization of darker pixels.
 _HIDDEN = 0.01
 _FEWEST = 1000
+_LEAST_SPREAD = 0.005
 _MOMENT_SAMPLES = 1 << 18
 
 
@@ -362,14 +347,10 @@ def pair_moments(gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> 
     usable = usable & (total > 4 * _HIDDEN * float(gray.max(initial=0)))
     rows = np.where(usable, gray / np.where(usable, total, 1.0), 0.0)
     tiles = []
-    for band, mask in zip(
-        np.array_split(rows, _TILES, axis=1), np.array_split(usable, _TILES, axis=0), strict=True
-    ):
-        for part, mine in zip(
-            np.array_split(band, _TILES, axis=2), np.array_split(mask, _TILES, axis=1), strict=True
-        ):
-            flat = part.reshape(4, -1)
-            tiles.append(np.vstack([flat @ flat.T, [mine.sum()] * 4]))
+    for band in np.array_split(np.concatenate([rows, usable[None]]), _TILES, axis=1):
+        for part in np.array_split(band, _TILES, axis=2):
+            flat = part[:4].reshape(4, -1)
+            tiles.append(np.vstack([flat @ flat.T, [part[4].sum()] * 4]))
     return np.stack(tiles)
 
 
@@ -387,14 +368,10 @@ def measured_gains(moments: NDArray[np.float64]) -> MeasuredGains | None:
         return None
     total = moments.sum(axis=0)
     vector = _least(total)
-    without = np.stack([_least(total - tile) for tile in moments])
-    pairs = [(0, 2), (0, 1), (0, 3)]
     signs = np.sign(vector)
-    alike = [k for k, (a, b) in enumerate(pairs) if signs[a] == signs[b] and signs.sum() == 0]
+    alike = [k for k, other in enumerate((2, 1, 3)) if signs[0] == signs[other] and signs.sum() == 0]
     logs = _logs(vector)
-    spread = _logs(without) - logs
-    count = len(moments)
-    errors = np.sqrt((spread**2).sum(axis=0) * (count - 1) / count)
+    errors = jackknife_error(logs, _logs(np.stack([_least(total - tile) for tile in moments])))
     return MeasuredGains(_four(logs), _four(errors), alike[0] if len(alike) == 1 else None)
 
 

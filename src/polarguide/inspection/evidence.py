@@ -26,6 +26,14 @@ from torch.nn.functional import grid_sample, interpolate
 
 from polarguide import __version__, optics
 from polarguide.capture import Scene, View
+from polarguide.capture.angle_evidence import (
+    DEGREES,
+    PAIRINGS,
+    SENSES,
+    OrderEvidence,
+    spatial_cells,
+    sum_by_cluster,
+)
 from polarguide.capture.colmap.model import ColmapModel
 from polarguide.capture.exposures import FOUR
 from polarguide.core.errors import PolarguideError
@@ -33,7 +41,6 @@ from polarguide.core.files import write_text
 from polarguide.core.records import read_record
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
-from polarguide.inspection.angles import DEGREES, PAIRINGS, SENSES, Evidence, spatial_cells, sum_by_cluster
 from polarguide.inspection.capture import InspectedView
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
@@ -66,7 +73,7 @@ _INLIERS = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97)
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class ViewSurface:
     """The surface that one view sees.
 
     Attributes:
@@ -103,24 +110,26 @@ class SurfaceSamples:
         return self.dolp > most + 2 * self.noise
 
 
-def sample_surfaces(pairs: Iterable[tuple[InspectedView, Surface]], pairing: int = 0) -> SurfaceSamples:
+def _polarization_planes(view: InspectedView, pairing: int) -> Tensor:
+    """Return the Stokes vector of the luminance, its noise, and 1 for unusable pixels: [1, 5, H, W]."""
+    gray = view.intensities().mean(dim=-1)[[PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]]
+    unusable = (~view.usable).float()
+    return torch.cat((optics.stokes(gray), optics.intensity_noise(gray)[None], unusable[None]))[None]
+
+
+def sample_surfaces(pairs: Iterable[tuple[InspectedView, ViewSurface]], pairing: int = 0) -> SurfaceSamples:
     """Sample pixels with a reliable normal and significant polarization, at most 400 per view.
 
     Args:
         pairs: views and their surfaces, whose maps may be smaller than the pictures.
         pairing: the pairs of perpendicular pictures, an index into ``PAIRINGS``.
     """
-    order = [PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]
     generator = torch.Generator().manual_seed(0)
     samples: list[Tensor] = []
     for view, surface in pairs:
-        size = surface.known.shape
-        gray = view.intensities().mean(dim=-1)[order]
-        noise = optics.intensity_noise(gray)
-        planes = torch.cat((optics.stokes(gray), noise[None], (~view.usable).float()[None]))
-        planes = interpolate(planes[None], size=size, mode="area")[0]
+        planes = interpolate(_polarization_planes(view, pairing), size=surface.known.shape, mode="area")[0]
         stokes = planes[:3]
-        degree = optics.dolp(planes[:3])
+        degree = optics.dolp(stokes)
         spread = optics.dolp_noise(stokes, planes[3])
         rays = surface.camera.rays()
         zenith = optics.zenith(surface.normal, rays)
@@ -130,15 +139,14 @@ def sample_surfaces(pairs: Iterable[tuple[InspectedView, Surface]], pairing: int
         chosen = chosen[torch.randperm(len(chosen), generator=generator)[:SAMPLES]]
         position = surface.camera.to_world(rays / rays[..., 2:] * surface.depth[..., None])
         position = position + surface.camera.center.float()
-        rows = (optics.aolp(stokes), degree, spread, optics.azimuth(surface.normal, rays), zenith)
-        flat = torch.stack([*(row.flatten() for row in rows), *position.reshape(-1, 3).unbind(-1)])
-        samples.append(flat[:, chosen])
-    rows_found = torch.cat(samples, dim=1) if samples else torch.zeros(8, 0)
-    aolp, dolp, noise_of, azimuth, zenith_of = rows_found[:5].unbind(0)
-    return SurfaceSamples(aolp, dolp, noise_of, azimuth, zenith_of, rows_found[5:].T)
+        azimuth = optics.azimuth(surface.normal, rays)
+        rows = (optics.aolp(stokes), degree, spread, azimuth, zenith, *position.unbind(-1))
+        samples.append(torch.stack([row.flatten() for row in rows])[:, chosen])
+    joined = torch.cat(samples, dim=1) if samples else torch.zeros(8, 0)
+    return SurfaceSamples(*joined[:5], joined[5:].T)
 
 
-def normal_evidence(pixels: SurfaceSamples, index: float) -> Evidence:
+def normal_evidence(pixels: SurfaceSamples, index: float) -> OrderEvidence:
     """Log-likelihoods of all zeros and both senses, given the normals.
 
     Twice a pixel's angle between AoLP and azimuth follows a mixture: a von Mises distribution about the perpendicular,
@@ -151,7 +159,7 @@ def normal_evidence(pixels: SurfaceSamples, index: float) -> Evidence:
         note = (
             f"Only {count} pixels have a reliable normal and significant polarization; {FEWEST} are needed."
         )
-        return Evidence(NORMALS, torch.zeros(1, len(SENSES), DEGREES), count, False, note)
+        return OrderEvidence(NORMALS, torch.zeros(1, len(SENSES), DEGREES), count, False, note)
     must = pixels.certainly_specular(index)
     coarse = torch.arange(0, DEGREES, 4)
     fits = [
@@ -167,7 +175,7 @@ def normal_evidence(pixels: SurfaceSamples, index: float) -> Evidence:
         f"normals, whose error is about {math.degrees(error):.0f}° (agreement modulo 90°: {coherent:.2f} of 1)."
     )
     usable = inliers >= LEAST_INLIERS and error <= LARGEST_ERROR and coherent >= LEAST_CONCENTRATION
-    return Evidence(NORMALS, sum_by_cluster(values, spatial_cells(pixels.position)), count, usable, note)
+    return OrderEvidence(NORMALS, sum_by_cluster(values, spatial_cells(pixels.position)), count, usable, note)
 
 
 def _concentration(pixels: SurfaceSamples) -> float:
@@ -208,7 +216,7 @@ _LEAST_SCALE = 2e-4
 
 def point_evidence(
     views: tuple[InspectedView, ...], model: ColmapModel, index: float, pairing: int = 0
-) -> tuple[Evidence, SurfaceSamples | None]:
+) -> tuple[OrderEvidence, SurfaceSamples | None]:
     """Log-likelihoods of all zeros and both senses, given the points of a COLMAP model.
 
     Args:
@@ -229,7 +237,7 @@ def point_evidence(
             f"Only {int(keep.sum())} points have {FEWEST_OBSERVATIONS} observations with a DoLP above the diffuse "
             f"limit {float(optics.diffuse_dolp_limit(index)):.2f}; {FEWEST_POINTS} are needed."
         )
-        return Evidence(POINTS, torch.zeros(1, 2, DEGREES), count, False, note), None
+        return OrderEvidence(POINTS, torch.zeros(1, 2, DEGREES), count, False, note), None
     weights = weights[keep].double()
     points = model.points[keep]
     spreads = torch.stack([_spread(fields[sense][keep].double(), weights) for sense in range(len(SENSES))])
@@ -246,7 +254,7 @@ def point_evidence(
     )
     clusters = sum_by_cluster(likelihood.movedim(1, 0), spatial_cells(points))
     usable = misfit <= LARGEST_MISFIT_DEG
-    evidence = Evidence(POINTS, clusters.float(), count, usable, note)
+    evidence = OrderEvidence(POINTS, clusters.float(), count, usable, note)
     if not usable:
         return evidence, None
     return evidence, _seen_pixels(
@@ -280,7 +288,6 @@ def _observed_fields(
     noise [P, V, 2].
     """
     limit = float(optics.diffuse_dolp_limit(index))
-    order = [PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]
     fields = torch.zeros(len(SENSES), len(points), len(views), 2, 3)
     weights = torch.zeros(len(points), len(views))
     degrees = torch.zeros(len(points), len(views), 2)
@@ -292,17 +299,14 @@ def _observed_fields(
         u = (camera.fx * local[:, 0] / depth + camera.cx) / camera.width
         v = (camera.fy * local[:, 1] / depth + camera.cy) / camera.height
         inside = (local[:, 2] > 1e-9) & (torch.minimum(u, v) > 0.01) & (torch.maximum(u, v) < 0.99)
-        gray = view.intensities().mean(dim=-1)[order]
-        noise = optics.intensity_noise(gray)
-        planes = torch.cat((optics.stokes(gray), noise[None], (~view.usable).float()[None]))
         grid = torch.stack((2 * u - 1, 2 * v - 1), dim=-1).float()[None, None]
-        sampled = grid_sample(planes[None], grid, align_corners=False)[0, :, 0]
-        stokes = sampled[:3]
-        degree = optics.dolp(sampled[:3])
-        spread = optics.dolp_noise(stokes, sampled[3])
+        planes = grid_sample(_polarization_planes(view, pairing), grid, align_corners=False)[0, :, 0]
+        stokes = planes[:3]
+        degree = optics.dolp(stokes)
+        spread = optics.dolp_noise(stokes, planes[3])
         degrees[:, column] = torch.stack((degree, spread), dim=-1)
         certain = degree > limit + 3 * spread
-        good = visible[:, column] & inside & certain & (sampled[4] < 1e-3) & (stokes[0] > 0.02)
+        good = visible[:, column] & inside & certain & (planes[4] < 1e-3) & (stokes[0] > 0.02)
         # Light that was polarized before the reflection turns the field by about sqrt(1 - d^2) / d times its DoLP,
         # alike in many observations: hence the square of the inverse variance that this suggests.
         weights[:, column] = good * (degree**2 / (1.05 - degree**2)) ** 2
@@ -425,16 +429,14 @@ def _same(folder: Path, wanted: dict[str, object]) -> bool:
 
 
 @torch.no_grad()
-def surface_of(state: TrainingState, view: View, backend: Backend) -> Surface:
+def trained_surface(state: TrainingState, view: View, backend: Backend) -> ViewSurface:
     """The surface of the trained Gaussians in one view, on the CPU, where pictures are compared with it."""
     request = RenderRequest(sh_degree=0, depth=True)
     result = render(state.gaussians, view.camera, backend.rasterize, request).to("cpu")
-    if result.normal is None or result.depth is None:
-        raise PolarguideError(
-            view.name, expected="normals and depth", found="none", remedy="Report this: it is a fault here."
-        )
+    assert result.normal is not None
+    assert result.depth is not None
     rays = view.camera.rays()
     normal, known = guide_normals(view.camera.to_camera(result.normal), rays, Priors.minimum_normal)
     by_depth = unit(view.camera.to_camera(depth_normals(result.depth, view.camera)))
     known = known & (result.alpha > _OPAQUE) & (dot(normal, by_depth) > _AGREEMENT)
-    return Surface(view.camera, normal, result.depth, known)
+    return ViewSurface(view.camera, normal, result.depth, known)

@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from polarguide.capture import Scene, load_scene
+from polarguide.capture.angle_evidence import OrderEvidence, posterior
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError
@@ -26,25 +28,18 @@ from polarguide.core.records import check_options
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.vectors import unit_array
-from polarguide.inspection.angles import (
-    AngleFindings,
-    Evidence,
-    combine_evidence,
-    handedness_check,
-    order_check,
-    zero_check,
-)
+from polarguide.inspection.angles import AngleFindings, angle_checks, combine_evidence
 from polarguide.inspection.capture import Capture, InspectedView, ViewMeasurements, measure_view, read_capture
 from polarguide.inspection.corrections import analyzer_check, corrected
 from polarguide.inspection.evidence import (
     LONGEST,
-    Surface,
     SurfaceSamples,
+    ViewSurface,
     normal_evidence,
     point_evidence,
     sample_surfaces,
     short_run,
-    surface_of,
+    trained_surface,
 )
 from polarguide.inspection.picture_checks import (
     dielectric_check,
@@ -57,7 +52,7 @@ from polarguide.inspection.settings import Check, InspectSettings, Verdict, wors
 from polarguide.inspection.shots import (
     ShotFindings,
     agreement_checks,
-    find_shots,
+    estimate_shot_angles,
     pictures_check,
     shot_checks,
 )
@@ -182,47 +177,40 @@ FEW_VIEWS = 20
 
 def pose_check(capture: Capture) -> Check:
     """Check whether feature matches agree with the poses."""
-    key = "poses"
-    title = "Pose quality"
     if capture.model is None:
         remedy = "Run polarguide prepare with --poses sfm or --poses PATH."
-        return Check(key, title, "n/a", "There are no poses.", remedy)
+        return Check("poses", "n/a", "There are no poses.", remedy)
     missing = tuple(view.name for view in capture.views if view.camera is None)
     errors = view_errors(epipolar_errors(capture))
     if len(errors) < 3:
-        return Check(
-            key, title, "n/a" if not missing else "warning",
-            f"Too few features match between neighboring views to judge the poses. {len(missing)} views have none.",
-            "Structure from motion needs static texture." if missing else "", missing,
-            {"views": {}, "without_pose": len(missing)},
-        )  # fmt: skip
+        finding = "Too few features match between neighboring views to judge the poses."
+        finding += f" {len(missing)} views have none."
+        remedy = "Structure from motion needs static texture." if missing else ""
+        figures: dict[str, Any] = {"views": {}, "without_pose": len(missing)}
+        return Check("poses", "warning" if missing else "n/a", finding, remedy, missing, figures)
     typical = float(np.median(list(errors.values())))
     bad = tuple(name for name, e in errors.items() if e > max(VIEW_PX, STANDS_OUT * typical))
-    figures = {"median_px": typical, "views": errors, "without_pose": len(missing)}
     finding = f"Matches lie {typical:.2f} px from their epipolar lines (median view of {len(errors)})."
-    verdict: Verdict = "ok"
+    verdict: Verdict = "warning" if bad or missing else "ok"
     remedies = []
     if bad:
-        verdict = "warning"
         finding += f" Far worse: {listed([f'{name} ({errors[name]:.1f} px)' for name in bad])}."
         remedies.append("Leave these views out, or register them again.")
     if missing:
-        verdict = "warning"
         finding += f" Without a pose: {len(missing)} views ({listed(list(missing))})."
         remedies.append("Remove the pictures of views without a pose, which train refuses, or register them.")
     if typical > TYPICAL_PX:
         verdict = "wrong" if typical > 2 * TYPICAL_PX else "warning"
         remedies.append("Refine the model (bundle adjustment), and check that it belongs to these pictures.")
-    return Check(key, title, verdict, finding, " ".join(remedies), (*bad, *missing), figures)
+    figures = {"median_px": typical, "views": errors, "without_pose": len(missing)}
+    return Check("poses", verdict, finding, " ".join(remedies), (*bad, *missing), figures)
 
 
 def coverage_check(capture: Capture) -> Check:
     """Check whether neighboring views are close enough to each other."""
-    key = "coverage"
-    title = "Coverage"
     cameras = [view.camera for view in capture.posed if view.camera is not None]
     if len(cameras) < 2:
-        return Check(key, title, "n/a", "Fewer than two views have a pose.")
+        return Check("coverage", "n/a", "Fewer than two views have a pose.")
     focus = scene_frame(cameras).center
     directions = unit_array(torch.stack([camera.center - focus for camera in cameras]).numpy())
     angles = np.degrees(np.arccos(np.clip(directions @ directions.T, -1, 1))) + 360 * np.eye(len(directions))
@@ -238,12 +226,10 @@ def coverage_check(capture: Capture) -> Check:
         f"within {spread:.0f}° of their mean direction."
     )
     lonely = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > GAP_DEG)
-    if lonely or len(directions) < FEW_VIEWS:
-        return Check(
-            key, title, "warning", finding,
-            "Reconstruction is unreliable across gaps: add views at most 15 degrees apart.", lonely, figures,
-        )  # fmt: skip
-    return Check(key, title, "ok", finding, figures=figures)
+    if not lonely and len(directions) >= FEW_VIEWS:
+        return Check("coverage", "ok", finding, figures=figures)
+    remedy = "Reconstruction is unreliable across gaps: add views at most 15 degrees apart."
+    return Check("coverage", "warning", finding, remedy, lonely, figures)
 
 
 SURE = 0.98
@@ -337,8 +323,7 @@ def inspect_scene(
         checks += [pose_check(capture), lens_check(capture), coverage_check(capture)]
     angles, pixels = _angles(capture, out, settings, index, pairing or 0, backend, reporter)
     angles = with_noise(angles, measurements)
-    checks += [order_check(angles), handedness_check(angles), zero_check(angles)]
-    checks.append(dielectric_check(measurements, pixels, index))
+    checks += [*angle_checks(angles), dielectric_check(measurements, pixels, index)]
     return Inspection(capture, settings, index, tuple(measurements), tuple(checks), angles)
 
 
@@ -355,17 +340,15 @@ def _shots(
     checks = [pictures_check(capture), *agreement_checks(capture), *light_checks(capture, measurements)]
     with reporter.track("matching features", 1):
         checks += [pose_check(capture), lens_check(capture), coverage_check(capture)]
+    needed = "The angles are checked by a short training, which"
     if len(capture.posed) < FEWEST_TO_TRAIN:
-        why = f"The angles are checked by a short training, which takes {FEWEST_TO_TRAIN} views with a pose."
-        findings = ShotFindings(why=why)
+        findings = ShotFindings(why=f"{needed} takes {FEWEST_TO_TRAIN} views with a pose.")
     elif settings.normals == "points":
-        findings = ShotFindings(
-            why="The angles are checked by a short training, which --normals points leaves out."
-        )
+        findings = ShotFindings(why=f"{needed} --normals points leaves out.")
     else:
         scene = _training_scene(capture, settings, reporter, held_out=())
         with reporter.track("short training", settings.steps) as advance:
-            findings = find_shots(
+            findings = estimate_shot_angles(
                 scene,
                 out / RUN_FOLDER,
                 steps=settings.steps,
@@ -385,21 +368,19 @@ def _angles(
     backend: Backend,
     reporter: Reporter,
 ) -> tuple[AngleFindings, SurfaceSamples | None]:
-    """Order, sense and zero by what geometry there is; and the pixels with normals if there are any."""
-    sources: list[Evidence] = []
-    if capture.model is None or len(capture.posed) < 2:
-        return combine_evidence(sources, pairing, capture.applied, mosaic=capture.origin == "mosaics"), None
-    with reporter.track("weighing points", 1):
-        evidence, pixels = point_evidence(capture.posed, capture.model, index, pairing)
-    sources.append(evidence)
-    angles = combine_evidence(sources, pairing, capture.applied, mosaic=capture.origin == "mosaics")
-    sure = angles.posterior is not None and max(angles.posterior.probabilities) >= SURE
-    if settings.normals == "points" or (settings.normals == "auto" and sure):
-        return angles, pixels
-    if len(capture.posed) < FEWEST_TO_TRAIN:
-        return angles, pixels
-    pixels = _trained_pixels(capture, out, settings, pairing, index, backend, reporter)
-    sources.append(normal_evidence(pixels, index))
+    """Return order, sense and zero by the available geometry; and the pixels with normals if there are any."""
+    sources: list[OrderEvidence] = []
+    pixels = None
+    trains = settings.normals != "points" and len(capture.posed) >= FEWEST_TO_TRAIN
+    if capture.model is not None and len(capture.posed) >= 2:
+        with reporter.track("weighing points", 1):
+            evidence, pixels = point_evidence(capture.posed, capture.model, index, pairing)
+        sources.append(evidence)
+        if settings.normals == "auto" and evidence.usable:
+            trains = trains and max(posterior(evidence).probabilities) < SURE
+        if trains:
+            pixels = _trained_pixels(capture, out, settings, pairing, index, backend, reporter)
+            sources.append(normal_evidence(pixels, index))
     return combine_evidence(sources, pairing, capture.applied, mosaic=capture.origin == "mosaics"), pixels
 
 
@@ -424,9 +405,9 @@ def _trained_pixels(
         )
     with reporter.track("comparing with normals", len(capture.posed)) as advance:
 
-        def surfaces() -> Iterator[tuple[InspectedView, Surface]]:
+        def surfaces() -> Iterator[tuple[InspectedView, ViewSurface]]:
             for done, view in enumerate(capture.posed):
-                yield view, surface_of(state, scene.view(view.name), backend)
+                yield view, trained_surface(state, scene.view(view.name), backend)
                 advance(done + 1)
 
         return sample_surfaces(surfaces(), pairing)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,16 +10,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from polarguide import optics
 from polarguide.capture import checks
+from polarguide.capture.angle_evidence import PAIRINGS, swaps
 from polarguide.capture.checks import MeasuredGains, measured_gains, pair_moments
 from polarguide.capture.view import ANGLES, FULL_CODE, listed
-from polarguide.inspection.angles import PAIRINGS, AngleFindings, swaps
+from polarguide.inspection.angles import AngleFindings
 from polarguide.inspection.capture import POLARIZED, Capture, ViewMeasurements
 from polarguide.inspection.evidence import ZENITH_MARGIN, SurfaceSamples
-from polarguide.inspection.settings import Check, Verdict
+from polarguide.inspection.settings import LCD_TEST, Check, Verdict
 
 PAIR_ERROR = 0.05
 """Median |I0 + I90 - I45 - I135| / S0 of a view above which its four pictures are inconsistent."""
@@ -44,10 +45,6 @@ ALMOST_NONE = 0.005
 NOISY = 0.03
 """Noise of one intensity as a share of S0 / 2: three times its DoLP noise is then 0.13."""
 
-PAIRS_TITLE = "Consistency of the four angles"
-ENCODING_TITLE = "Linear encoding"
-EXPOSURE_TITLE = "Equal exposure of the angles"
-NOISE_TITLE = "Noise"
 UNDEREXPOSED = 0.01
 """99th percentile of the values below which the exposure of a view was too short."""
 
@@ -81,15 +78,10 @@ def picture_checks(
     """All checks of this file, in their order on the page."""
     if capture.origin == "stokes":
         computed = "The four pictures were computed from Stokes vectors: their sums agree by construction."
-        checks_of_four = (
-            ("pair_sums", PAIRS_TITLE),
-            ("encoding", ENCODING_TITLE),
-            ("exposure", EXPOSURE_TITLE),
-        )
         return [
-            *(Check(key, title, "n/a", computed) for key, title in checks_of_four),
+            *(Check(key, "n/a", computed) for key in ("pair_sums", "encoding", "exposure")),
             _saturation(capture, measurements),
-            Check("noise", NOISE_TITLE, "n/a", computed),
+            Check("noise", "n/a", computed),
             _polarization(measurements),
         ]
     encoding = _encoding(capture, pairing)
@@ -112,105 +104,65 @@ def light_checks(capture: Capture, measurements: Sequence[ViewMeasurements]) -> 
 
 def _pairs(capture: Capture, measurements: Sequence[ViewMeasurements], pairing: int | None) -> Check:
     key = "pair_sums"
-    title = PAIRS_TITLE
     error = float(np.median([r.sum_error for r in measurements]))
     figures = {"median_error": error, "pairing": None if pairing is None else list(PAIRINGS[pairing])}
     if pairing is not None and pairing > 0:
-        return Check(
-            key, title, "wrong",
-            f"The pair sums agree only if {swaps(PAIRINGS[pairing])}.",
-            "Rename the files; once the whole order is decided, --fix does it.", figures=figures,
-        )  # fmt: skip
+        finding = f"The pair sums agree only if {swaps(PAIRINGS[pairing])}."
+        remedy = "Rename the files; once the whole order is decided, --fix does it."
+        return Check(key, "wrong", finding, remedy, figures=figures)
     off = tuple(r.view for r in measurements if r.sum_error > PAIR_ERROR)
-    if off:
-        verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) else "warning"
-        return Check(
-            key, title, verdict,
-            f"I0 + I90 and I45 + I135 differ by more than {PAIR_ERROR:.0%} of S0 in {len(off)} views "
-            f"({listed(list(off))}).",
-            "Check whether something moved or the light changed between the shots, or whether files were exchanged.",
-            off, figures,
-        )  # fmt: skip
-    finding = f"I0 + I90 and I45 + I135 differ by {error:.1%} of S0 (median)."
-    return Check(key, title, "ok", finding, figures=figures)
+    if not off:
+        finding = f"I0 + I90 and I45 + I135 differ by {error:.1%} of S0 (median)."
+        return Check(key, "ok", finding, figures=figures)
+    shown = listed(list(off))
+    finding = (
+        f"I0 + I90 and I45 + I135 differ by more than {PAIR_ERROR:.0%} of S0 in {len(off)} views ({shown})."
+    )
+    remedy = "Check whether something moved or the light changed between the shots, or whether files were exchanged."
+    return Check(
+        key, "wrong" if 2 * len(off) > len(measurements) else "warning", finding, remedy, off, figures
+    )
 
 
 WRONG = 0.18
 """Curvature of the response, beside ``checks.BENT``: a gamma of 0.8 has -0.125, of 0.73 -0.18; DoLP is then off by as
 much as the gamma. Smooth areas of a real sensor's pictures, whose response is close to linear, have -0.17."""
+_SURE_BEND = 4.0
 
 
 def _encoding(capture: Capture, pairing: int | None) -> Check:
     key = "encoding"
-    title = ENCODING_TITLE
-    slope = checks.curvature([view.measures for view in capture.views])
-    if slope is None or pairing not in (None, 0):
-        why = "too few pixels are polarized" if slope is None else "the pictures are paired wrongly"
-        return Check(key, title, "n/a", f"The curvature of the response cannot be measured: {why}.")
-    bend = response_curvature(capture)
-    figures = {"curvature": slope} if bend is None else {"curvature": bend[0], "curvature_error": bend[1]}
-    slope = slope if bend is None else bend[0]
-    sure = bend is not None and abs(slope) > _SURE_BEND * bend[1]
+    views = [
+        checks.pair_slopes(view.codes.numpy(), view.usable.numpy(), checks.FOUR_PAIRS)
+        for view in capture.views
+    ]
+    found = checks.curvature_of(list(itertools.chain.from_iterable(views)))
+    if found is None or pairing not in (None, 0):
+        why = "too few pixels are polarized" if found is None else "the pictures are paired wrongly"
+        return Check(key, "n/a", f"The curvature of the response cannot be measured: {why}.")
+    slope = found.value
+    figures = {"curvature": slope, "curvature_error": found.error}
     finding = f"Curvature of the response {slope:+.2f}; linear files have 0, sRGB read as linear about -0.6."
-    low, high = (abs(slope) > abs((checks.ENCODED if slope < 0 else checks.DECODED)[k]) for k in (0, 1))
-    low = low or (sure and abs(slope) > checks.BENT)
-    high = high or (sure and abs(slope) > WRONG)
-    if not low:
-        return Check(key, title, "ok", finding, figures=figures)
-    gamma = 1 / (1 - 2 * slope)
-    remedy = (
-        "The files seem display-encoded (gamma): export linear ones, or read them with --transfer srgb; mosaics of a "
-        f"camera with gamma are prepared with --gamma (here about {gamma:.2f})."
-        if slope < 0
-        else "The files seem linear but are decoded (or have another tone curve): try --transfer linear."
-    )
-    return Check(key, title, "wrong" if high else "warning", finding, remedy, figures=figures)
-
-
-_SURE_BEND = 4.0
-_GROUPS = 16
-
-
-def response_curvature(capture: Capture) -> tuple[float, float] | None:
-    """Curvature of the response and its standard error; None where too few pixels are polarized.
-
-    The slope of ``checks.Measures``, with S1/S0 and S2/S0 beside it in the regression: gains that differ, and angles
-    that are off, bend nothing. The error is a jackknife over groups of pixels that lie together.
-    """
-    groups: list[NDArray[np.float64]] = []
-    for view in capture.views:
-        gray = view.intensities().mean(dim=-1).numpy().astype(np.float64)
-        good = view.usable.numpy() & (gray.min(axis=0) > 1 / 256)
-        i0, i45, i90, i135 = gray[:, good]
-        s0 = (i0 + i45 + i90 + i135) / 2
-        x = (i0 - i90) / s0
-        y = (i45 - i135) / s0
-        rows = np.stack([np.ones_like(x), x, y, x * x - y * y, (i0 + i90 - i45 - i135) / s0])
-        groups += [
-            part @ part.T for part in np.array_split(rows, max(2, _GROUPS // len(capture.views)), axis=1)
-        ]
-    total = np.sum(groups, axis=0)
-
-    def slope(moments: NDArray[np.float64]) -> float:
-        return float(np.linalg.lstsq(moments[:4, :4], moments[:4, 4], rcond=None)[0][3])
-
-    count = total[0, 0]
-    if count < 1000 or total[3, 3] / count - (total[0, 3] / count) ** 2 < 0.005**2:
-        return None
-    curvature = slope(total)
-    without = np.array([slope(total - part) for part in groups])
-    error = math.sqrt(float(((without - curvature) ** 2).sum()) * (len(groups) - 1) / len(groups))
-    return curvature, error
+    sure = abs(slope) > _SURE_BEND * found.error
+    doubtful, certain = np.abs(checks.ENCODED if slope < 0 else checks.DECODED)
+    if abs(slope) <= doubtful and not (sure and abs(slope) > checks.BENT):
+        return Check(key, "ok", finding, figures=figures)
+    wrong = abs(slope) > certain or (sure and abs(slope) > WRONG)
+    remedy = "The files seem linear but are decoded (or have another tone curve): try --transfer linear."
+    if slope < 0:
+        remedy = (
+            "The files seem display-encoded (gamma): export linear ones, or read them with --transfer srgb; mosaics of "
+            f"a camera with gamma are prepared with --gamma (here about {1 / (1 - 2 * slope):.2f})."
+        )
+    return Check(key, "wrong" if wrong else "warning", finding, remedy, figures=figures)
 
 
 def _exposure(
     measurements: Sequence[ViewMeasurements], pairing: int | None, exposed: MeasuredGains | None
 ) -> Check:
-    key = "exposure"
-    title = EXPOSURE_TITLE
     known = [r for r in measurements if r.pair_ratio is not None]
     if not known or pairing not in (None, 0):
-        return Check(key, title, "n/a", "The pair sums cannot be compared.")
+        return Check("exposure", "n/a", "The pair sums cannot be compared.")
     ratio = float(np.median([r.pair_ratio for r in known]))
     off = tuple(r.view for r in known if abs((r.pair_ratio or ratio) - ratio) > UNSTEADY)
     figures: dict[str, Any] = {"pair_ratio": ratio, "unsteady_views": len(off)}
@@ -241,12 +193,11 @@ def _exposure(
         verdict = "warning" if verdict == "ok" else verdict
         finding += f" It differs by more than {UNSTEADY:.0%} in {len(off)} views ({listed(list(off))})."
         remedy = remedy or "Look for automatic exposure, flicker, or motion between the shots."
-    return Check(key, title, verdict, finding, remedy, off, figures)
+    return Check("exposure", verdict, finding, remedy, off, figures)
 
 
 def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> Check:
     key = "saturation"
-    title = "Saturation"
     shares = [r.saturated for r in measurements]
     lost = [r.saturated + r.invalid for r in measurements]
     figures = {
@@ -257,31 +208,27 @@ def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> C
     }
     largest = max(view.peak for view in capture.views)
     if capture.bits == 16 and 0 < largest < (FULL_CODE + 1) // 16:
-        return Check(
-            key, title, "wrong", f"No value of the 16-bit files exceeds {largest}.",
-            "The data were not scaled to 16 bits: multiply the values, or run prepare with --bits.", figures=figures,
-        )  # fmt: skip
+        finding = f"No value of the 16-bit files exceeds {largest}."
+        remedy = "The data were not scaled to 16 bits: multiply the values, or run prepare with --bits."
+        return Check(key, "wrong", finding, remedy, figures=figures)
     off = tuple(r.view for r, share in zip(measurements, lost, strict=True) if share > SATURATED)
     finding = (
         f"{np.mean(shares):.1%} of the pixels are at full scale, at most {max(shares):.1%} in a view; "
         f"{figures['invalid']:.1%} are marked invalid, {figures['dark']:.1%} are too dark to be used."
     )
     if not off:
-        return Check(key, title, "ok", finding, figures=figures)
-    verdict: Verdict = "wrong" if float(np.mean(lost)) > BLOWN else "warning"
-    return Check(
-        key, title, verdict, f"{finding} Over {SATURATED:.0%} are lost in {len(off)} views ({listed(list(off))}).",
+        return Check(key, "ok", finding, figures=figures)
+    finding += f" Over {SATURATED:.0%} are lost in {len(off)} views ({listed(list(off))})."
+    remedy = (
         "These pixels carry no polarization and are excluded. Invalid ones may have clipped in the camera: expose "
-        "shorter, keep lamps out of the picture.", off, figures,
-    )  # fmt: skip
+        "shorter, keep lamps out of the picture."
+    )
+    return Check(key, "wrong" if float(np.mean(lost)) > BLOWN else "warning", finding, remedy, off, figures)
 
 
 def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
-    key = "noise"
-    title = NOISE_TITLE
-    share, bright = (
-        float(np.median([getattr(r, k) for r in measurements])) for k in ("noise_share", "bright")
-    )
+    share = float(np.median([r.noise_share for r in measurements]))
+    bright = float(np.median([r.bright for r in measurements]))
     off = tuple(r.view for r in measurements if r.noise_share > NOISY or r.bright < UNDEREXPOSED)
     finding = (
         f"Noise of one intensity is {share:.2%} of the photograph (median, after averaging down), so that a DoLP "
@@ -290,16 +237,15 @@ def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
     )
     figures = {"noise_share": share, "bright": bright}
     if not off:
-        return Check(key, title, "ok", finding, figures=figures)
-    verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) and bright < UNDEREXPOSED else "warning"
-    return Check(
-        key, title, verdict, f"{finding} Dark or noisy: {len(off)} views ({listed(list(off))}).",
-        "Use a longer exposure at the lowest gain, or average several shots.", off, figures,
-    )  # fmt: skip
+        return Check("noise", "ok", finding, figures=figures)
+    wrong = 2 * len(off) > len(measurements) and bright < UNDEREXPOSED
+    finding += f" Dark or noisy: {len(off)} views ({listed(list(off))})."
+    remedy = "Use a longer exposure at the lowest gain, or average several shots."
+    return Check("noise", "wrong" if wrong else "warning", finding, remedy, off, figures)
 
 
 def with_noise(angles: AngleFindings, measurements: Sequence[ViewMeasurements]) -> AngleFindings:
-    """The findings with noise in the error of the zero, where the check of noise warns.
+    """Return the findings with noise in the error of the zero if the check of noise warns.
 
     There, values are steps of a tone curve or what a compression left of them, which is not independent from pixel to
     pixel. So the error that it makes in the AoLP of one strongly polarized pixel is that of all of them together.
@@ -314,47 +260,43 @@ def with_noise(angles: AngleFindings, measurements: Sequence[ViewMeasurements]) 
 
 
 def _brightness(measurements: Sequence[ViewMeasurements]) -> Check:
-    key = "brightness"
-    title = "Brightness"
     bright = float(np.median([r.bright for r in measurements]))
     finding = f"The 99th percentile of the values is {bright:.0%} of full scale (median view)."
+    figures = {"bright": bright}
     off = tuple(r.view for r in measurements if r.bright < UNDEREXPOSED)
     if not off:
-        return Check(key, title, "ok", finding, figures={"bright": bright})
-    return Check(
-        key, title, "wrong" if 2 * len(off) > len(measurements) else "warning",
-        f"{finding} Dark: {len(off)} views ({listed(list(off))}).", "Use a longer exposure.", off, {"bright": bright},
-    )  # fmt: skip
+        return Check("brightness", "ok", finding, figures=figures)
+    verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) else "warning"
+    finding += f" Dark: {len(off)} views ({listed(list(off))})."
+    return Check("brightness", verdict, finding, "Use a longer exposure.", off, figures)
 
 
 def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
-    key = "low_dolp"
-    title = "Strength of polarization"
     share = float(np.median([r.polarized for r in measurements]))
     median = float(np.median([r.dolp[0] for r in measurements]))
-    finding = f"{share:.0%} of the pixels have a DoLP above {POLARIZED:g} and above three times its noise; "
-    finding += f"the median DoLP is {median:.3f}."
+    finding = (
+        f"{share:.0%} of the pixels have a DoLP above {POLARIZED:g} and above three times its noise; "
+        f"the median DoLP is {median:.3f}."
+    )
     strongest = float(np.median([r.dolp[1] for r in measurements]))
     noise = 3 * math.sqrt(2) / 2 * float(np.median([r.noise_share for r in measurements]))
     figures = {"polarized": share, "median_dolp": median, "p99_dolp": strongest}
     if share >= LITTLE:
-        return Check(key, title, "ok", finding, figures=figures)
-    if (strongest < POLARIZED or share < ALMOST_NONE) and noise < POLARIZED:
-        return Check(
-            key, title, "wrong",
-            f"No modulation: was the filter reversed, or missing? The four pictures show the same light but for "
-            f"noise; 99 % of the pixels (median view) have a DoLP under {strongest:.3f}, and {share:.1%} one above "
-            "three times their noise.",
-            "Hold the filter before an LCD screen and turn it: the side that is towards the screen when it goes dark "
-            "must face the scene. If the filter was right: photograph glossy surfaces obliquely (50 to 65 degrees).",
-            figures=figures,
-        )  # fmt: skip
-    return Check(
-        key, title, "wrong" if share < ALMOST_NONE else "warning", finding,
+        return Check("low_dolp", "ok", finding, figures=figures)
+    verdict: Verdict = "wrong" if share < ALMOST_NONE else "warning"
+    remedy = (
         "Polarization carries little information here. Photograph surfaces obliquely (50 to 65 degrees), from lower "
-        "views; check that the filter is a linear polarizer, the right way round, and that the exposure was fixed.",
-        figures=figures,
-    )  # fmt: skip
+        "views; check that the filter is a linear polarizer, the right way round, and that the exposure was fixed."
+    )
+    if (strongest < POLARIZED or share < ALMOST_NONE) and noise < POLARIZED:
+        verdict = "wrong"
+        finding = (
+            "No modulation: was the filter reversed, or missing? The four pictures show the same light but for "
+            f"noise; 99 % of the pixels (median view) have a DoLP under {strongest:.3f}, and {share:.1%} one above "
+            "three times their noise."
+        )
+        remedy = LCD_TEST
+    return Check("low_dolp", verdict, finding, remedy, figures=figures)
 
 
 NOT_DIELECTRIC = 0.15
@@ -365,30 +307,26 @@ def dielectric_check(
     measurements: Sequence[ViewMeasurements], pixels: SurfaceSamples | None, index: float
 ) -> Check:
     """Check whether large areas are polarized more strongly than a dielectric under unpolarized light can be."""
-    key = "dielectric"
-    title = "Polarization that a dielectric can have"
     above = float(torch.tensor([r.above_limit for r in measurements]).median())
     limit = float(optics.diffuse_dolp_limit(index))
     finding = f"{above:.0%} of the pixels (median view) have a DoLP above the diffuse limit ({limit:.2f})."
     figures: dict[str, Any] = {"above_diffuse_limit": above}
+    share = above
+    if pixels is None or len(pixels.aolp) == 0:
+        finding += (
+            " Without normals, reflections of a smooth dielectric cannot be distinguished from metal or sky."
+        )
+    else:
+        share = float(exceeds_dielectric(pixels, index).float().mean())
+        figures["unexplained"] = share
+        finding += f" {share:.0%} of pixels with a normal have a DoLP above the maximum of both lobes at their zenith."
+    if share <= NOT_DIELECTRIC:
+        return Check("dielectric", "ok", finding, figures=figures)
     remedy = (
         "Bare metal, sky or its reflection, or a screen? The model assumes dielectrics under unpolarized light: "
         "exclude such areas with masks, and expect worse normals there."
     )
-    if pixels is None or len(pixels.aolp) == 0:
-        verdict: Verdict = "warning" if above > NOT_DIELECTRIC else "ok"
-        finding += (
-            " Without normals, reflections of a smooth dielectric cannot be distinguished from metal or sky."
-        )
-        return Check(key, title, verdict, finding, remedy if verdict == "warning" else "", figures=figures)
-    strange = float(exceeds_dielectric(pixels, index).float().mean())
-    figures["unexplained"] = strange
-    finding += (
-        f" {strange:.0%} of pixels with a normal have a DoLP above the maximum of both lobes at their zenith."
-    )
-    if strange <= NOT_DIELECTRIC:
-        return Check(key, title, "ok", finding, figures=figures)
-    return Check(key, title, "warning", finding, remedy, figures=figures)
+    return Check("dielectric", "warning", finding, remedy, figures=figures)
 
 
 def exceeds_dielectric(pixels: SurfaceSamples, index: float) -> torch.Tensor:

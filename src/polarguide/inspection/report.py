@@ -11,14 +11,16 @@ import numpy as np
 from torch.nn.functional import max_pool2d
 
 from polarguide import __version__, optics
+from polarguide.capture.exposures import Exposure
 from polarguide.core.files import make_folder, write_text, write_whole
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import to_json
 from polarguide.inspection.angles import AngleFindings
 from polarguide.inspection.capture import InspectedView, ViewMeasurements, quantile
 from polarguide.inspection.inspect import Inspection
-from polarguide.inspection.settings import plain
+from polarguide.inspection.settings import json_value
 from polarguide.inspection.shots import ShotFindings
+from polarguide.training.angles.polarizers import Judgment
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
 from polarguide.visualization.layers import AOLP_FULL_DOLP, DOLP_HIGH
@@ -139,10 +141,7 @@ def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
         title=f"Inspection of {capture.name}",
         summary=f"{len(capture.views)} views of {width} x {height} pixels, {capture.bits} bits; {posed}",
         found=inspection,
-        why=_why(angles),
-        orders=_orders(angles) if isinstance(angles, AngleFindings) else [],
-        shots=_shots(angles) if isinstance(angles, ShotFindings) else [],
-        notes=_notes(angles) if isinstance(angles, AngleFindings) else [],
+        **_angle_values(angles),
         layers=layers,
         ramps={layer.ramp: figures.color_gradient(layer.ramp) for layer in layers if layer.ramp},
         wheel=data_uri(figures.angle_wheel(), "aolp", 2 * SIDE),
@@ -158,46 +157,39 @@ def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
     )
 
 
-def _why(angles: AngleFindings | ShotFindings) -> str:
-    """Why nothing was found; empty where something was."""
+def _angle_values(angles: AngleFindings | ShotFindings) -> dict[str, Any]:
+    """Return the values of the page's section on angles.
+
+    ``why`` explains missing results. ``orders`` has files, sense and zero, probability, and log-odds relative to the
+    best (empty for the best). ``shots`` has the stated and estimated angle of each picture. ``notes`` are sentences.
+    """
     if isinstance(angles, ShotFindings):
-        return angles.why
-    return "" if angles.posterior else "Not decided: this check needs poses and reflecting surfaces."
-
-
-def _orders(angles: AngleFindings) -> list[tuple[str, str, float, str]]:
-    """Files, sense and zero, probability, and log-odds relative to the best (empty: the best)."""
-    if angles.posterior is None:
-        return []
-    return [
-        (
-            ", ".join(f"{angle}°" for angle in row.files),
-            row.order.label,
-            row.probability,
-            "" if k == angles.posterior.best else f"{-row.log_odds:.1f}",
-        )
-        for k, row in enumerate(angles.hypotheses)
+        rows = zip(angles.judgments, angles.stated, strict=True)
+        shots = [_shot_row(judgment, exposure) for judgment, exposure in rows]
+        return {"why": angles.why, "orders": [], "shots": shots, "notes": []}
+    found = angles.posterior
+    notes = [f"{e.source.capitalize()}{'' if e.usable else ' (not used)'}: {e.note}" for e in angles.sources]
+    if found is None:
+        why = "Not decided: this check needs poses and reflecting surfaces."
+        return {"why": why, "orders": [], "shots": [], "notes": notes}
+    zero = f"Zero offset beyond the best order: {found.offset:+.2f}° ± {found.offset_error:.2f}°."
+    orders = [
+        (", ".join(f"{angle}°" for angle in files), order.label, probability, f"{-log_odds:.1f}")
+        for order, files, probability, log_odds in angles.hypotheses
     ]
+    orders[found.best] = (*orders[found.best][:3], "")
+    return {"why": "", "orders": orders, "shots": [], "notes": [zero, *notes]}
 
 
-def _notes(angles: AngleFindings) -> list[str]:
-    posterior = angles.posterior
-    zero = "" if posterior is None else f"{posterior.offset:+.2f}° ± {posterior.offset_error:.2f}°"
-    notes = [f"Zero offset beyond the best order: {zero}."] if zero else []
-    return notes + [
-        f"{e.source.capitalize()}{'' if e.usable else ' (not used)'}: {e.note}" for e in angles.sources
-    ]
-
-
-def _shots(findings: ShotFindings) -> list[tuple[str, ...]]:
-    """Rows of the table of angles: what is specified of each picture, and what was found."""
-    rows: list[tuple[str, ...]] = []
-    for judgment, exposure in zip(findings.judgments, findings.stated, strict=True):
-        angle = "without a filter, as it looks" if judgment.unfiltered else f"{judgment.angle:.0f}°"
-        angle = "too little polarization to tell" if judgment.vague else angle
-        numbers = (f"{judgment.spread:.1f}°", f"{judgment.modulation:.2f}", f"{judgment.gain:.2f}")
-        rows.append((judgment.view, exposure.words, angle, *numbers))
-    return [] if findings.why else rows
+def _shot_row(judgment: Judgment, exposure: Exposure) -> tuple[str, ...]:
+    """Return the cells of one picture: view, stated and estimated angle, spread, modulation and gain."""
+    angle = f"{judgment.angle:.0f}°"
+    if judgment.unfiltered:
+        angle = "without a filter, as it looks"
+    elif judgment.vague:
+        angle = "too little polarization to tell"
+    numbers = (f"{judgment.spread:.1f}°", f"{judgment.modulation:.2f}", f"{judgment.gain:.2f}")
+    return judgment.view, exposure.words, angle, *numbers
 
 
 def _figures(measurements: Sequence[ViewMeasurements]) -> list[tuple[str, ...]]:
@@ -233,7 +225,7 @@ RECORD = "inspection.json"
 def inspection_record(inspection: Inspection) -> dict[str, Any]:
     """The findings as plain JSON types; docs/reference/inspection.md describes the keys."""
     capture = inspection.capture
-    record: dict[str, Any] = plain(
+    record: dict[str, Any] = json_value(
         {
             "schema": SCHEMA,
             "program": f"polarguide {__version__}",

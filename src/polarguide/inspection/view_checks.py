@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from polarguide.capture.angle_evidence import TO_DEVIATION
 from polarguide.capture.colmap.model import ColmapModel
 from polarguide.capture.point_exposures import significant
 from polarguide.capture.view import listed
@@ -22,7 +23,6 @@ FOCAL_DIFFERS = 0.01
 """Difference of the logarithm of a focal length for a warning; 1 % turns a ray at 30 degrees by 0.25 degrees."""
 FOCAL_WRONG = 0.05
 """The same for the verdict "wrong"."""
-TO_DEVIATION = 1.4826
 STEP = 1 / 3
 """Stops by which cameras set exposures; with a larger error, equal exposures are not confirmed."""
 
@@ -30,10 +30,9 @@ STEP = 1 / 3
 def view_exposure_check(capture: Capture) -> Check:
     """Check whether the views were exposed and white-balanced alike."""
     key = "view_exposure"
-    title = "Equal exposure of the views"
     exposures = capture.exposures
     if exposures is None or not np.isfinite(exposures.logs).any():
-        return Check(key, title, "n/a", "No points that views have in common are stored in the model.")
+        return Check(key, "n/a", "No points that views have in common are stored in the model.")
     logs = exposures.significant / math.log(2)
     known = np.isfinite(logs).all(axis=1)
     size = np.where(known, np.abs(logs).max(axis=1), 0.0)
@@ -51,12 +50,10 @@ def view_exposure_check(capture: Capture) -> Check:
         finding = (
             f"The points that views have in common are too few to compare their exposures ({precision})."
         )
-        return Check(
-            key, title, "not verified", finding, "Add views between those there are.", figures=figures
-        )
+        return Check(key, "not verified", finding, "Add views between those there are.", figures=figures)
     if not strongest:
         finding = f"The points that views have in common are equally bright in all of them ({precision})."
-        return Check(key, title, "ok", finding, figures=figures)
+        return Check(key, "ok", finding, figures=figures)
     told = [f"{names[k]} {logs[k][np.abs(logs[k]).argmax()]:+.2f}" for k in strongest]
     remedy = (
         "prepare --gains none left them. Prepare without it, and training divides each color of a view by its gain."
@@ -64,7 +61,7 @@ def view_exposure_check(capture: Capture) -> Check:
         else "Training and evaluation divide each color of these views by its gain."
     )
     return Check(
-        key, title, "warning",
+        key, "warning",
         f"{len(strongest)} of {len(names)} views were exposed or white-balanced otherwise than the mean, by points in "
         f"common ({precision}). Stops: {listed(told)}.",
         f"{remedy} Next time, fix exposure and white balance.",
@@ -75,9 +72,8 @@ def view_exposure_check(capture: Capture) -> Check:
 def lens_check(capture: Capture) -> Check:
     """Check whether each view alone agrees with the focal length that the model has for it."""
     key = "focal_lengths"
-    title = "Focal lengths"
     if capture.model is None:
-        return Check(key, title, "n/a", "There are no poses.")
+        return Check(key, "n/a", "There are no poses.")
     found = {
         view.name: alone
         for view in capture.posed
@@ -85,7 +81,7 @@ def lens_check(capture: Capture) -> Check:
     }
     if len(found) < 3:
         why = f"Fewer than 3 views have {FEWEST} points with their places in the pictures."
-        return Check(key, title, "n/a", why)
+        return Check(key, "n/a", why)
     names = list(found)
     logs, errors = np.array(list(found.values())).T
     off = significant(np.abs(logs), errors) & (np.abs(logs) > FOCAL_DIFFERS)
@@ -95,12 +91,12 @@ def lens_check(capture: Capture) -> Check:
         f"Where the points hold and a view alone is free, its focal length changes by {usual:.1%} (rms)."
     )
     if not off.any():
-        return Check(key, title, "ok", finding, figures=figures)
+        return Check(key, "ok", finding, figures=figures)
     order = [int(k) for k in np.argsort(-np.abs(logs)) if off[k]]
     told = listed([f"{names[k]} {math.expm1(logs[k]):+.1%}" for k in order])
     verdict: Verdict = "wrong" if np.abs(logs[off]).max() > FOCAL_WRONG else "warning"
     return Check(
-        key, title, verdict, f"{finding} It contradicts the model in {len(order)} views ({told}).",
+        key, verdict, f"{finding} It contradicts the model in {len(order)} views ({told}).",
         "Poses are wrong where several cameras were taken for one: a telephone that changed its lens, a zoom, a crop. "
         "Prepare the original files, whose EXIF tells them apart, or bring a model with a camera for each.",
         tuple(names[k] for k in order), figures,

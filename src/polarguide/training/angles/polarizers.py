@@ -13,35 +13,37 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
+from polarguide.capture.angle_evidence import TO_DEVIATION, angle_difference, mean_angle, tolerance
 from polarguide.capture.exposures import Exposure
 from polarguide.capture.exposures import found as found_exposure
 from polarguide.capture.view import ANGLES
-from polarguide.training.angles.fit import fit_angle
+from polarguide.training.angles.fit import FittedAngle, fit_angle
 from polarguide.training.recipe import Recipe
 from polarguide.training.rules import AngleRules
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import ANGLE_COLUMNS
 
-TO_DEVIATION = 1.4826
-"""Standard deviation of normal errors over the median of their absolute values."""
 REMEDY = (
     "Note the angle of each shot; or take three or four shots of each view at known angles, from a tripod; or treat "
     "the pictures as ordinary photographs: prepare them with --angles none."
 )
 """What to do where most angles are doubtful."""
+UNFITTED = (0.0, 1.0, 0.0, 90.0, 1.0, 0.0, 0.0)
+"""Values of ``FittedAngle`` for a picture without polarization to fit an angle to."""
 Predict = Callable[[View], Tensor]
 """Stokes vectors [3, H, W, 3] that the present state predicts for a view."""
 
 
 @dataclass(frozen=True)
-class Judgment:
+class Judgment(FittedAngle):
     """The training's judgment of a picture's angle.
+
+    ``angle`` is the mean of the fits that tell one, or else of those that guess one. The other values of
+    ``FittedAngle`` are those of the last of these fits.
 
     Attributes:
         view, number: the view, and the place of the picture among its exposures.
         specified: what the capture says. believed: what the training goes by.
-        angle: the mean of the fits that tell one, or else of those that guess one, degrees.
-        gain, modulation, spread, doubt, misfit, misfit_across: those of the last of these, see ``FittedAngle``.
         scatter: scatter of the angles about their mean, degrees; 90 where less than half of the fits have one.
         usual: median of what the telling pictures of the same fit are ``off``: how well the model predicts any.
         unexplained: misfit of the last of all fits over the median of all pictures, times that over the misfit across:
@@ -54,13 +56,6 @@ class Judgment:
     number: int
     specified: Exposure
     believed: Exposure
-    angle: float
-    gain: float
-    modulation: float
-    spread: float
-    doubt: float
-    misfit: float = 0.0
-    misfit_across: float = 0.0
     scatter: float = 0.0
     unexplained: float = 0.0
     usual: float = 0.0
@@ -100,16 +95,14 @@ class Judgment:
     @property
     def off(self) -> float:
         """Degrees from the specified to the fitted angle, in [-90, 90); 0 without a specified angle."""
-        return (
-            0.0 if self.specified.angle is None else (self.angle - self.specified.angle + 90.0) % 180.0 - 90.0
-        )
+        return 0.0 if self.specified.angle is None else angle_difference(self.angle, self.specified.angle)
 
     @property
     def limit(self) -> float:
         """Degrees that a picture has to be ``off`` to contradict its specified angle: more than others are,
         since where all are off, the model is wrong. From 90 on, nothing contradicts.
         """
-        return max(self.rules.contradicts, 3 * self.spread, 3 * TO_DEVIATION * self.usual)
+        return tolerance(self.rules.contradicts, self.spread, self.usual)
 
     @property
     def contradicts(self) -> bool:
@@ -118,8 +111,8 @@ class Judgment:
 
     def resembles(self, other: Judgment) -> bool:
         """Whether it looks as if taken at the specified angle of another picture, as well as it tells."""
-        apart = (self.angle - (other.specified.angle or 0.0) + 90.0) % 180.0 - 90.0
-        return abs(apart) <= max(self.rules.contradicts, 3 * self.spread)
+        apart = angle_difference(self.angle, other.specified.angle or 0.0)
+        return abs(apart) <= tolerance(self.rules.contradicts, self.spread)
 
     @property
     def doubtful(self) -> bool:
@@ -224,10 +217,7 @@ class Polarizers:
                 if not view.exposures[k].filtered:
                     continue
                 fitted = fit_angle(intensity, stokes, weight, rays, view.mount)
-                row = [0.0, 1.0, 0.0, 90.0, 1.0, 0.0, 0.0, 0.0]
-                if fitted is not None:
-                    row = [*dataclasses.astuple(fitted), 1.0]
-                rows.append(row)
+                rows.append([*UNFITTED, 0.0] if fitted is None else [*dataclasses.astuple(fitted), 1.0])
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, ANGLE_COLUMNS)
 
     def take(self, table: Tensor) -> set[str]:
@@ -281,10 +271,7 @@ class Polarizers:
     def _judged(self, fit: Tensor) -> list[Judgment]:
         """The judgment of each picture by one fit [P, 8]."""
         rows = [
-            replace(
-                Judgment(view.name, k, view.exposures[k], view.exposures[k], *row[: ANGLE_COLUMNS - 1]),
-                rules=self._rules,
-            )
+            Judgment(*row[:-1], view.name, k, view.exposures[k], view.exposures[k], rules=self._rules)
             for (view, k), row in zip(self._places, fit.tolist(), strict=True)
         ]
         offs = [abs(row.off) for row in rows if row.tells and row.specified.angle is not None]
@@ -347,19 +334,3 @@ def _belief(judgment: Judgment, common: float | None) -> Exposure:
         return specified
     gain = specified.gain if common is None else specified.gain * judgment.gain / common
     return found_exposure(specified, judgment.angle, gain)
-
-
-def mean_angle(angles: Sequence[float], spreads: Sequence[float], least_spread: float) -> tuple[float, float]:
-    """Mean of angles in degrees that count modulo 180, each by one over its spread in degrees, but not
-    more than by one over ``least_spread``, and their scatter.
-
-    The scatter is half the circular standard deviation of the doubled angles, sqrt(-2 log R) with R the length of their
-    mean (Mardia and Jupp, Directional Statistics, 2.3), in degrees.
-    """
-    weights = [1 / max(spread, least_spread) for spread in spreads]
-    doubled = [math.radians(2 * angle) for angle in angles]
-    sine = sum(weight * math.sin(angle) for weight, angle in zip(weights, doubled, strict=True))
-    cosine = sum(weight * math.cos(angle) for weight, angle in zip(weights, doubled, strict=True))
-    length = min(max(math.hypot(sine, cosine) / sum(weights), 1e-6), 1.0)
-    mean = math.degrees(math.atan2(sine, cosine) / 2) % 180.0
-    return mean, min(math.degrees(math.sqrt(-2 * math.log(length))) / 2, 90.0)
