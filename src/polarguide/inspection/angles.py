@@ -21,7 +21,7 @@ from polarguide.capture.angle_evidence import (
 )
 from polarguide.capture.calibration import Calibration, combined
 from polarguide.capture.view import ANGLES
-from polarguide.inspection.settings import Check, Verdict
+from polarguide.inspection.settings import Check, first_outcome
 
 DECIDED = 0.95
 """Probability from which an order counts as decided."""
@@ -173,49 +173,72 @@ def angle_checks(angles: AngleFindings) -> list[Check]:
 def _order_check(angles: AngleFindings, found: OrderPosterior, more: str) -> Check:
     """Check whether the pictures are named by their true angles."""
     probability = max(found.probabilities)
-    figures = angles.record()
-    if angles.files is None:
-        likely = sorted((row for row in angles.hypotheses if row[2] > 0.02), key=lambda row: -row[2])
-        rivals = " or ".join(f"{', '.join(map(str, files))} ({p:.0%})" for _, files, p, _ in likely)
-        finding = f"Not decided. The pictures named 0, 45, 90, 135 were taken at {rivals}."
-        return Check("angle_order", "warning", finding, more, figures=figures)
-    if angles.files == ANGLES:
-        finding = f"The file names are right with a probability of {probability:.1%}."
-        return Check("angle_order", "ok", finding, figures=figures)
-    finding = f"With a probability of {probability:.1%} {swaps(angles.files)}."
-    return Check("angle_order", "wrong", finding, angles.correction(angles.offset or 0.0), figures=figures)
+    likely = sorted((row for row in angles.hypotheses if row[2] > 0.02), key=lambda row: -row[2])
+    rivals = " or ".join(f"{', '.join(map(str, files))} ({p:.0%})" for _, files, p, _ in likely)
+    outcome = first_outcome(
+        (
+            angles.files is None,
+            "warning",
+            f"Not decided. The pictures named 0, 45, 90, 135 were taken at {rivals}.",
+            more,
+        ),
+        (
+            angles.files == ANGLES,
+            "ok",
+            f"The file names are right with a probability of {probability:.1%}.",
+            "",
+        ),
+        (
+            True,
+            "wrong",
+            f"With a probability of {probability:.1%} {swaps(angles.files or ANGLES)}.",
+            angles.correction(angles.offset or 0.0),
+        ),
+    )
+    return Check("angle_order", *outcome, figures=angles.record())
 
 
 def _sense_check(angles: AngleFindings, found: OrderPosterior, more: str) -> Check:
     """Check whether the angles increase counter-clockwise as displayed."""
     probability = found.sense_probability
-    figures = {"counter_clockwise": probability}
-    if max(probability, 1 - probability) < DECIDED:
-        finding = f"Not decided: counter-clockwise with a probability of {probability:.0%}."
-        return Check("handedness", "warning", finding, more, figures=figures)
-    if probability > 0.5:
-        finding = f"Counter-clockwise as displayed, with a probability of {probability:.1%}."
-        return Check("handedness", "ok", finding, figures=figures)
-    finding = (
-        f"Clockwise as displayed, with a probability of {1 - probability:.1%}: clockwise angles, "
-        "a mirrored picture and two exchanged files look the same."
+    outcome = first_outcome(
+        (
+            max(probability, 1 - probability) < DECIDED,
+            "warning",
+            f"Not decided: counter-clockwise with a probability of {probability:.0%}.",
+            more,
+        ),
+        (
+            probability > 0.5,
+            "ok",
+            f"Counter-clockwise as displayed, with a probability of {probability:.1%}.",
+            "",
+        ),
+        (
+            True,
+            "wrong",
+            f"Clockwise as displayed, with a probability of {1 - probability:.1%}: clockwise angles, "
+            "a mirrored picture and two exchanged files look the same.",
+            angles.correction(angles.offset or 0.0) or more,
+        ),
     )
-    return Check(
-        "handedness", "wrong", finding, angles.correction(angles.offset or 0.0) or more, figures=figures
-    )
+    return Check("handedness", *outcome, figures={"counter_clockwise": probability})
 
 
 def _zero_check(angles: AngleFindings, found: OrderPosterior, more: str) -> Check:
     """Check whether a polarizer angle of 0 degrees is the image's horizontal."""
     offset = found.offset
     error = found.offset_error
-    figures = {"offset_degrees": offset, "error_degrees": error}
-    if error > ZERO_UNSURE:
-        finding = f"The standard error of the zero is {error:.1f}°: too large to decide."
-        return Check("zero_offset", "warning", finding, more, figures=figures)
     about = "" if angles.order in (None, IDENTITY) else " (relative to the order found above)"
     finding = f"The zero of the instrument lies at {offset:+.1f}° ± {error:.1f}°{about}."
-    if abs(offset) <= tolerance(ZERO_OFF / 2, error):
-        return Check("zero_offset", "ok", finding, figures=figures)
-    verdict: Verdict = "wrong" if angles.offset is not None else "warning"
-    return Check("zero_offset", verdict, finding, angles.correction(offset) or more, figures=figures)
+    outcome = first_outcome(
+        (
+            error > ZERO_UNSURE,
+            "warning",
+            f"The standard error of the zero is {error:.1f}°: too large to decide.",
+            more,
+        ),
+        (abs(offset) <= tolerance(ZERO_OFF / 2, error), "ok", finding, ""),
+        (True, "warning" if angles.offset is None else "wrong", finding, angles.correction(offset) or more),
+    )
+    return Check("zero_offset", *outcome, figures={"offset_degrees": offset, "error_degrees": error})

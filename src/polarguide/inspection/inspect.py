@@ -48,7 +48,7 @@ from polarguide.inspection.picture_checks import (
     picture_checks,
     with_noise,
 )
-from polarguide.inspection.settings import Check, InspectSettings, Verdict, worst
+from polarguide.inspection.settings import Check, InspectSettings, Verdict, first_outcome, worst
 from polarguide.inspection.shots import (
     ShotFindings,
     agreement_checks,
@@ -226,10 +226,16 @@ def coverage_check(capture: Capture) -> Check:
         f"within {spread:.0f}° of their mean direction."
     )
     lonely = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > GAP_DEG)
-    if not lonely and len(directions) >= FEW_VIEWS:
-        return Check("coverage", "ok", finding, figures=figures)
-    remedy = "Reconstruction is unreliable across gaps: add views at most 15 degrees apart."
-    return Check("coverage", "warning", finding, remedy, lonely, figures)
+    outcome = first_outcome(
+        (not lonely and len(directions) >= FEW_VIEWS, "ok", finding, ""),
+        (
+            True,
+            "warning",
+            finding,
+            "Reconstruction is unreliable across gaps: add views at most 15 degrees apart.",
+        ),
+    )
+    return Check("coverage", *outcome, lonely, figures)
 
 
 SURE = 0.98

@@ -103,6 +103,15 @@ class Check:
         return record
 
 
+def first_outcome(*rows: tuple[object, Verdict, str, str]) -> tuple[Verdict, str, str]:
+    """Return verdict, finding and remedy of the first row whose condition holds.
+
+    Args:
+        rows: condition, verdict, finding and remedy of each possible outcome, the most important first.
+    """
+    return next(outcome for condition, *outcome in rows if condition)  # type: ignore[return-value]
+
+
 def worst(checks: Iterable[Check]) -> Verdict:
     """Return the worst verdict among the checks; "n/a" without checks."""
     return max((check.verdict for check in checks), key=ORDER.index, default="n/a")

@@ -28,7 +28,7 @@ from polarguide.capture.picture_sets import SetSamples, chosen_pixels, judge
 from polarguide.capture.view import FULL_CODE, View, listed
 from polarguide.inspection.capture import Capture
 from polarguide.inspection.evidence import short_run
-from polarguide.inspection.settings import LCD_TEST, Check, Verdict
+from polarguide.inspection.settings import LCD_TEST, Check, Verdict, first_outcome
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers
@@ -37,22 +37,34 @@ from polarguide.training.trainer import StepReport
 
 RECIPE = "polarguide-stokes"
 """Recipe of the short training."""
-CERTAIN = 0.6
-"""Share of the median modulation (``FittedAngle``) from which a picture may contradict its stated angle."""
-CONTRADICTS = 30.0
-"""Smallest difference in degrees that contradicts a stated angle; the short training is 3 to 7 degrees off."""
-SIGMAS = 4.0
-"""Standard deviations that a short training may be off by chance."""
-FEWEST = 4
-"""Number of pictures that determine their angle from which on all are judged."""
-ZERO_OFF = 4.0
-"""Degrees of a common offset for a warning."""
-ZERO_WRONG = 8.0
-"""Degrees of a common offset for the verdict "wrong"."""
-REDUNDANT = 4
-"""Known angles of one view from which on they can contradict one another."""
-FEW_ANGLES = 3
-"""Different angles from which on S1 and S2 can be told apart, over the capture."""
+
+
+class Limits:
+    """Thresholds of the checks.
+
+    Attributes:
+        certain: share of the median modulation (``FittedAngle``) from which a picture may contradict its stated angle.
+            At 0.7 a wrong line of the demo (0.67) went unnamed.
+        contradicts: smallest difference in degrees that contradicts a stated angle. The short training is 3 to 7
+            degrees off (median) on four scenes.
+        sigmas: standard deviations that a short training may be off by chance.
+        fewest: pictures that determine their angle from which on all are judged.
+        zero_off: degrees of a common offset for a warning.
+        zero_wrong: degrees of a common offset for the verdict "wrong".
+        redundant: known angles of one view from which on they can contradict one another.
+        few_angles: different angles from which on S1 and S2 can be told apart, over the capture.
+    """
+
+    certain = 0.6
+    contradicts = 30.0
+    sigmas = 4.0
+    fewest = 4
+    zero_off = 4.0
+    zero_wrong = 8.0
+    redundant = 4
+    few_angles = 3
+
+
 CHAOS = (
     "Look for shifted lines in angles.csv, or prepare with --angles unknown: training then finds the angles."
 )
@@ -84,7 +96,7 @@ class ShotFindings:
     @property
     def rotation(self) -> CommonRotation:
         """Sense and zero of the stated angles by the pictures that determine their angle."""
-        if len(self.telling) < FEWEST:
+        if len(self.telling) < Limits.fewest:
             return NO_ROTATION
         return common_rotation([j.angle for j, _ in self.telling], [angle for _, angle in self.telling])
 
@@ -184,22 +196,24 @@ def pictures_check(capture: Capture) -> Check:
         f"{len(exposures)} pictures of {len(capture.views)} views: "
         f"{', '.join(text for text, count in kinds.items() if count)}; gains {min(gains):.2f} to {max(gains):.2f}."
     )
-    verdict: Verdict = "ok"
-    remedy = ""
-    if plain == len(exposures):
-        verdict = "warning"
-        finding += " Ordinary photographs train, without measured polarization."
-        remedy = (
+    outcome = first_outcome(
+        (
+            plain == len(exposures),
+            "warning",
+            f"{finding} Ordinary photographs train, without measured polarization.",
             "If a filter was used, note its angles (or --angles unknown) and repeat prepare. If not, nothing is wrong; "
-            "some views through a filter would improve layers and normals."
-        )
-    elif not unknown and len(angles) < FEW_ANGLES:
-        verdict = "warning"
-        remedy = (
+            "some views through a filter would improve layers and normals.",
+        ),
+        (
+            not unknown and len(angles) < Limits.few_angles,
+            "warning",
+            finding,
             "Turn the filter between shots: with at least three angles, spread over half a turn, no direction of "
-            "the polarization stays unseen."
-        )
-    return Check("pictures", verdict, finding, remedy, figures=figures)
+            "the polarization stays unseen.",
+        ),
+        (True, "ok", finding, ""),
+    )
+    return Check("pictures", *outcome, figures=figures)
 
 
 def agreement_checks(capture: Capture) -> list[Check]:
@@ -210,7 +224,7 @@ def agreement_checks(capture: Capture) -> list[Check]:
     for view in capture.views:
         places = [k for k, exposure in enumerate(view.exposures) if exposure.angle is not None]
         exposures = tuple(view.exposures[k] for k in places)
-        if len(places) < REDUNDANT or not determine_stokes(exposures):
+        if len(places) < Limits.redundant or not determine_stokes(exposures):
             continue
         files = capture.layout.files(view.name)
         samples = SetSamples(
@@ -229,14 +243,17 @@ def agreement_checks(capture: Capture) -> list[Check]:
             notes += [f"{view.name}: {note.removesuffix(' It is left out.')}" for note in judged.notes]
     if not compared:
         return []
-    figures = {"views": compared, "contradicting": len(wrong)}
-    if not notes:
-        return [Check("agreement", "ok", f"The pictures of {compared} views agree.", figures=figures)]
-    finding = f"In {len(wrong)} of {compared} views, pictures contradict one another. {listed(notes)}"
-    remedy = (
-        "Correct their lines of angles.csv, or write unknown; repeat prepare without pictures that moved."
+    outcome = first_outcome(
+        (not notes, "ok", f"The pictures of {compared} views agree.", ""),
+        (
+            notes,
+            "wrong",
+            f"In {len(wrong)} of {compared} views, pictures contradict one another. {listed(notes)}",
+            "Correct their lines of angles.csv, or write unknown; repeat prepare without pictures that moved.",
+        ),
     )
-    return [Check("agreement", "wrong", finding, remedy, tuple(wrong), figures)]
+    figures = {"views": compared, "contradicting": len(wrong)}
+    return [Check("agreement", *outcome, tuple(wrong), figures)]
 
 
 def shot_checks(findings: ShotFindings) -> list[Check]:
@@ -249,7 +266,7 @@ def shot_checks(findings: ShotFindings) -> list[Check]:
     rotation = findings.rotation
     return [
         _modulation(findings),
-        _sense(findings, rotation),
+        _sense(findings, rotation.sense),
         _zero(findings, rotation),
         _each(findings, rotation),
     ]
@@ -260,94 +277,120 @@ def _modulation(findings: ShotFindings) -> Check:
     plain = tuple(dict.fromkeys(j.view for j in findings.judgments if j.unfiltered))
     vague = sum(j.vague for j in findings.judgments)
     modulation = float(np.median([j.modulation for j in findings.judgments]))
-    figures = {"pictures": count, "unfiltered": len(plain), "vague": vague, "modulation": modulation}
     finding = f"{count - len(plain) - vague} of {count} pictures tell the angle of their filter."
-    verdict: Verdict = "ok"
-    remedy = ""
-    if 2 * len(plain) > count:
-        verdict = "wrong"
-        finding = (
+    outcome = first_outcome(
+        (
+            2 * len(plain) > count,
+            "wrong",
             f"No modulation: was the filter reversed, or missing? {len(plain)} of {count} pictures look as if taken "
-            "without one."
-        )
-        remedy = LCD_TEST
-    elif plain:
-        verdict = "warning"
-        finding += f" Taken without a filter, as it looks: {listed(list(plain))}."
-        remedy = "If so, write none for them in angles.csv."
-    elif 2 * vague > count:
-        verdict = "warning"
-        finding += " The others show too little polarization for that."
-        remedy = "Photograph glossy surfaces obliquely (50 to 65 degrees); or train longer with --steps."
-    return Check("modulation", verdict, finding, remedy, plain, figures)
+            "without one.",
+            LCD_TEST,
+        ),
+        (
+            plain,
+            "warning",
+            f"{finding} Taken without a filter, as it looks: {listed(list(plain))}.",
+            "If so, write none for them in angles.csv.",
+        ),
+        (
+            2 * vague > count,
+            "warning",
+            f"{finding} The others show too little polarization for that.",
+            "Photograph glossy surfaces obliquely (50 to 65 degrees); or train longer with --steps.",
+        ),
+        (True, "ok", finding, ""),
+    )
+    figures = {"pictures": count, "unfiltered": len(plain), "vague": vague, "modulation": modulation}
+    return Check("modulation", *outcome, plain, figures)
 
 
-def _sense(findings: ShotFindings, rotation: CommonRotation) -> Check:
-    key = "handedness"
-    if len(findings.telling) < FEWEST:
-        return Check(key, *findings.undecided)
+def _sense(findings: ShotFindings, sense: int | None) -> Check:
+    if len(findings.telling) < Limits.fewest:
+        return Check("handedness", *findings.undecided)
     stated = np.radians([angle for _, angle in findings.telling])
-    if max(abs(np.exp(1j * times * stated).mean()) for times in (2, 4)) > SAME_DIRECTION:
-        finding = "The stated angles, modulo 90 degrees, differ too little to tell."
-        return Check(key, "not verified", finding)
-    if rotation.sense is None:
-        return Check(key, "warning", "The pictures agree with neither sense.", CHAOS)
-    if rotation.sense == 1:
-        return Check(key, "ok", "Counter-clockwise as displayed.", figures={"counter_clockwise": 1.0})
-    finding = "Clockwise as displayed: the pictures agree only if the angles count the other way."
-    remedy = "Repeat prepare with the other --sense and a new --out."
-    return Check(key, "wrong", finding, remedy, figures={"counter_clockwise": 0.0})
+    alike = max(abs(np.exp(1j * times * stated).mean()) for times in (2, 4)) > SAME_DIRECTION
+    outcome = first_outcome(
+        (alike, "not verified", "The stated angles, modulo 90 degrees, differ too little to tell.", ""),
+        (sense is None, "warning", "The pictures agree with neither sense.", CHAOS),
+        (sense == 1, "ok", "Counter-clockwise as displayed.", ""),
+        (
+            sense == -1,
+            "wrong",
+            "Clockwise as displayed: the pictures agree only if the angles count the other way.",
+            "Repeat prepare with the other --sense and a new --out.",
+        ),
+    )
+    figures = {} if alike or sense is None else {"counter_clockwise": float(sense == 1)}
+    return Check("handedness", *outcome, figures=figures)
 
 
 def _zero(findings: ShotFindings, rotation: CommonRotation) -> Check:
-    key = "zero_offset"
     sense, offset, error = rotation
     if sense is None:
-        return Check(key, *findings.undecided)
-    figures = {"offset_degrees": offset, "error_degrees": error}
+        return Check("zero_offset", *findings.undecided)
     finding = f"The zero of the filter lies at {offset:+.1f}° ± {error:.1f}° from where it is stated to lie."
-    if abs(offset) <= tolerance(ZERO_OFF, error, sigmas=SIGMAS):
-        return Check(key, "ok", finding, figures=figures)
-    verdict: Verdict = "wrong" if abs(offset) > tolerance(ZERO_WRONG, error, sigmas=SIGMAS) else "warning"
-    remedy = (
-        f"Repeat prepare with --zero changed by {offset:+.0f} degrees and a new --out; this training itself is good "
-        "to a few degrees."
+    warning, wrong = (
+        abs(offset) > tolerance(floor, error, sigmas=Limits.sigmas)
+        for floor in (Limits.zero_off, Limits.zero_wrong)
     )
-    return Check(key, verdict, finding, remedy, figures=figures)
+    outcome = first_outcome(
+        (not warning, "ok", finding, ""),
+        (
+            True,
+            "wrong" if wrong else "warning",
+            finding,
+            f"Repeat prepare with --zero changed by {offset:+.0f} degrees and a new --out; this training itself is "
+            "good to a few degrees.",
+        ),
+    )
+    return Check("zero_offset", *outcome, figures={"offset_degrees": offset, "error_degrees": error})
 
 
 def _each(findings: ShotFindings, rotation: CommonRotation) -> Check:
-    key = "angles"
     sense, offset, _ = rotation
     unknown = sum(not exposure.known for exposure in findings.stated)
-    if sense is None and len(findings.telling) >= FEWEST:
-        return Check(key, "wrong", "The pictures contradict the stated angles.", CHAOS)
     if sense is None:
         verdict, finding = findings.undecided
         doubtful = sum(j.doubtful for j in findings.judgments)
-        if verdict == "n/a" and 2 * doubtful > unknown:
-            finding = f"No angle is specified, and {doubtful} of the {unknown} that were found are doubtful."
-            figures: dict[str, Any] = {"doubtful": doubtful, "unknown": unknown}
-            return Check(key, "warning", finding, REMEDY, figures=figures)
-        return Check(key, "ok" if verdict == "n/a" else verdict, finding)
+        doubts = verdict == "n/a" and 2 * doubtful > unknown
+        outcome = first_outcome(
+            (
+                len(findings.telling) >= Limits.fewest,
+                "wrong",
+                "The pictures contradict the stated angles.",
+                CHAOS,
+            ),
+            (
+                doubts,
+                "warning",
+                f"No angle is specified, and {doubtful} of the {unknown} that were found are doubtful.",
+                REMEDY,
+            ),
+            (True, "ok" if verdict == "n/a" else verdict, finding, ""),
+        )
+        return Check("angles", *outcome, figures={"doubtful": doubtful, "unknown": unknown} if doubts else {})
     rows = [
         (j, angle, abs(angle_difference(j.angle, sense * angle + offset))) for j, angle in findings.telling
     ]
     typical = float(np.median([apart for _, _, apart in rows]))
-    certain = CERTAIN * float(np.median([j.modulation for j in findings.judgments]))
+    certain = Limits.certain * float(np.median([j.modulation for j in findings.judgments]))
     off = [
         (j, angle)
         for j, angle, apart in rows
-        if apart > tolerance(CONTRADICTS, j.spread, typical, sigmas=SIGMAS)
+        if apart > tolerance(Limits.contradicts, j.spread, typical, sigmas=Limits.sigmas)
         and j.modulation > certain
         and not j.poorly_explained
     ]
-    figures = {"median_degrees": typical, "compared": len(rows), "unknown": unknown}
-    finding = f"{len(rows)} pictures lie {typical:.1f}° from the stated angles (median)."
-    if not off:
-        return Check(key, "ok", finding, figures=figures)
     names = [f"{j.view} ({angle:g}°, looks like {sense * (j.angle - offset) % 180:.0f}°)" for j, angle in off]
-    verdict = "wrong" if 5 * len(off) > len(rows) else "warning"
-    finding += f" Contradicting: {listed(names)}."
-    remedy = "Compare them with your notes; correct their lines of angles.csv, or write unknown."
-    return Check(key, verdict, finding, remedy, tuple(dict.fromkeys(j.view for j, _ in off)), figures)
+    finding = f"{len(rows)} pictures lie {typical:.1f}° from the stated angles (median)."
+    outcome = first_outcome(
+        (not off, "ok", finding, ""),
+        (
+            off,
+            "wrong" if 5 * len(off) > len(rows) else "warning",
+            f"{finding} Contradicting: {listed(names)}.",
+            "Compare them with your notes; correct their lines of angles.csv, or write unknown.",
+        ),
+    )
+    figures = {"median_degrees": typical, "compared": len(rows), "unknown": unknown}
+    return Check("angles", *outcome, tuple(dict.fromkeys(j.view for j, _ in off)), figures)
