@@ -30,7 +30,7 @@ from polarguide.capture.exposures import (
     read_table,
 )
 from polarguide.capture.filter.consecutive import VIDEO_SUFFIXES
-from polarguide.capture.filter.shots import SHOT_SUFFIXES, group_files
+from polarguide.capture.filter.shots import SHOT_SUFFIXES, angle_order, group_files, views_of_names
 from polarguide.capture.layout import ambiguous, list_files
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
@@ -167,7 +167,7 @@ def _exposure_set(
 
     One picture each at 0, 45, 90 and 135 degrees, without gains, are a shot of four.
     """
-    mine = tuple(sorted(pictures, key=_order))
+    mine = tuple(sorted(pictures, key=lambda p: (*angle_order(p.angle), p.path.name, p.frame or 0)))
     if fault is None:
         try:
             require_determined(f"{(table or mine[0].path.parent)} ({name})", [p.angle for p in mine])
@@ -179,12 +179,6 @@ def _exposure_set(
     return ExposureSet(name, "set", {}, fault=fault, pictures=mine, table=table)
 
 
-def _order(picture: SetPicture) -> tuple[bool, float, str, int]:
-    word = isinstance(picture.angle, str)
-    angle = 0.0 if isinstance(picture.angle, str) else picture.angle
-    return word, angle, picture.path.name, picture.frame or 0
-
-
 def by_name(files: Sequence[Path]) -> tuple[list[ExposureSet], list[Path]]:
     """Sets by the names of files, and the files that belong to no set: of four angles at most, or without an angle.
 
@@ -194,16 +188,12 @@ def by_name(files: Sequence[Path]) -> tuple[list[ExposureSet], list[Path]]:
     rest: list[Path] = []
     for folder in dict.fromkeys(path.parent for path in files):
         inside = [path for path in files if path.parent == folder]
-        stated = angles_of_names([stem_of(path) for path in inside])
-        alone = all(name is not None and name[0] == "" for name in stated)
         views: dict[str, list[SetPicture]] = {}
-        for path, name in zip(inside, stated, strict=True):
-            if name is None or (name[0] == "" and not alone):
+        for path, name in zip(inside, views_of_names(folder, inside), strict=True):
+            if name is None:
                 rest.append(path)
             else:
-                views.setdefault(name[0] or canonical(folder.resolve().name), []).append(
-                    SetPicture(path, name[1])
-                )
+                views.setdefault(name[0], []).append(SetPicture(path, name[1]))
         more, four = _any_angles(folder, views)
         sets += more
         rest += four
@@ -298,31 +288,33 @@ def _views_of(root: Path, lines: Sequence[Line]) -> list[str]:
 
 def _of_lines(files: Mapping[str, Path], table: Path, view: str, lines: Sequence[Line]) -> ExposureSet:
     pictures = [SetPicture(files[line.file], line.angle, line.gain) for line in lines]
-    missing = [picture.path for picture in pictures if not picture.path.is_file()]
-    if not missing:
-        return _exposure_set(view, pictures, table)
-    fault = PolarguideError(
-        table,
-        expected=f"the file {missing[0]}",
-        found="nothing of this name",
-        remedy="Correct the file's name in the table, or remove its line.",
-    )
     there = [picture for picture in pictures if picture.path.is_file()]
+    fault = None
+    if missing := [picture.path for picture in pictures if picture not in there]:
+        fault = PolarguideError(
+            table,
+            expected=f"the file {missing[0]}",
+            found="nothing of this name",
+            remedy="Correct the file's name in the table, or remove its line.",
+        )
     return _exposure_set(view, there, table, fault)
 
 
 def videos(files: Sequence[Path]) -> list[ExposureSet]:
     """Each video as a set, with the frames that the table beside it lists."""
-    return [_video(path) for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
-
-
-def _video(path: Path) -> ExposureSet:
-    table = path.with_suffix(".csv")
-    try:
-        pictures = [SetPicture(path, angle, None, frame) for frame, angle in read_frame_table(table, path)]
-    except PolarguideError as error:
-        return _exposure_set(stem_of(path), [SetPicture(path, "unknown")], None, error)
-    return _exposure_set(stem_of(path), pictures, table)
+    sets = []
+    for path in files:
+        if path.suffix.lower() not in VIDEO_SUFFIXES:
+            continue
+        table = path.with_suffix(".csv")
+        try:
+            frames = read_frame_table(table, path)
+        except PolarguideError as error:
+            sets.append(_exposure_set(stem_of(path), [SetPicture(path, "unknown")], None, error))
+        else:
+            pictures = [SetPicture(path, angle, None, frame) for frame, angle in frames]
+            sets.append(_exposure_set(stem_of(path), pictures, table))
+    return sets
 
 
 _COLUMNS = ["frame", "angle"]

@@ -300,28 +300,19 @@ def find_single_shots(
             remedy="Leave out the option, or move the table away.",
         )
     if angles is not None and not angles.lower().endswith(".csv"):
-        shots = _all_alike(root, angles, each)
-        return _checked(root, shots), []
+        return _checked(root, _all_alike(root, angles, each)), []
     if angles is not None or table.exists():
         table = Path(angles) if angles is not None else table
         return _checked(root, _by_table(root, table, read_table(table))), [table]
     files = list_files(root, SHOT_SUFFIXES)
-    folders = {} if files else folders_of_angles(root)
-    if folders:
-        shots = [
-            SingleShot(path, stem, angle)
-            for folder, angle in folders.items()
-            for stem, path in index_files(folder, SHOT_SUFFIXES).items()
-        ]
+    shots = [
+        SingleShot(path, stem, angle)
+        for folder, angle in ({} if files else folders_of_angles(root)).items()
+        for stem, path in index_files(folder, SHOT_SUFFIXES).items()
+    ]
+    if shots:
         return _checked(root, shots), []
-    names = angles_of_names([stem_of(path) for path in files])
-    alone = all(name is not None and not name[0] for name in names)
-    named = {
-        path: None
-        if name is None or not (name[0] or alone)
-        else (name[0] or canonical(root.resolve().name), name[1])
-        for path, name in zip(files, names, strict=True)
-    }
+    named = dict(zip(files, views_of_names(root, files), strict=True))
     without = [path.name for path, shot in named.items() if shot is None]
     if without:
         raise PolarguideError(
@@ -332,6 +323,17 @@ def find_single_shots(
         )
     shots = [SingleShot(path, *shot) for path, shot in named.items() if shot is not None]
     return _checked(root, shots), []
+
+
+def views_of_names(folder: Path, files: Sequence[Path]) -> list[tuple[str, Angle] | None]:
+    """Return the view and the angle that the names of files in a folder state; None for a name without them.
+
+    Files named like angles alone are one view, called like the folder, if all of them are named so.
+    """
+    names = angles_of_names([stem_of(path) for path in files])
+    alone = all(name is not None and not name[0] for name in names)
+    own = canonical(folder.resolve().name) if alone else ""
+    return [(name[0] or own, name[1]) if name is not None and (name[0] or alone) else None for name in names]
 
 
 def _all_alike(root: Path, angles: str, each: int) -> list[SingleShot]:
@@ -434,8 +436,9 @@ def _checked(root: Path, shots: list[SingleShot]) -> list[SingleShot]:
             raise ambiguous(root, f"one photograph of {shot.view} {at}", first[key], shot.path)
         first[key] = shot.path
 
-    def order(shot: SingleShot) -> tuple[str, bool, float, str]:
-        word = isinstance(shot.angle, str)
-        return shot.view, word, 0.0 if isinstance(shot.angle, str) else shot.angle, shot.path.name
+    return sorted(shots, key=lambda shot: (shot.view, *angle_order(shot.angle), shot.path.name))
 
-    return sorted(shots, key=order)
+
+def angle_order(angle: Angle) -> tuple[bool, float]:
+    """Return the sort key of an angle: numbers first, then words."""
+    return (True, 0.0) if isinstance(angle, str) else (False, angle)
