@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from polarguide.capture.angle_evidence import (
     IDENTITY,
@@ -38,6 +38,22 @@ MOSAICS = {
     (-1, 45): "--offset-y 1",
 }
 """Sense and zero that geometry finds -> what makes such angles of the mosaics of a sensor."""
+
+
+class Hypothesis(NamedTuple):
+    """One of the eight orders with its evidence.
+
+    Attributes:
+        order: sense and zero.
+        files: true angles of the pictures named 0, 45, 90 and 135.
+        probability: posterior probability of the order.
+        log_odds: log odds of the most likely order to it, 0 or more.
+    """
+
+    order: Order
+    files: FileOrder
+    probability: float
+    log_odds: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +108,12 @@ class AngleFindings:
         return None if self.order is None else self.order.files(PAIRINGS[self.pairing])
 
     @property
-    def hypotheses(self) -> list[tuple[Order, FileOrder, float, float]]:
-        """Order, true angles, probability and log odds against it, of all ``ORDERS``; empty without evidence."""
+    def hypotheses(self) -> list[Hypothesis]:
+        """All ``ORDERS`` with their evidence; empty without evidence."""
         if self.posterior is None:
             return []
         rows = zip(ORDERS, self.posterior.probabilities, self.posterior.log_odds, strict=True)
-        return [(order, order.files(PAIRINGS[self.pairing]), p, odds) for order, p, odds in rows]
+        return [Hypothesis(order, order.files(PAIRINGS[self.pairing]), p, odds) for order, p, odds in rows]
 
     @property
     def offset(self) -> float | None:
@@ -173,7 +189,9 @@ def angle_checks(angles: AngleFindings) -> list[Check]:
 def _order_check(angles: AngleFindings, found: OrderPosterior, more: str) -> Check:
     """Check whether the pictures are named by their true angles."""
     probability = max(found.probabilities)
-    likely = sorted((row for row in angles.hypotheses if row[2] > 0.02), key=lambda row: -row[2])
+    likely = sorted(
+        (row for row in angles.hypotheses if row.probability > 0.02), key=lambda row: -row.probability
+    )
     rivals = " or ".join(f"{', '.join(map(str, files))} ({p:.0%})" for _, files, p, _ in likely)
     outcome = first_outcome(
         (
