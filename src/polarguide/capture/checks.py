@@ -313,8 +313,8 @@ class MeasuredGains:
             pair, 1 where 0 and 45 are, 2 where 0 and 135 are; None where the samples contradict any.
     """
 
-    logs: tuple[float, float, float, float]
-    errors: tuple[float, float, float, float]
+    logs: tuple[float, ...]
+    errors: tuple[float, ...]
     pairing: int | None
 
     def deviating(self, stated: Sequence[float] = (0.0, 0.0, 0.0, 0.0)) -> dict[int, float]:
@@ -372,7 +372,7 @@ def measured_gains(moments: NDArray[np.float64]) -> MeasuredGains | None:
     alike = [k for k, other in enumerate((2, 1, 3)) if signs[0] == signs[other] and signs.sum() == 0]
     logs = _logs(vector)
     errors = jackknife_error(logs, _logs(np.stack([_least(total - tile) for tile in moments])))
-    return MeasuredGains(_four(logs), _four(errors), alike[0] if len(alike) == 1 else None)
+    return MeasuredGains(tuple(logs.tolist()), tuple(errors.tolist()), alike[0] if len(alike) == 1 else None)
 
 
 def _least(moments: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -384,8 +384,3 @@ def _logs(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Logarithms of gains, mean 0, of vectors of their inverses [..., 4]."""
     logs = -np.log(np.maximum(np.abs(vectors), 1e-9))
     return np.asarray(logs - logs.mean(axis=-1, keepdims=True))
-
-
-def _four(values: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    first, second, third, fourth = (float(value) for value in values)
-    return first, second, third, fourth

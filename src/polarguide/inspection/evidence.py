@@ -54,22 +54,55 @@ from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
 
 NORMALS = "normals of a short training"
-SAMPLES = 400
-"""Largest number of pixels that are sampled in a view."""
-ZENITH_MARGIN = math.radians(15.0)
-"""Error of a rendered zenith up to which a pixel still counts as certainly specular."""
-LEAST_ZENITH = math.radians(15.0)
-LEAST_DOLP = 0.03
-FEWEST = 500
-LEAST_INLIERS = 0.5
-"""Least share of pixels whose normals agree."""
-LARGEST_ERROR = math.radians(10.0)
-"""Largest error of these normals."""
-LEAST_CONCENTRATION = 0.25
-"""Least length of the mean of ``exp(4 i (AoLP - azimuth))``: 1 for agreement modulo 90 degrees, 0 for none."""
-_SPECULAR = 0.95
-_NORMAL_ERRORS = tuple(math.radians(angle) for angle in (3.0, 6.0, 10.0, 16.0))
-_INLIERS = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97)
+"""Name of the evidence from normals."""
+POINTS = "points observed in several views"
+"""Name of the evidence from points."""
+
+
+_SENSES = torch.tensor(SENSES)[:, None]
+
+
+class EvidenceLimits:
+    """Constants of the evidence.
+
+    Attributes:
+        samples: largest number of pixels that are sampled in a view.
+        zenith_margin: error of a rendered zenith, radians, up to which a pixel still counts as certainly specular.
+        least_zenith: zenith of a normal from which on its azimuth is reliable, radians.
+        least_dolp: DoLP from which on the AoLP of a pixel is used.
+        fewest_pixels: pixels with a normal that the evidence needs.
+        least_inliers: least share of pixels whose normals agree.
+        largest_error: largest error of the normals, radians.
+        least_concentration: least length of the mean of ``exp(4 i (AoLP - azimuth))``: 1 for agreement modulo 90
+            degrees, 0 for none.
+        specular: share of certainly specular pixels that are polarized perpendicular to the plane of incidence.
+        normal_errors: errors of normals that are tried, radians.
+        inliers: shares of agreeing pixels that are tried.
+        fewest_observations: views that a point has to be observed in.
+        fewest_points: points that the evidence needs.
+        largest_misfit: median angle in degrees between fields and their common plane above which points are not used.
+        least_scale: smallest mean square of the fields' components along a normal that counts.
+        opaque: alpha from which on a rendered normal counts.
+        agreement: least cosine between the rendered normal and that of the depth.
+    """
+
+    samples = 400
+    zenith_margin = math.radians(15.0)
+    least_zenith = math.radians(15.0)
+    least_dolp = 0.03
+    fewest_pixels = 500
+    least_inliers = 0.5
+    largest_error = math.radians(10.0)
+    least_concentration = 0.25
+    specular = 0.95
+    normal_errors = tuple(math.radians(angle) for angle in (3.0, 6.0, 10.0, 16.0))
+    inliers = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97)
+    fewest_observations = 4
+    fewest_points = 20
+    largest_misfit = 8.0
+    least_scale = 2e-4
+    opaque = 0.9
+    agreement = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +139,7 @@ class SurfaceSamples:
 
     def certainly_specular(self, index: float) -> Tensor:
         """Whether the DoLP exceeds that of diffuse light at this zenith, [N] bool."""
-        most = optics.diffuse_dolp((self.zenith + ZENITH_MARGIN).clamp(max=math.pi / 2), index)
+        most = optics.diffuse_dolp((self.zenith + EvidenceLimits.zenith_margin).clamp(max=math.pi / 2), index)
         return self.dolp > most + 2 * self.noise
 
 
@@ -133,10 +166,12 @@ def sample_surfaces(pairs: Iterable[tuple[InspectedView, ViewSurface]], pairing:
         spread = optics.dolp_noise(stokes, planes[3])
         rays = surface.camera.rays()
         zenith = optics.zenith(surface.normal, rays)
-        good = surface.known & (planes[4] < 1e-3) & (stokes[0] > 0.01) & (zenith > LEAST_ZENITH)
-        good &= (degree > LEAST_DOLP) & (degree > 3 * spread)
+        good = (
+            surface.known & (planes[4] < 1e-3) & (stokes[0] > 0.01) & (zenith > EvidenceLimits.least_zenith)
+        )
+        good &= (degree > EvidenceLimits.least_dolp) & (degree > 3 * spread)
         chosen = good.flatten().nonzero()[:, 0]
-        chosen = chosen[torch.randperm(len(chosen), generator=generator)[:SAMPLES]]
+        chosen = chosen[torch.randperm(len(chosen), generator=generator)[: EvidenceLimits.samples]]
         position = surface.camera.to_world(rays / rays[..., 2:] * surface.depth[..., None])
         position = position + surface.camera.center.float()
         azimuth = optics.azimuth(surface.normal, rays)
@@ -155,17 +190,18 @@ def normal_evidence(pixels: SurfaceSamples, index: float) -> OrderEvidence:
     the AoLP; that error and the uniform share are fitted by maximum likelihood.
     """
     count = len(pixels.aolp)
-    if count < FEWEST:
+    fewest = EvidenceLimits.fewest_pixels
+    if count < fewest:
         note = (
-            f"Only {count} pixels have a reliable normal and significant polarization; {FEWEST} are needed."
+            f"Only {count} pixels have a reliable normal and significant polarization; {fewest} are needed."
         )
         return OrderEvidence(NORMALS, torch.zeros(1, len(SENSES), DEGREES), count, False, note)
     must = pixels.certainly_specular(index)
     coarse = torch.arange(0, DEGREES, 4)
     fits = [
         (float(_log_likelihood(pixels, must, coarse, error, inliers).sum(dim=0).max()), error, inliers)
-        for error in _NORMAL_ERRORS
-        for inliers in _INLIERS
+        for error in EvidenceLimits.normal_errors
+        for inliers in EvidenceLimits.inliers
     ]
     _, error, inliers = max(fits)
     values = _log_likelihood(pixels, must, torch.arange(DEGREES), error, inliers)
@@ -174,17 +210,18 @@ def normal_evidence(pixels: SurfaceSamples, index: float) -> OrderEvidence:
         f"{count} pixels, {int(must.sum())} of which are certainly specular; the AoLP of {inliers:.0%} agrees with the "
         f"normals, whose error is about {math.degrees(error):.0f}° (agreement modulo 90°: {coherent:.2f} of 1)."
     )
-    usable = inliers >= LEAST_INLIERS and error <= LARGEST_ERROR and coherent >= LEAST_CONCENTRATION
+    usable = (
+        inliers >= EvidenceLimits.least_inliers
+        and error <= EvidenceLimits.largest_error
+        and coherent >= EvidenceLimits.least_concentration
+    )
     return OrderEvidence(NORMALS, sum_by_cluster(values, spatial_cells(pixels.position)), count, usable, note)
 
 
 def _concentration(pixels: SurfaceSamples) -> float:
     """Agreement of AoLP and azimuth modulo 90 degrees, for the better sense and the best zero, in [0, 1]."""
-    lengths = []
-    for sense in SENSES:
-        angle = 4 * (sense * pixels.aolp - pixels.azimuth)
-        lengths.append(float(torch.hypot(torch.cos(angle).mean(), torch.sin(angle).mean())))
-    return max(lengths)
+    angles = 4 * (_SENSES * pixels.aolp - pixels.azimuth)
+    return float(torch.hypot(torch.cos(angles).mean(dim=1), torch.sin(angles).mean(dim=1)).max())
 
 
 def _log_likelihood(
@@ -193,25 +230,14 @@ def _log_likelihood(
     """Log-density of the pixels' angles for both senses and zeros [Z] in degrees, [N, 2, Z]."""
     aolp_noise = pixels.noise / (2 * pixels.dolp)
     variance = (error / torch.sin(pixels.zenith)) ** 2 + aolp_noise**2
-    concentration = (1 / (4 * variance)).clamp(max=200.0)[:, None]
+    concentration = (1 / (4 * variance)).clamp(max=200.0)[:, None, None]
     height = 1 / (math.pi * torch.special.i0e(concentration))
-    across = torch.where(must, _SPECULAR, 0.5)[:, None]
-    turn = torch.deg2rad(2 * zeros.float())[None]
-    columns = []
-    for sense in SENSES:
-        cosine = torch.cos(2 * (sense * pixels.aolp - pixels.azimuth)[:, None] + turn)
-        lobes = across * torch.exp(-concentration * (1 + cosine))
-        lobes += (1 - across) * torch.exp(-concentration * (1 - cosine))
-        columns.append(torch.log((1 - inliers) / math.pi + inliers * height * lobes))
-    return torch.stack(columns, dim=1)
-
-
-POINTS = "points observed in several views"
-FEWEST_OBSERVATIONS = 4
-FEWEST_POINTS = 20
-LARGEST_MISFIT_DEG = 8.0
-"""Median angle in degrees between fields and their common plane above which the evidence is not used."""
-_LEAST_SCALE = 2e-4
+    across = torch.where(must, EvidenceLimits.specular, 0.5)[:, None, None]
+    doubled = 2 * (_SENSES * pixels.aolp - pixels.azimuth).T
+    cosine = torch.cos(doubled[:, :, None] + torch.deg2rad(2 * zeros.float()))
+    lobes = across * torch.exp(-concentration * (1 + cosine))
+    lobes += (1 - across) * torch.exp(-concentration * (1 - cosine))
+    return torch.log((1 - inliers) / math.pi + inliers * height * lobes)
 
 
 def point_evidence(
@@ -230,12 +256,13 @@ def point_evidence(
     """
     observations = model.observations([view.name for view in views])
     fields, weights, degrees = _observed_fields(views, model.points.double(), observations, index, pairing)
-    keep = (weights > 0).sum(dim=1) >= FEWEST_OBSERVATIONS
+    fewest = EvidenceLimits.fewest_observations
+    keep = (weights > 0).sum(dim=1) >= fewest
     count = int((weights[keep] > 0).sum())
-    if int(keep.sum()) < FEWEST_POINTS:
+    if int(keep.sum()) < EvidenceLimits.fewest_points:
         note = (
-            f"Only {int(keep.sum())} points have {FEWEST_OBSERVATIONS} observations with a DoLP above the diffuse "
-            f"limit {float(optics.diffuse_dolp_limit(index)):.2f}; {FEWEST_POINTS} are needed."
+            f"Only {int(keep.sum())} points have {fewest} observations with a DoLP above the diffuse limit "
+            f"{float(optics.diffuse_dolp_limit(index)):.2f}; {EvidenceLimits.fewest_points} are needed."
         )
         return OrderEvidence(POINTS, torch.zeros(1, 2, DEGREES), count, False, note), None
     weights = weights[keep].double()
@@ -243,7 +270,7 @@ def point_evidence(
     spreads = torch.stack([_spread(fields[sense][keep].double(), weights) for sense in range(len(SENSES))])
     observed = (weights > 0).sum(dim=1)
     certainty = (weights.sum(dim=1) / observed)[None, :, None]
-    scale = max(float((spreads * certainty).amin(dim=(0, 2)).median()), _LEAST_SCALE)
+    scale = max(float((spreads * certainty).amin(dim=(0, 2)).median()), EvidenceLimits.least_scale)
     likelihood = -0.5 * (observed - 2.0)[None, :, None] * torch.log1p(spreads * certainty / scale)
     total = likelihood.sum(dim=1)
     sense, zero = divmod(int(total.argmax()), DEGREES)
@@ -253,7 +280,7 @@ def point_evidence(
         f"lie within {misfit:.1f}° of a plane (median)."
     )
     clusters = sum_by_cluster(likelihood.movedim(1, 0), spatial_cells(points))
-    usable = misfit <= LARGEST_MISFIT_DEG
+    usable = misfit <= EvidenceLimits.largest_misfit
     evidence = OrderEvidence(POINTS, clusters.float(), count, usable, note)
     if not usable:
         return evidence, None
@@ -313,11 +340,10 @@ def _observed_fields(
         x_ref, up_ref = optics.lens_frame(unit(local).float())
         turn = camera.rotation.float()
         angle = optics.aolp(stokes)
-        for k, sense in enumerate(SENSES):
-            cosine = torch.cos(angle)[:, None]
-            sine = sense * torch.sin(angle)[:, None]
-            fields[k, :, column, 0] = (cosine * x_ref + sine * up_ref) @ turn
-            fields[k, :, column, 1] = (cosine * up_ref - sine * x_ref) @ turn
+        cosine = torch.cos(angle)[:, None]
+        sine = _SENSES[..., None] * torch.sin(angle)[:, None]
+        fields[:, :, column, 0] = (cosine * x_ref + sine * up_ref) @ turn
+        fields[:, :, column, 1] = (cosine * up_ref - sine * x_ref) @ turn
     return fields, weights, degrees
 
 
@@ -344,8 +370,6 @@ LONGEST = 160
 """Pixels of the longer side that the training's pictures are averaged down to (by a whole factor)."""
 KEY = "short_run.json"
 SAVE_EVERY = 100
-_OPAQUE = 0.9
-_AGREEMENT = 0.9
 
 
 def photograph_digest(scene: Scene) -> str:
@@ -438,5 +462,7 @@ def trained_surface(state: TrainingState, view: View, backend: Backend) -> ViewS
     rays = view.camera.rays()
     normal, known = guide_normals(view.camera.to_camera(result.normal), rays, Priors.minimum_normal)
     by_depth = unit(view.camera.to_camera(depth_normals(result.depth, view.camera)))
-    known = known & (result.alpha > _OPAQUE) & (dot(normal, by_depth) > _AGREEMENT)
+    known = (
+        known & (result.alpha > EvidenceLimits.opaque) & (dot(normal, by_depth) > EvidenceLimits.agreement)
+    )
     return ViewSurface(view.camera, normal, result.depth, known)

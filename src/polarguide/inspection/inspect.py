@@ -59,12 +59,40 @@ from polarguide.inspection.shots import (
 from polarguide.inspection.view_checks import lens_check, view_exposure_check
 from polarguide.raster import Backend
 
-NEIGHBORS = 4
-FEATURES = 3000
-FEWEST_MATCHES = 15
-RATIO = 0.75
-GATE_SHARE = 0.02
-"""Matches farther from their epipolar line than this share of the picture's diagonal count as mismatches."""
+RUN_FOLDER = "short_run"
+"""Folder of the short training in the folder of an inspection."""
+
+
+class PoseLimits:
+    """Constants of the checks of poses, and of the decision to train.
+
+    Attributes:
+        neighbors: views that a view is matched with.
+        features: most features of a view.
+        fewest_matches: matches from which on two views are compared.
+        ratio: largest distance of a match's descriptors over that of the second best match.
+        gate: share of the picture's diagonal; matches farther from their epipolar line count as mismatches.
+        typical_px: median epipolar error in stored pixels above which a capture gets a warning.
+        view_px: the same of one view.
+        stands_out: times the median view's error that a view also has to exceed.
+        gap: degrees to the nearest view above which a view is lonely.
+        few_views: views below which a capture gets a warning.
+        sure: probability of an order from which on ``auto`` does not train.
+        fewest_to_train: views with a pose from which on a short training is possible.
+    """
+
+    neighbors = 4
+    features = 3000
+    fewest_matches = 15
+    ratio = 0.75
+    gate = 0.02
+    typical_px = 2.0
+    view_px = 2.0
+    stands_out = 2.5
+    gap = 25.0
+    few_views = 20
+    sure = 0.98
+    fewest_to_train = 8
 
 
 @dataclass(frozen=True)
@@ -103,7 +131,9 @@ def _features(view: InspectedView) -> tuple[NDArray[np.float64], NDArray[np.floa
     gray = view.codes.numpy().astype(np.float64).mean(axis=(0, 3))
     top = max(float(np.percentile(gray, 99.5)), 1.0)
     encoded = (255 * np.clip(gray / top, 0, 1) ** (1 / 2.2)).astype(np.uint8)
-    keypoints, descriptors = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.02).detectAndCompute(  # type: ignore[attr-defined]
+    keypoints, descriptors = cv2.SIFT_create(
+        nfeatures=PoseLimits.features, contrastThreshold=0.02
+    ).detectAndCompute(  # type: ignore[attr-defined]
         encoded, None
     )
     # OpenCV has its first pixel center at 0, COLMAP at 0.5.
@@ -119,7 +149,7 @@ def _neighbor_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     apart = apart / max(float(np.median(apart)), 1e-12) + 2 * (1 - axes @ axes.T)
     np.fill_diagonal(apart, np.inf)
-    near = np.argsort(apart, axis=1)[:, : min(NEIGHBORS, len(cameras) - 1)]
+    near = np.argsort(apart, axis=1)[:, : min(PoseLimits.neighbors, len(cameras) - 1)]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(near) for j in row})
 
 
@@ -138,8 +168,12 @@ def _pair_error(
         return None
     there = cv2.BFMatcher(cv2.NORM_L2).knnMatch(d1, d2, k=2)
     back = {m.queryIdx: m.trainIdx for m in cv2.BFMatcher(cv2.NORM_L2).match(d2, d1)}
-    matches = [m for m, n in there if m.distance < RATIO * n.distance and back.get(m.trainIdx) == m.queryIdx]
-    if len(matches) < FEWEST_MATCHES:
+    matches = [
+        m
+        for m, n in there
+        if m.distance < PoseLimits.ratio * n.distance and back.get(m.trainIdx) == m.queryIdx
+    ]
+    if len(matches) < PoseLimits.fewest_matches:
         return None
     p1 = np.concatenate([x1[[m.queryIdx for m in matches]], np.ones((len(matches), 1))], axis=1)
     p2 = np.concatenate([x2[[m.trainIdx for m in matches]], np.ones((len(matches), 1))], axis=1)
@@ -150,8 +184,8 @@ def _pair_error(
     length = np.sqrt((along1[:, :2] ** 2).sum(1) + (along2[:, :2] ** 2).sum(1))
     nowhere = np.full_like(value, np.inf)  # cameras in one place have no epipolar lines
     distance = np.divide(value, length, out=nowhere, where=length > 0) * np.sqrt(2)
-    near = distance < GATE_SHARE * float(np.hypot(first.camera.width, first.camera.height))
-    if near.sum() < FEWEST_MATCHES:
+    near = distance < PoseLimits.gate * float(np.hypot(first.camera.width, first.camera.height))
+    if near.sum() < PoseLimits.fewest_matches:
         return None
     return PairError(first.name, second.name, int(near.sum()), float(np.median(distance[near])) * factor)
 
@@ -163,16 +197,6 @@ def _fundamental(first: Camera, second: Camera) -> NDArray[np.float64]:
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     inner1, inner2 = (np.linalg.inv(camera.intrinsics.numpy()) for camera in (first, second))
     return np.asarray(inner2.T @ cross @ rotation @ inner1)
-
-
-TYPICAL_PX = 2.0
-"""Median epipolar error in stored pixels above which a capture gets a warning."""
-VIEW_PX = 2.0
-"""The same of one view."""
-STANDS_OUT = 2.5
-"""A view also has to be this many times worse than the median view."""
-GAP_DEG = 25.0
-FEW_VIEWS = 20
 
 
 def pose_check(capture: Capture) -> Check:
@@ -189,7 +213,9 @@ def pose_check(capture: Capture) -> Check:
         figures: dict[str, Any] = {"views": {}, "without_pose": len(missing)}
         return Check("poses", "warning" if missing else "n/a", finding, remedy, missing, figures)
     typical = float(np.median(list(errors.values())))
-    bad = tuple(name for name, e in errors.items() if e > max(VIEW_PX, STANDS_OUT * typical))
+    bad = tuple(
+        name for name, e in errors.items() if e > max(PoseLimits.view_px, PoseLimits.stands_out * typical)
+    )
     finding = f"Matches lie {typical:.2f} px from their epipolar lines (median view of {len(errors)})."
     verdict: Verdict = "warning" if bad or missing else "ok"
     remedies = []
@@ -199,8 +225,8 @@ def pose_check(capture: Capture) -> Check:
     if missing:
         finding += f" Without a pose: {len(missing)} views ({listed(list(missing))})."
         remedies.append("Remove the pictures of views without a pose, which train refuses, or register them.")
-    if typical > TYPICAL_PX:
-        verdict = "wrong" if typical > 2 * TYPICAL_PX else "warning"
+    if typical > PoseLimits.typical_px:
+        verdict = "wrong" if typical > 2 * PoseLimits.typical_px else "warning"
         remedies.append("Refine the model (bundle adjustment), and check that it belongs to these pictures.")
     figures = {"median_px": typical, "views": errors, "without_pose": len(missing)}
     return Check("poses", verdict, finding, " ".join(remedies), (*bad, *missing), figures)
@@ -225,9 +251,9 @@ def coverage_check(capture: Capture) -> Check:
         f"(median; at most {nearest.max():.0f}°), "
         f"within {spread:.0f}° of their mean direction."
     )
-    lonely = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > GAP_DEG)
+    lonely = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > PoseLimits.gap)
     outcome = first_outcome(
-        (not lonely and len(directions) >= FEW_VIEWS, "ok", finding, ""),
+        (not lonely and len(directions) >= PoseLimits.few_views, "ok", finding, ""),
         (
             True,
             "warning",
@@ -236,12 +262,6 @@ def coverage_check(capture: Capture) -> Check:
         ),
     )
     return Check("coverage", *outcome, lonely, figures)
-
-
-SURE = 0.98
-"""Probability from which on ``auto`` is content with the points."""
-FEWEST_TO_TRAIN = 8
-RUN_FOLDER = "short_run"
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,8 +367,8 @@ def _shots(
     with reporter.track("matching features", 1):
         checks += [pose_check(capture), lens_check(capture), coverage_check(capture)]
     needed = "The angles are checked by a short training, which"
-    if len(capture.posed) < FEWEST_TO_TRAIN:
-        findings = ShotFindings(why=f"{needed} takes {FEWEST_TO_TRAIN} views with a pose.")
+    if len(capture.posed) < PoseLimits.fewest_to_train:
+        findings = ShotFindings(why=f"{needed} takes {PoseLimits.fewest_to_train} views with a pose.")
     elif settings.normals == "points":
         findings = ShotFindings(why=f"{needed} --normals points leaves out.")
     else:
@@ -377,13 +397,13 @@ def _angles(
     """Return order, sense and zero by the available geometry; and the pixels with normals if there are any."""
     sources: list[OrderEvidence] = []
     pixels = None
-    trains = settings.normals != "points" and len(capture.posed) >= FEWEST_TO_TRAIN
+    trains = settings.normals != "points" and len(capture.posed) >= PoseLimits.fewest_to_train
     if capture.model is not None and len(capture.posed) >= 2:
         with reporter.track("weighing points", 1):
             evidence, pixels = point_evidence(capture.posed, capture.model, index, pairing)
         sources.append(evidence)
         if settings.normals == "auto" and evidence.usable:
-            trains = trains and max(posterior(evidence).probabilities) < SURE
+            trains = trains and max(posterior(evidence).probabilities) < PoseLimits.sure
         if trains:
             pixels = _trained_pixels(capture, out, settings, pairing, index, backend, reporter)
             sources.append(normal_evidence(pixels, index))

@@ -18,11 +18,11 @@ from polarguide.capture.checks import MeasuredGains, measured_gains, pair_moment
 from polarguide.capture.view import ANGLES, FULL_CODE, listed
 from polarguide.inspection.angles import AngleFindings
 from polarguide.inspection.capture import POLARIZED, Capture, ViewMeasurements
-from polarguide.inspection.evidence import ZENITH_MARGIN, SurfaceSamples
+from polarguide.inspection.evidence import EvidenceLimits, SurfaceSamples
 from polarguide.inspection.settings import LCD_TEST, Check, Verdict, first_outcome
 
 
-class Limits:
+class PictureLimits:
     """Thresholds of the checks.
 
     Attributes:
@@ -72,7 +72,7 @@ def find_pairing(capture: Capture) -> int | None:
     if (
         exposed is not None
         and exposed.pairing is not None
-        and max(exposed.errors) < Limits.exposed_unequal / 3
+        and max(exposed.errors) < PictureLimits.exposed_unequal / 3
     ):
         return exposed.pairing  # whatever the exposures are
     medians = np.median(residuals, axis=0)
@@ -126,7 +126,7 @@ def _majority(views: Sequence[str], measurements: Sequence[ViewMeasurements]) ->
 
 def _pairs(measurements: Sequence[ViewMeasurements], pairing: int | None) -> Check:
     error = float(np.median([r.sum_error for r in measurements]))
-    off = () if pairing else tuple(r.view for r in measurements if r.sum_error > Limits.pair_error)
+    off = () if pairing else tuple(r.view for r in measurements if r.sum_error > PictureLimits.pair_error)
     outcome = first_outcome(
         (
             pairing,
@@ -138,7 +138,7 @@ def _pairs(measurements: Sequence[ViewMeasurements], pairing: int | None) -> Che
         (
             off,
             _majority(off, measurements),
-            f"I0 + I90 and I45 + I135 differ by more than {Limits.pair_error:.0%} of S0 in {len(off)} views "
+            f"I0 + I90 and I45 + I135 differ by more than {PictureLimits.pair_error:.0%} of S0 in {len(off)} views "
             f"({listed(list(off))}).",
             "Check whether something moved or the light changed between the shots, or whether files were exchanged.",
         ),
@@ -158,12 +158,12 @@ def _encoding(capture: Capture, pairing: int | None) -> Check:
         return Check("encoding", "n/a", f"The curvature of the response cannot be measured: {why}.")
     curvature = found.value
     bend = abs(curvature)
-    sure = bend > Limits.sure_bend * found.error
+    sure = bend > PictureLimits.sure_bend * found.error
     doubtful, certain = np.abs(checks.ENCODED if curvature < 0 else checks.DECODED)
     finding = (
         f"Curvature of the response {curvature:+.2f}; linear files have 0, sRGB read as linear about -0.6."
     )
-    verdict: Verdict = "wrong" if bend > certain or (sure and bend > Limits.bent) else "warning"
+    verdict: Verdict = "wrong" if bend > certain or (sure and bend > PictureLimits.bent) else "warning"
     outcome = first_outcome(
         (bend <= doubtful and not (sure and bend > checks.BENT), "ok", finding, ""),
         (
@@ -190,23 +190,25 @@ def _exposure(
     if not known or pairing not in (None, 0):
         return Check("exposure", "n/a", "The pair sums cannot be compared.")
     ratio = float(np.median(list(known.values())))
-    off = tuple(view for view, of_view in known.items() if abs(of_view - ratio) > Limits.unsteady)
+    off = tuple(view for view, of_view in known.items() if abs(of_view - ratio) > PictureLimits.unsteady)
     figures: dict[str, Any] = {"pair_ratio": ratio, "unsteady_views": len(off)}
     finding = f"(I0 + I90) / (I45 + I135) is {ratio:.3f} (median); ideal analyzers have 1."
     verdict: Verdict = "ok"
     remedy = ""
-    if abs(ratio - 1) > Limits.unequal:
-        verdict = "wrong" if abs(ratio - 1) > Limits.very_unequal else "warning"
+    if abs(ratio - 1) > PictureLimits.unequal:
+        verdict = "wrong" if abs(ratio - 1) > PictureLimits.very_unequal else "warning"
         finding += f" If only one picture deviates, it does by {2 * abs(ratio - 1):.0%}."
         remedy = (
             "Let prepare estimate the gains (it does by default), or measure them on unpolarized light and give "
             "--calibration. The pair sums do not show which of the four deviates."
         )
-    if exposed is not None and np.ptp(exposed.logs) > max(Limits.exposed_unequal, 3 * max(exposed.errors)):
+    if exposed is not None and np.ptp(exposed.logs) > max(
+        PictureLimits.exposed_unequal, 3 * max(exposed.errors)
+    ):
         gains = np.exp(exposed.logs).tolist()
         figures["exposures"] = gains
         if verdict != "wrong":
-            wrong = np.ptp(exposed.logs) > max(Limits.exposed_very_unequal, 3 * max(exposed.errors))
+            wrong = np.ptp(exposed.logs) > max(PictureLimits.exposed_very_unequal, 3 * max(exposed.errors))
             verdict = "wrong" if wrong else "warning"
         each = ", ".join(f"{angle}°: {gain:.2f}" for angle, gain in zip(ANGLES, gains, strict=True))
         finding += f" Pixel by pixel, they agree if the angles were exposed by {each}."
@@ -216,9 +218,7 @@ def _exposure(
         )
     if off:
         verdict = "warning" if verdict == "ok" else verdict
-        finding += (
-            f" It differs by more than {Limits.unsteady:.0%} in {len(off)} views ({listed(list(off))})."
-        )
+        finding += f" It differs by more than {PictureLimits.unsteady:.0%} in {len(off)} views ({listed(list(off))})."
         remedy = remedy or "Look for automatic exposure, flicker, or motion between the shots."
     return Check("exposure", verdict, finding, remedy, off, figures)
 
@@ -230,7 +230,7 @@ def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> C
     dark = float(np.mean([r.dark for r in measurements]))
     largest = max(view.peak for view in capture.views)
     unscaled = capture.bits == 16 and 0 < largest < (FULL_CODE + 1) // 16
-    off = () if unscaled else tuple(view for view, share in lost.items() if share > Limits.saturated)
+    off = () if unscaled else tuple(view for view, share in lost.items() if share > PictureLimits.saturated)
     finding = (
         f"{np.mean(shares):.1%} of the pixels are at full scale, at most {max(shares):.1%} in a view; "
         f"{invalid:.1%} are marked invalid, {dark:.1%} are too dark to be used."
@@ -245,8 +245,8 @@ def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> C
         (not off, "ok", finding, ""),
         (
             off,
-            "wrong" if np.mean(list(lost.values())) > Limits.blown else "warning",
-            f"{finding} Over {Limits.saturated:.0%} are lost in {len(off)} views ({listed(list(off))}).",
+            "wrong" if np.mean(list(lost.values())) > PictureLimits.blown else "warning",
+            f"{finding} Over {PictureLimits.saturated:.0%} are lost in {len(off)} views ({listed(list(off))}).",
             "These pixels carry no polarization and are excluded. Invalid ones may have clipped in the camera: expose "
             "shorter, keep lamps out of the picture.",
         ),
@@ -259,7 +259,9 @@ def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
     share = float(np.median([r.noise_share for r in measurements]))
     bright = float(np.median([r.bright for r in measurements]))
     off = tuple(
-        r.view for r in measurements if r.noise_share > Limits.noisy or r.bright < Limits.underexposed
+        r.view
+        for r in measurements
+        if r.noise_share > PictureLimits.noisy or r.bright < PictureLimits.underexposed
     )
     finding = (
         f"Noise of one intensity is {share:.2%} of the photograph (median, after averaging down), so that a DoLP "
@@ -270,7 +272,7 @@ def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
         (not off, "ok", finding, ""),
         (
             off,
-            _majority(off, measurements) if bright < Limits.underexposed else "warning",
+            _majority(off, measurements) if bright < PictureLimits.underexposed else "warning",
             f"{finding} Dark or noisy: {len(off)} views ({listed(list(off))}).",
             "Use a longer exposure at the lowest gain, or average several shots.",
         ),
@@ -295,7 +297,7 @@ def with_noise(angles: AngleFindings, measurements: Sequence[ViewMeasurements]) 
 
 def _brightness(measurements: Sequence[ViewMeasurements]) -> Check:
     bright = float(np.median([r.bright for r in measurements]))
-    off = tuple(r.view for r in measurements if r.bright < Limits.underexposed)
+    off = tuple(r.view for r in measurements if r.bright < PictureLimits.underexposed)
     finding = f"The 99th percentile of the values is {bright:.0%} of full scale (median view)."
     dark = f"{finding} Dark: {len(off)} views ({listed(list(off))})."
     outcome = first_outcome(
@@ -314,9 +316,9 @@ def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
         f"the median DoLP is {median:.3f}."
     )
     outcome = first_outcome(
-        (share >= Limits.little, "ok", finding, ""),
+        (share >= PictureLimits.little, "ok", finding, ""),
         (
-            (strongest < POLARIZED or share < Limits.almost_none) and noise < POLARIZED,
+            (strongest < POLARIZED or share < PictureLimits.almost_none) and noise < POLARIZED,
             "wrong",
             "No modulation: was the filter reversed, or missing? The four pictures show the same light but for "
             f"noise; 99 % of the pixels (median view) have a DoLP under {strongest:.3f}, and {share:.1%} one above "
@@ -325,7 +327,7 @@ def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
         ),
         (
             True,
-            "wrong" if share < Limits.almost_none else "warning",
+            "wrong" if share < PictureLimits.almost_none else "warning",
             finding,
             "Polarization carries little information here. Photograph surfaces obliquely (50 to 65 degrees), from "
             "lower views; check that the filter is a linear polarizer, the right way round, and that the exposure was "
@@ -353,7 +355,7 @@ def dielectric_check(
         figures["unexplained"] = share
         finding += f"{share:.0%} of pixels with a normal have a DoLP above the maximum of both lobes at their zenith."
     outcome = first_outcome(
-        (share <= Limits.not_dielectric, "ok", finding, ""),
+        (share <= PictureLimits.not_dielectric, "ok", finding, ""),
         (
             True,
             "warning",
@@ -367,7 +369,7 @@ def dielectric_check(
 
 def exceeds_dielectric(pixels: SurfaceSamples, index: float) -> torch.Tensor:
     """Whether the DoLP exceeds that of specular and diffuse light at every zenith within the margin, [N] bool."""
-    steps = torch.linspace(-ZENITH_MARGIN, ZENITH_MARGIN, 7)
+    steps = EvidenceLimits.zenith_margin * torch.linspace(-1, 1, 7)
     zenith = (pixels.zenith[:, None] + steps).clamp(0, math.pi / 2)
     most = torch.maximum(optics.specular_dolp(zenith, index), optics.diffuse_dolp(zenith, index)).amax(dim=1)
     return pixels.dolp > most + 3 * pixels.noise

@@ -39,7 +39,7 @@ RECIPE = "polarguide-stokes"
 """Recipe of the short training."""
 
 
-class Limits:
+class ShotLimits:
     """Thresholds of the checks.
 
     Attributes:
@@ -96,7 +96,7 @@ class ShotFindings:
     @property
     def rotation(self) -> CommonRotation:
         """Sense and zero of the stated angles by the pictures that determine their angle."""
-        if len(self.telling) < Limits.fewest:
+        if len(self.telling) < ShotLimits.fewest:
             return NO_ROTATION
         return common_rotation([j.angle for j, _ in self.telling], [angle for _, angle in self.telling])
 
@@ -205,7 +205,7 @@ def pictures_check(capture: Capture) -> Check:
             "some views through a filter would improve layers and normals.",
         ),
         (
-            not unknown and len(angles) < Limits.few_angles,
+            not unknown and len(angles) < ShotLimits.few_angles,
             "warning",
             finding,
             "Turn the filter between shots: with at least three angles, spread over half a turn, no direction of "
@@ -224,7 +224,7 @@ def agreement_checks(capture: Capture) -> list[Check]:
     for view in capture.views:
         places = [k for k, exposure in enumerate(view.exposures) if exposure.angle is not None]
         exposures = tuple(view.exposures[k] for k in places)
-        if len(places) < Limits.redundant or not determine_stokes(exposures):
+        if len(places) < ShotLimits.redundant or not determine_stokes(exposures):
             continue
         files = capture.layout.files(view.name)
         samples = SetSamples(
@@ -305,7 +305,7 @@ def _modulation(findings: ShotFindings) -> Check:
 
 
 def _sense(findings: ShotFindings, sense: int | None) -> Check:
-    if len(findings.telling) < Limits.fewest:
+    if len(findings.telling) < ShotLimits.fewest:
         return Check("handedness", *findings.undecided)
     stated = np.radians([angle for _, angle in findings.telling])
     alike = max(abs(np.exp(1j * times * stated).mean()) for times in (2, 4)) > SAME_DIRECTION
@@ -330,8 +330,8 @@ def _zero(findings: ShotFindings, rotation: CommonRotation) -> Check:
         return Check("zero_offset", *findings.undecided)
     finding = f"The zero of the filter lies at {offset:+.1f}° ± {error:.1f}° from where it is stated to lie."
     warning, wrong = (
-        abs(offset) > tolerance(floor, error, sigmas=Limits.sigmas)
-        for floor in (Limits.zero_off, Limits.zero_wrong)
+        abs(offset) > tolerance(floor, error, sigmas=ShotLimits.sigmas)
+        for floor in (ShotLimits.zero_off, ShotLimits.zero_wrong)
     )
     outcome = first_outcome(
         (not warning, "ok", finding, ""),
@@ -355,7 +355,7 @@ def _each(findings: ShotFindings, rotation: CommonRotation) -> Check:
         doubts = verdict == "n/a" and 2 * doubtful > unknown
         outcome = first_outcome(
             (
-                len(findings.telling) >= Limits.fewest,
+                len(findings.telling) >= ShotLimits.fewest,
                 "wrong",
                 "The pictures contradict the stated angles.",
                 CHAOS,
@@ -373,11 +373,11 @@ def _each(findings: ShotFindings, rotation: CommonRotation) -> Check:
         (j, angle, abs(angle_difference(j.angle, sense * angle + offset))) for j, angle in findings.telling
     ]
     typical = float(np.median([apart for _, _, apart in rows]))
-    certain = Limits.certain * float(np.median([j.modulation for j in findings.judgments]))
+    certain = ShotLimits.certain * float(np.median([j.modulation for j in findings.judgments]))
     off = [
         (j, angle)
         for j, angle, apart in rows
-        if apart > tolerance(Limits.contradicts, j.spread, typical, sigmas=Limits.sigmas)
+        if apart > tolerance(ShotLimits.contradicts, j.spread, typical, sigmas=ShotLimits.sigmas)
         and j.modulation > certain
         and not j.poorly_explained
     ]

@@ -18,7 +18,7 @@ from polarguide.inspection.capture import Capture
 from polarguide.inspection.settings import Check, first_outcome
 
 
-class Limits:
+class ViewLimits:
     """Thresholds of the checks.
 
     Attributes:
@@ -56,7 +56,10 @@ def view_exposure_check(capture: Capture) -> Check:
     changes = [f"{names[k]} {logs[k][np.abs(logs[k]).argmax()]:+.2f}" for k in strongest]
     remedy = "Training and evaluation divide each color of these views by its gain."
     if capture.keeps_gains:
-        remedy = "prepare --gains none left them. Prepare without it, and training divides each color of a view by its gain."
+        remedy = (
+            "prepare --gains none left them. Prepare without it, and training divides each color of a view by its "
+            "gain."
+        )
     outcome = first_outcome(
         (
             strongest,
@@ -66,7 +69,7 @@ def view_exposure_check(capture: Capture) -> Check:
             f"{remedy} Next time, fix exposure and white balance.",
         ),
         (
-            errors[0] > Limits.step,
+            errors[0] > ViewLimits.step,
             "not verified",
             f"The points that views have in common are too few to compare their exposures ({precision}).",
             "Add views between those there are.",
@@ -91,11 +94,11 @@ def lens_check(capture: Capture) -> Check:
         if (alone := _focal_length_alone(capture.model, view.name)) is not None
     }
     if len(found) < 3:
-        why = f"Fewer than 3 views have {Limits.fewest} points with their places in the pictures."
+        why = f"Fewer than 3 views have {ViewLimits.fewest} points with their places in the pictures."
         return Check("focal_lengths", "n/a", why)
     names = list(found)
     logs, errors = np.array(list(found.values())).T
-    off = significant(np.abs(logs), errors) & (np.abs(logs) > Limits.focal_differs)
+    off = significant(np.abs(logs), errors) & (np.abs(logs) > ViewLimits.focal_differs)
     usual = float(np.sqrt(np.mean(logs**2)))
     order = [int(k) for k in np.argsort(-np.abs(logs)) if off[k]]
     changes = listed([f"{names[k]} {math.expm1(logs[k]):+.1%}" for k in order])
@@ -106,7 +109,7 @@ def lens_check(capture: Capture) -> Check:
         (not order, "ok", finding, ""),
         (
             order,
-            "wrong" if np.abs(logs[off]).max(initial=0) > Limits.focal_wrong else "warning",
+            "wrong" if np.abs(logs[off]).max(initial=0) > ViewLimits.focal_wrong else "warning",
             f"{finding} It contradicts the model in {len(order)} views ({changes}).",
             "Poses are wrong where several cameras were taken for one: a telephone that changed its lens, a zoom, a "
             "crop. Prepare the original files, whose EXIF tells them apart, or bring a model with a camera for each.",
@@ -123,7 +126,7 @@ def _focal_length_alone(model: ColmapModel, view: str) -> tuple[float, float] | 
     distances of the deviation that they have.
     """
     pixels, places = model.correspondences(view)
-    if len(pixels) < Limits.fewest:
+    if len(pixels) < ViewLimits.fewest:
         return None
     camera = model.camera(view)
     local = places @ camera.rotation.numpy().T + camera.translation.numpy()
