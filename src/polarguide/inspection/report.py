@@ -11,16 +11,12 @@ import numpy as np
 from torch.nn.functional import max_pool2d
 
 from polarguide import __version__, optics
-from polarguide.capture.exposures import Exposure
 from polarguide.core.files import make_folder, write_text, write_whole
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import to_json
-from polarguide.inspection.angles import AngleFindings
 from polarguide.inspection.capture import InspectedView, ViewMeasurements, quantile
 from polarguide.inspection.inspect import Inspection
 from polarguide.inspection.settings import json_value
-from polarguide.inspection.shots import ShotFindings
-from polarguide.training.angles.polarizers import Judgment
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
 from polarguide.visualization.layers import AOLP_FULL_DOLP, DOLP_HIGH
@@ -123,7 +119,6 @@ def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
     """
     capture = inspection.capture
     settings = inspection.settings
-    angles = inspection.angles
     layers = LAYERS if capture.four else SHOT_LAYERS
     marked = {name for check in inspection.checks for name in check.views}
     tiles = []
@@ -141,7 +136,6 @@ def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
         title=f"Inspection of {capture.name}",
         summary=f"{len(capture.views)} views of {width} x {height} pixels, {capture.bits} bits; {posed}",
         found=inspection,
-        **_angle_values(angles),
         layers=layers,
         ramps={layer.ramp: figures.color_gradient(layer.ramp) for layer in layers if layer.ramp},
         wheel=data_uri(figures.angle_wheel(), "aolp", 2 * SIDE),
@@ -157,64 +151,32 @@ def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
     )
 
 
-def _angle_values(angles: AngleFindings | ShotFindings) -> dict[str, Any]:
-    """Return the values of the page's section on angles.
-
-    ``why`` explains missing results. ``orders`` has files, sense and zero, probability, and log-odds relative to the
-    best (empty for the best). ``shots`` has the stated and estimated angle of each picture. ``notes`` are sentences.
-    """
-    if isinstance(angles, ShotFindings):
-        rows = zip(angles.judgments, angles.stated, strict=True)
-        shots = [_shot_row(judgment, exposure) for judgment, exposure in rows]
-        return {"why": angles.why, "orders": [], "shots": shots, "notes": []}
-    found = angles.posterior
-    notes = [f"{e.source.capitalize()}{'' if e.usable else ' (not used)'}: {e.note}" for e in angles.sources]
-    if found is None:
-        why = "Not decided: this check needs poses and reflecting surfaces."
-        return {"why": why, "orders": [], "shots": [], "notes": notes}
-    zero = f"Zero offset beyond the best order: {found.offset:+.2f}° ± {found.offset_error:.2f}°."
-    orders = [
-        (", ".join(f"{angle}°" for angle in files), order.label, probability, f"{-log_odds:.1f}")
-        for order, files, probability, log_odds in angles.hypotheses
-    ]
-    orders[found.best] = (*orders[found.best][:3], "")
-    return {"why": "", "orders": orders, "shots": [], "notes": [zero, *notes]}
-
-
-def _shot_row(judgment: Judgment, exposure: Exposure) -> tuple[str, ...]:
-    """Return the cells of one picture: view, stated and estimated angle, spread, modulation and gain."""
-    angle = f"{judgment.angle:.0f}°"
-    if judgment.unfiltered:
-        angle = "without a filter, as it looks"
-    elif judgment.vague:
-        angle = "too little polarization to tell"
-    numbers = (f"{judgment.spread:.1f}°", f"{judgment.modulation:.2f}", f"{judgment.gain:.2f}")
-    return judgment.view, exposure.words, angle, *numbers
-
-
 def _figures(measurements: Sequence[ViewMeasurements]) -> list[tuple[str, ...]]:
     """Head and rows of the table of figures; single shots have fewer of them."""
     shots = any(r.exposures for r in measurements)
-    head = ("99 % under", "saturated", "invalid", "dark")
-    more = (
-        "noise",
-        "pair ratio",
-        "sum error",
-        "DoLP median",
-        "DoLP 99 %",
-        "polarized",
-        "above diffuse limit",
-    )
-    rows: list[tuple[str, ...]] = [("view", "pictures", *head) if shots else ("view", *head, *more)]
+    rows = []
     for r in measurements:
-        cells = (f"{r.bright:.3f}", f"{r.saturated:.2%}", f"{r.invalid:.2%}", f"{r.dark:.2%}")
-        if shots:
-            rows.append((r.view, r.exposures or "0, 45, 90, 135", *cells))
-            continue
-        ratio = "n/a" if r.pair_ratio is None else f"{r.pair_ratio:.4f}"
-        further = (ratio, f"{r.sum_error:.2%}", f"{r.dolp[0]:.3f}", f"{r.dolp[1]:.3f}", f"{r.polarized:.1%}")
-        rows.append((r.view, *cells, f"{r.noise_share:.2%}", *further, f"{r.above_limit:.1%}"))
-    return rows
+        row = {
+            "view": r.view,
+            "pictures": r.exposures or "0, 45, 90, 135",
+            "99 % under": f"{r.bright:.3f}",
+            "saturated": f"{r.saturated:.2%}",
+            "invalid": f"{r.invalid:.2%}",
+            "dark": f"{r.dark:.2%}",
+        }
+        if not shots:
+            del row["pictures"]
+            row |= {
+                "noise": f"{r.noise_share:.2%}",
+                "pair ratio": "n/a" if r.pair_ratio is None else f"{r.pair_ratio:.4f}",
+                "sum error": f"{r.sum_error:.2%}",
+                "DoLP median": f"{r.dolp[0]:.3f}",
+                "DoLP 99 %": f"{r.dolp[1]:.3f}",
+                "polarized": f"{r.polarized:.1%}",
+                "above diffuse limit": f"{r.above_limit:.1%}",
+            }
+        rows.append(row)
+    return [tuple(rows[0]), *(tuple(row.values()) for row in rows)]
 
 
 SCHEMA = 2
