@@ -18,7 +18,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from polarguide.capture import checks
 from polarguide.capture.angle_evidence import ORDERS
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.geometry.polarizer import ANGLES
@@ -38,11 +37,8 @@ def altered(capture: Capture, change: Change) -> Capture:
         values = change(view.intensities().numpy())
         codes = np.rint(np.clip(values, 0, 1) * 65535).astype(np.uint16)
         saturated = view.saturated.numpy() | (codes == 65535).any(axis=(0, 3))
-        measures = checks.measure(codes, ~(view.invalid.numpy() | saturated))
         views.append(
-            dataclasses.replace(
-                view, codes=torch.from_numpy(codes), saturated=torch.from_numpy(saturated), measures=measures
-            )
+            dataclasses.replace(view, codes=torch.from_numpy(codes), saturated=torch.from_numpy(saturated))
         )
     return dataclasses.replace(capture, views=tuple(views))
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.capture import ColmapModel, checks
+from polarguide.capture import ColmapModel
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.polarizer import ANGLES
@@ -77,7 +77,6 @@ def pictures_of(
             torch.zeros(HEIGHT, WIDTH, dtype=torch.bool),
             torch.zeros(HEIGHT, WIDTH, dtype=torch.bool),
             camera,
-            checks.Measures(0.0, (0.0, 0.0, 0.0), np.zeros(5)),
             60000,
         ),
         values.numpy(),
@@ -87,8 +86,7 @@ def pictures_of(
 def with_intensities(view: InspectedView, values: np.ndarray) -> InspectedView:
     """A view with other pictures."""
     codes = np.rint(np.clip(values, 0, 1) * 65535).astype(np.uint16)
-    usable = ~(view.invalid | view.saturated).numpy()
-    return dataclasses.replace(view, codes=torch.from_numpy(codes), measures=checks.measure(codes, usable))
+    return dataclasses.replace(view, codes=torch.from_numpy(codes))
 
 
 def mistaken(view: InspectedView, *, files: tuple[int, ...] = ANGLES, zero: float = 0.0) -> InspectedView:

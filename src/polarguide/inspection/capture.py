@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.capture import checks
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import ColmapModel, read_model
 from polarguide.capture.exposures import FOUR, Exposure
@@ -52,7 +51,6 @@ class InspectedView:
         invalid, saturated: as in ``View``, [H, W] bool.
         black: pixels that are 0 in all angles; they count as ``saturated``, too.
         camera: at the size of ``codes``, or None.
-        measures: what ``capture.checks`` measures on them.
         peak: largest stored value.
         exposures: what the pictures are.
     """
@@ -63,7 +61,6 @@ class InspectedView:
     saturated: Tensor
     black: Tensor
     camera: Camera | None
-    measures: checks.Measures
     peak: int
     exposures: tuple[Exposure, ...] = FOUR
 
@@ -185,7 +182,6 @@ def _inspected(stored: StoredViews, number: int) -> InspectedView:
         saturated=torch.from_numpy(item.saturated(stored.full_scale)),
         black=torch.from_numpy(item.black),
         camera=stored.cameras[number],
-        measures=stored.measures[number],
         peak=int(item.peak.max()),
         exposures=item.exposures,
     )

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from polarguide import __version__
-from polarguide.capture import box_filter, checks
+from polarguide.capture import box_filter
 from polarguide.capture.angle_evidence import swaps
 from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented
 from polarguide.capture.colmap.files import MODELS
@@ -350,16 +350,10 @@ def _as_named(
 
 
 def _corrected_view(view: InspectedView, matrices: NDArray[np.float32]) -> InspectedView:
-    codes = view.codes.numpy().astype(np.float32)
+    stored = view.codes.numpy().astype(np.float32)
     weights = matrices if matrices.ndim == 5 else matrices[..., None]
-    done = np.stack([sum(weights[k, j] * codes[j] for j in range(4)) for k in range(4)])
+    done = np.stack([sum(weights[k, j] * stored[j] for j in range(4)) for k in range(4)])
     over = (done > FULL_CODE).any(axis=(0, 3))
     saturated = view.saturated | torch.from_numpy(over)
-    corrected_codes = np.rint(np.clip(done, 0, FULL_CODE)).astype(np.uint16)
-    usable = ~(view.invalid | saturated).numpy()
-    return replace(
-        view,
-        codes=torch.from_numpy(corrected_codes),
-        saturated=saturated,
-        measures=checks.measure(corrected_codes, usable),
-    )
+    codes = np.rint(np.clip(done, 0, FULL_CODE)).astype(np.uint16)
+    return replace(view, codes=torch.from_numpy(codes), saturated=saturated)

@@ -64,7 +64,9 @@ class PictureLimits:
 
 def find_pairing(capture: Capture) -> int | None:
     """The pairs of perpendicular pictures by their sums, an index into ``PAIRINGS``; None if they do not decide."""
-    residuals = np.array([view.measures.residuals for view in capture.views])
+    residuals = np.array(
+        [checks.measure(view.codes.numpy(), view.usable.numpy()).residuals for view in capture.views]
+    )
     residuals = residuals[residuals.max(axis=1) > 0]
     if len(residuals) == 0:
         return None

@@ -231,11 +231,13 @@ class Polarizers:
         """Specified and assumed angles of each picture; empty before the first fit."""
         if self.table is None:
             return []
-        common = self._common_gain()
-        fits = [self._judged(fit) for fit in self._latest()]
+        common = self._common_gain(self.table[-1])
+        # The fits of the latest search that has any; those of earlier ones are worse.
+        ends = itertools.accumulate(map(len, self._rounds), initial=0)
+        latest = self.table[max(end for end in ends if end < len(self.table)) :]
+        fits = zip(*map(self._judged, latest), strict=True)
         judgments = []
-        for rows, poor in zip(zip(*fits, strict=True), self._unexplained(), strict=True):
-            specified = rows[0].specified
+        for rows, poor in zip(fits, _unexplained(self.table[-1]), strict=True):
             telling = [row for row in rows if row.tells] or [row for row in rows if row.guesses]
             judgment = replace((telling or rows)[-1], unexplained=poor)
             if telling:
@@ -247,7 +249,9 @@ class Polarizers:
             if wrong := [row for row in rows if row.contradicts]:
                 judgment = replace(wrong[-1], unexplained=poor)
             judgments.append(
-                judgment if specified.known else replace(judgment, believed=_belief(judgment, common))
+                judgment
+                if judgment.specified.known
+                else replace(judgment, believed=_belief(judgment, common))
             )
         return [replace(judgment, overruled=self._overruled(judgment, judgments)) for judgment in judgments]
 
@@ -278,27 +282,9 @@ class Polarizers:
         usual = median(offs) if offs else 0.0
         return [replace(row, usual=usual) for row in rows]
 
-    def _latest(self) -> Tensor:
-        """The fits of the latest search that has any; those of earlier ones are worse."""
-        assert self.table is not None
-        ends = itertools.accumulate(map(len, self._rounds), initial=0)
-        return self.table[max(end for end in ends if end < len(self.table)) :]
-
-    def _unexplained(self) -> list[float]:
-        """Of each picture what ``Judgment.unexplained`` says; 0 where there was nothing to go by."""
-        assert self.table is not None
-        misfit, across, counted = self.table[-1, :, -3:].unbind(1)
-        measured = counted > 0
-        middle = misfit[measured].median() if bool(measured.any()) else misfit.new_ones(())
-        relative = misfit**2 / (middle * across).clamp(min=1e-12)
-        values: list[float] = torch.where(measured, relative, torch.zeros_like(relative)).tolist()
-        return values
-
-    def _common_gain(self) -> float | None:
+    def _common_gain(self, fit: Tensor) -> float | None:
         """The gain that others are relative to; None where gains differ as little as those of locked exposures."""
-        assert self.table is not None
-        last = zip(self._places, self.table[-1], strict=True)
-        rows = [row for (view, k), row in last if not view.exposures[k].known]
+        rows = [row for (view, k), row in zip(self._places, fit, strict=True) if not view.exposures[k].known]
         gains = [float(row[1]) for row in rows if row[-1]]
         if len(gains) < self._rules.fewest:
             return None
@@ -307,11 +293,10 @@ class Polarizers:
         return middle if spread > self._rules.locked else None
 
     def _beliefs(self) -> dict[str, tuple[Exposure, ...]]:
-        believed: dict[str, list[Exposure]] = {}
-        views = {view.name: view for view in self._views}
+        judged = [] if self.table is None else self._places
+        believed = {view.name: list(view.exposures) for view, _ in judged}
         for judgment in self.judgments():
-            exposures = believed.setdefault(judgment.view, list(views[judgment.view].exposures))
-            exposures[judgment.number] = judgment.believed
+            believed[judgment.view][judgment.number] = judgment.believed
         return {name: tuple(exposures) for name, exposures in believed.items()}
 
 
@@ -323,6 +308,14 @@ def predicts_filters(recipe: Recipe) -> bool:
 def search_steps(recipe: Recipe, settings: ResolvedSettings) -> int:
     """Steps of the schedule by which unknown angles are sought before a training begins; 0: it does not begin again."""
     return min(recipe.angle_rules.search_steps, settings.steps) if settings.begin_again else 0
+
+
+def _unexplained(fit: Tensor) -> list[float]:
+    """Return ``Judgment.unexplained`` of each picture by a fit [P, 8]; 0 for unfitted pictures."""
+    misfit, across, counted = fit[:, -3:].unbind(1)
+    middle = misfit[counted > 0].median() if bool(counted.any()) else misfit.new_ones(())
+    values: list[float] = (misfit**2 / (middle * across).clamp(min=1e-12)).tolist()
+    return values
 
 
 def _belief(judgment: Judgment, common: float | None) -> Exposure:
