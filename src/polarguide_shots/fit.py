@@ -76,20 +76,13 @@ class SetModel:
 
     def _drop_outliers(self, gray: Array, fit: PixelFit) -> None:
         """Leave out the sample that is off most, pixel by pixel, while one is off by more than noise is."""
+        doubled = self._squares * np.float32([[1], [2], [2], [1], [2], [1]])
         at = np.flatnonzero(fit.determined)
         while at.size:
-            weights = fit.weights[:, at]
-            picked = gray[:, at]
             # Of four samples nobody can tell which is wrong: all are equally far off.
-            testable = (weights > 0).sum(axis=0) >= 5
-            at = at[testable]
-            weights = weights[:, testable]
-            picked = picked[:, testable]
-            if not at.size:
-                return
-            off = picked - self.rows @ fit.stokes[:, at]
-            doubled = self._squares.copy()
-            doubled[[1, 2, 4]] *= 2
+            at = at[(fit.weights[:, at] > 0).sum(axis=0) >= 5]
+            weights = fit.weights[:, at]
+            off = gray[:, at] - self.rows @ fit.stokes[:, at]
             leverage = weights * (doubled.T @ fit.covariance[:, at])
             far = off**2 * weights / np.maximum(1 - leverage, 1e-3)
             worst = far.argmax(axis=0)
@@ -98,12 +91,9 @@ class SetModel:
             weights[worst[beyond], np.arange(beyond.size)] = 0
             determined = self._determined((weights > 0).astype(np.float32))
             weights = weights[:, determined]
-            beyond = beyond[determined]
-            at = at[beyond]
-            picked = picked[:, beyond]
-            if at.size:
-                fit.weights[:, at] = weights
-                fit.stokes[:, at], fit.covariance[:, at] = self._solve(weights, picked)
+            at = at[beyond[determined]]
+            fit.weights[:, at] = weights
+            fit.stokes[:, at], fit.covariance[:, at] = self._solve(weights, gray[:, at])
 
     def _determined(self, usable: Array) -> NDArray[np.bool_]:
         """Whether the samples that are used, [K, N] of 0 and 1, determine a Stokes vector well, [N]."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,14 +23,18 @@ from polarguide.capture.exposures import (
     angles_of_names,
     conditioning,
     covers_turn,
-    files_of,
     nominal,
     normalized,
     parse_angle,
-    read_table,
 )
 from polarguide.capture.filter.consecutive import VIDEO_SUFFIXES
-from polarguide.capture.filter.shots import SHOT_SUFFIXES, angle_order, group_files, views_of_names
+from polarguide.capture.filter.shots import (
+    SHOT_SUFFIXES,
+    angle_order,
+    group_files,
+    listed_pictures,
+    views_of_names,
+)
 from polarguide.capture.layout import ambiguous, list_files
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
@@ -253,25 +257,12 @@ def by_table(root: Path) -> tuple[list[ExposureSet], list[Path]]:
         PolarguideError: the table cannot be read, or names files outside of the folder or of other kinds.
     """
     table = root / TABLE
-    lines = read_table(table)
-    base = root.resolve()
-    files = dict(zip((line.file for line in lines), files_of(root, table, lines), strict=True))
-    for line in lines:
-        path = files[line.file]
-        inside = path.resolve().is_relative_to(base)
-        if not inside or path.suffix.lower() not in SHOT_SUFFIXES:
-            raise PolarguideError(
-                f"{table} (line {line.number})",
-                expected=f"a picture in {root} ({', '.join(SHOT_SUFFIXES)})",
-                found=line.file,
-                remedy="Copy or convert the file, or remove the line.",
-            )
-    views: dict[str, list[Line]] = {}
-    for line, view in zip(lines, _views_of(root, lines), strict=True):
-        views.setdefault(view, []).append(line)
-    taken = {path.resolve() for path in files.values()}
-    others = [path for path in list_files(root, SHOT_SUFFIXES) if path.resolve() not in taken]
-    return [_of_lines(files, table, view, mine) for view, mine in sorted(views.items())], others
+    rows, others = listed_pictures(root, table)
+    lines = [line for line, _ in rows]
+    views: dict[str, list[SetPicture]] = {}
+    for (line, path), view in zip(rows, _views_of(root, lines), strict=True):
+        views.setdefault(view, []).append(SetPicture(path, line.angle, line.gain))
+    return [_of_table(table, view, mine) for view, mine in sorted(views.items())], others
 
 
 def _views_of(root: Path, lines: Sequence[Line]) -> list[str]:
@@ -286,17 +277,18 @@ def _views_of(root: Path, lines: Sequence[Line]) -> list[str]:
     return [of_file[line.file] if line.view is None else line.view for line in lines]
 
 
-def _of_lines(files: Mapping[str, Path], table: Path, view: str, lines: Sequence[Line]) -> ExposureSet:
-    pictures = [SetPicture(files[line.file], line.angle, line.gain) for line in lines]
+def _of_table(table: Path, view: str, pictures: Sequence[SetPicture]) -> ExposureSet:
+    """Return the set of a view's pictures; a missing file is its fault."""
     there = [picture for picture in pictures if picture.path.is_file()]
-    fault = None
-    if missing := [picture.path for picture in pictures if picture not in there]:
-        fault = PolarguideError(
-            table,
-            expected=f"the file {missing[0]}",
-            found="nothing of this name",
-            remedy="Correct the file's name in the table, or remove its line.",
-        )
+    missing = next((picture.path for picture in pictures if not picture.path.is_file()), None)
+    if missing is None:
+        return _exposure_set(view, there, table)
+    fault = PolarguideError(
+        table,
+        expected=f"the file {missing}",
+        found="nothing of this name",
+        remedy="Correct the file's name in the table, or remove its line.",
+    )
     return _exposure_set(view, there, table, fault)
 
 

@@ -96,13 +96,9 @@ class CommonRotation(NamedTuple):
         error: standard error of the offset in degrees.
     """
 
-    sense: int | None
-    offset: float
-    error: float
-
-
-NO_ROTATION = CommonRotation(None, 0.0, math.inf)
-"""Result for estimates that agree with no rotation."""
+    sense: int | None = None
+    offset: float = 0.0
+    error: float = math.inf
 
 
 def common_rotation(estimated: Sequence[float], stated: Sequence[float]) -> CommonRotation:
@@ -114,7 +110,7 @@ def common_rotation(estimated: Sequence[float], stated: Sequence[float]) -> Comm
     sense = 1 if alike or abs(turns[1].mean()) >= abs(turns[-1].mean()) else -1
     turn = turns[sense]
     if abs(turn.mean()) < ALIKE:
-        return NO_ROTATION
+        return CommonRotation()
     # The mean, then once more without the outliers.
     near = turn[np.abs(np.angle(turn / turn.mean())) < math.radians(2 * OUTLYING)]
     apart = np.degrees(np.angle(near / near.mean())) / 2

@@ -16,7 +16,6 @@ import numpy as np
 
 from polarguide.capture import Scene
 from polarguide.capture.angle_evidence import (
-    NO_ROTATION,
     SAME_DIRECTION,
     CommonRotation,
     angle_difference,
@@ -97,7 +96,7 @@ class ShotFindings:
     def rotation(self) -> CommonRotation:
         """Sense and zero of the stated angles by the pictures that determine their angle."""
         if len(self.telling) < ShotLimits.fewest:
-            return NO_ROTATION
+            return CommonRotation()
         return common_rotation([j.angle for j, _ in self.telling], [angle for _, angle in self.telling])
 
     @property

@@ -303,7 +303,7 @@ def find_single_shots(
         return _checked(root, _all_alike(root, angles, each)), []
     if angles is not None or table.exists():
         table = Path(angles) if angles is not None else table
-        return _checked(root, _by_table(root, table, read_table(table))), [table]
+        return _checked(root, _by_table(root, table)), [table]
     files = list_files(root, SHOT_SUFFIXES)
     shots = [
         SingleShot(path, stem, angle)
@@ -363,20 +363,36 @@ def _all_alike(root: Path, angles: str, each: int) -> list[SingleShot]:
     ]
 
 
-def _by_table(root: Path, table: Path, lines: Sequence[Line]) -> list[SingleShot]:
-    """The photographs that a table lists: all that there are.
+def listed_pictures(root: Path, table: Path) -> tuple[list[tuple[Line, Path]], list[Path]]:
+    """Return the lines of a table with the picture of each, and the pictures of the folder without a line.
 
     Raises:
-        PolarguideError: one does not exist or is not listed.
+        PolarguideError: the table cannot be read, or names files outside of the folder or of other kinds.
     """
-    base = root.resolve()
+    lines = read_table(table)
+    rows = list(zip(lines, files_of(root, table, lines), strict=True))
+    for line, path in rows:
+        if not path.resolve().is_relative_to(root.resolve()) or path.suffix.lower() not in SHOT_SUFFIXES:
+            raise PolarguideError(
+                f"{table} (line {line.number})",
+                expected=f"a picture in {root} ({', '.join(SHOT_SUFFIXES)})",
+                found=line.file,
+                remedy="Copy or convert the file, or remove the line.",
+            )
+    taken = {path.resolve() for _, path in rows}
+    return rows, [path for path in list_files(root, SHOT_SUFFIXES) if path.resolve() not in taken]
+
+
+def _by_table(root: Path, table: Path) -> list[SingleShot]:
+    """Return the photographs that a table lists.
+
+    Raises:
+        PolarguideError: a photograph does not exist or is not listed.
+    """
+    rows, without = listed_pictures(root, table)
     shots: list[SingleShot] = []
     alone: dict[str, Path] = {}
-    for line, path in zip(lines, files_of(root, table, lines), strict=True):
-        if not path.resolve().is_relative_to(base):
-            raise PolarguideError(
-                table, expected=f"files in {root}", found=line.file, remedy="Copy the file there."
-            )
+    for line, path in rows:
         if not path.is_file():
             raise PolarguideError(
                 table,
@@ -384,26 +400,15 @@ def _by_table(root: Path, table: Path, lines: Sequence[Line]) -> list[SingleShot
                 found="nothing of this name",
                 remedy="Correct the name, or remove the line.",
             )
-        if path.suffix.lower() not in SHOT_SUFFIXES:
-            raise PolarguideError(
-                table,
-                expected=f"names of pictures ({', '.join(SHOT_SUFFIXES)})",
-                found=line.file,
-                remedy="Remove its line from the table, or convert the file to one of these formats.",
-            )
         stem = stem_of(path)
-        if line.view is None and stem in alone:
+        if line.view is None and alone.setdefault(stem, path) is not path:
             raise ambiguous(root, f"one photograph called {stem}", alone[stem], path)
-        if line.view is None:
-            alone[stem] = path
         shots.append(SingleShot(path, line.view or stem, line.angle, line.gain))
-    taken = {shot.path.resolve() for shot in shots}
-    without = [path.name for path in list_files(root, SHOT_SUFFIXES) if path.resolve() not in taken]
     if without:
         raise PolarguideError(
             table,
             expected="a line for every photograph in the folder",
-            found=f"none for {len(without)} ({listed(without)})",
+            found=f"none for {len(without)} ({listed([path.name for path in without])})",
             remedy="Add the lines (angle unknown if it was not noted), or move the photographs away.",
         )
     return shots
