@@ -22,7 +22,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.angle_evidence import jackknife_error
+from polarguide.capture.angle_evidence import angle_difference, jackknife_error
 from polarguide.capture.view import FULL_CODE, listed
 from polarguide.geometry.polarizer import ANGLES
 
@@ -165,12 +165,13 @@ def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], tr
     swapped = False
     if off:
         pairs = np.median(list(off.values()), axis=0)
-        hint = "Probably files are swapped, or the transfer is wrong"
         best = int(pairs.argmin())
-        if best:
-            swap = ("45 and 90 (or 0 and 135)", "90 and 135 (or 0 and 45)")[best - 1]
-            hint = f"The pictures at {swap} degrees are probably swapped"
-            swapped = len(off) * 2 > len(names)
+        swapped = best > 0 and len(off) * 2 > len(names)
+        hint = (
+            "Probably files are swapped, or the transfer is wrong",
+            "The pictures at 45 and 90 (or 0 and 135) degrees are probably swapped",
+            "The pictures at 90 and 135 (or 0 and 45) degrees are probably swapped",
+        )[best]
         warnings.append(
             f"I0 + I90 differs from I45 + I135 by {pairs[0]:.1%} of S0 (median) in {len(off)} of "
             f"{len(names)} views ({listed(list(off))}); a sound capture stays under {_RESIDUAL:.0%}. {hint}."
@@ -204,7 +205,7 @@ def right_pairs(angles: Sequence[object]) -> list[tuple[int, int]]:
     while free:
         place, angle = next(iter(free.items()))
         del free[place]
-        other = next((k for k, at in free.items() if abs((at - angle) % 180 - 90) <= _RIGHT), None)
+        other = next((k for k, at in free.items() if abs(angle_difference(at, angle + 90)) <= _RIGHT), None)
         if other is not None:
             del free[other]
             pairs.append((place, other))

@@ -47,16 +47,15 @@ def correction(capture: Capture, angles: AngleFindings) -> Calibration | None:
     Raises:
         PolarguideError: the order is not decided.
     """
-    files = angles.files
-    if files is None:
+    if angles.files is None:
         raise PolarguideError(
             capture.root,
             expected="a decided order of the angles",
             found="an order that geometry does not decide",
             remedy="Nothing was written. The report says what to do; --order of prepare sets it by hand.",
         )
-    zero = round(angles.offset, 2) if angles.offset is not None else 0.0
-    return None if files == ANGLES and zero == 0.0 else Calibration(order=files, zero=zero)
+    change = Calibration(order=angles.files, zero=round(angles.offset or 0.0, 2))
+    return None if change == Calibration() else change
 
 
 def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Reporter = SILENT) -> str:
@@ -94,12 +93,11 @@ def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Report
 
 def describe_correction(change: Calibration) -> str:
     """Describe a correction."""
-    parts = []
-    if change.order != ANGLES:
-        parts.append(f"the files were renamed ({swaps(change.order)})")
-    if change.zero:
-        parts.append(f"the Stokes vectors were rotated by {change.zero:+.2f}°")
-    return " and ".join(parts)
+    parts = {
+        f"the files were renamed ({swaps(change.order)})": change.order != ANGLES,
+        f"the Stokes vectors were rotated by {change.zero:+.2f}°": change.zero != 0.0,
+    }
+    return " and ".join(part for part, changed in parts.items() if changed)
 
 
 def _write(capture: Capture, change: Calibration, folder: Path, reporter: Reporter) -> None:
@@ -107,10 +105,9 @@ def _write(capture: Capture, change: Calibration, folder: Path, reporter: Report
     for name in _COPIED:
         source = capture.root / name
         _require_inside(capture.root, source)
-        if source.is_dir():
-            shutil.copytree(source, folder / name)
-        elif source.exists():
-            shutil.copy2(source, folder / name)
+        if source.exists():
+            copy = shutil.copytree if source.is_dir() else shutil.copy2
+            copy(source, folder / name)
     with reporter.track("fixing", len(capture.layout.names)) as advance:
         for done, view in enumerate(capture.layout.names, 1):
             if change.zero:
@@ -247,18 +244,19 @@ def corrected(capture: Capture, path: Path) -> Capture:
         )
     calibration.require_sensor(notes.sensor, path)
     applied = capture.applied
-    if (applied is None and notes.prepare is not None) or (applied is not None and not applied.permutes):
+    turned = notes.prepare is not None if applied is None else not applied.permutes
+    if turned:
         raise PolarguideError(
             capture.root,
             expected="angles in steps of 45 degrees from those of the sensor",
             found="a scene whose zero was turned",
             remedy=_REMEDY,
         )
-    known: dict[Any, NDArray[np.float32]] = {}
+    known: dict[bytes, NDArray[np.float32]] = {}
     views = []
     for view in capture.views:
         prepared = None if notes.prepare is None else notes.prepare.views.get(view.name)
-        key = None if prepared is None else msgspec.json.encode(prepared)
+        key = msgspec.json.encode(prepared)
         if key not in known:
             matrices = _as_named(
                 _matrices(calibration, notes, prepared, capture, view.name), applied, notes.gains
