@@ -380,12 +380,11 @@ def photograph_digest(scene: Scene) -> str:
     digest = hashlib.sha256(scene.points.numpy().tobytes())
     for view in scene.train_views:
         camera = view.camera
-        digest.update(view.codes.to(torch.int32).sum(dim=0).numpy().tobytes())
-        digest.update(view.invalid.numpy().tobytes())
-        digest.update(camera.rotation.numpy().tobytes() + camera.translation.numpy().tobytes())
-        digest.update(repr((view.name, camera.fx, camera.fy, camera.cx, camera.cy)).encode())
-        if view.exposures != FOUR:
-            digest.update(repr(view.exposures).encode())
+        photograph = view.codes.to(torch.int32).sum(dim=0)
+        for tensor in (photograph, view.invalid, camera.rotation, camera.translation):
+            digest.update(tensor.numpy().tobytes())
+        others = "" if view.exposures == FOUR else repr(view.exposures)
+        digest.update(f"{(view.name, camera.fx, camera.fy, camera.cx, camera.cy)}{others}".encode())
     return digest.hexdigest()
 
 

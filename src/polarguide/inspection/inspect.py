@@ -109,13 +109,11 @@ def epipolar_errors(capture: Capture) -> list[PairError]:
     """Match every posed view with its nearest neighbors in position and viewing direction."""
     views = capture.posed
     features = [_features(view) for view in views]
-    pairs = _neighbor_pairs([view.camera for view in views if view.camera is not None])
-    errors = []
-    for i, j in pairs:
-        error = _pair_error(views[i], views[j], features[i], features[j], capture.factor)
-        if error is not None:
-            errors.append(error)
-    return errors
+    errors = (
+        _pair_error(views[i], views[j], features[i], features[j], capture.factor)
+        for i, j in _neighbor_pairs([view.camera for view in views if view.camera is not None])
+    )
+    return [error for error in errors if error is not None]
 
 
 def view_errors(errors: Sequence[PairError]) -> dict[str, float]:
@@ -131,11 +129,8 @@ def _features(view: InspectedView) -> tuple[NDArray[np.float64], NDArray[np.floa
     gray = view.codes.numpy().astype(np.float64).mean(axis=(0, 3))
     top = max(float(np.percentile(gray, 99.5)), 1.0)
     encoded = (255 * np.clip(gray / top, 0, 1) ** (1 / 2.2)).astype(np.uint8)
-    keypoints, descriptors = cv2.SIFT_create(
-        nfeatures=PoseLimits.features, contrastThreshold=0.02
-    ).detectAndCompute(  # type: ignore[attr-defined]
-        encoded, None
-    )
+    sift = cv2.SIFT_create(nfeatures=PoseLimits.features, contrastThreshold=0.02)  # type: ignore[attr-defined]
+    keypoints, descriptors = sift.detectAndCompute(encoded, None)
     # OpenCV has its first pixel center at 0, COLMAP at 0.5.
     places = np.array([point.pt for point in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
     return places, None if descriptors is None else np.sqrt(
@@ -166,8 +161,9 @@ def _pair_error(
     assert second.camera is not None
     if d1 is None or d2 is None or min(len(d1), len(d2)) < 2:
         return None
-    there = cv2.BFMatcher(cv2.NORM_L2).knnMatch(d1, d2, k=2)
-    back = {m.queryIdx: m.trainIdx for m in cv2.BFMatcher(cv2.NORM_L2).match(d2, d1)}
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    there = matcher.knnMatch(d1, d2, k=2)
+    back = {m.queryIdx: m.trainIdx for m in matcher.match(d2, d1)}
     matches = [
         m
         for m, n in there

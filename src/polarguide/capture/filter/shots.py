@@ -209,21 +209,20 @@ def read_stack(
         PolarguideError: one cannot be read, or they differ in size, depth or orientation.
     """
     pictures: list[NDArray[Any]] = []
-    codes: list[int] = []
+    first_code = None
     for path in paths:
         picture, code = _read_shot(path, gains)
-        if pictures:
-            require_alike(path, picture, paths[0], pictures[0])
         pictures.append(picture)
-        codes.append(code)
-        if codes[-1] != codes[0]:
+        first_code = first_code or code
+        require_alike(path, picture, paths[0], pictures[0])
+        if code != first_code:
             raise PolarguideError(
                 path,
-                expected=f"EXIF orientation {codes[0]} like {paths[0].name}",
-                found=str(codes[-1]),
+                expected=f"EXIF orientation {first_code} like {paths[0].name}",
+                found=str(code),
                 remedy="Keep the camera still between the shots of a view, or export all with the same settings.",
             )
-    return stacked(np.stack(pictures), codes[0], lossy=is_lossy(paths[0]), levels=levels)
+    return stacked(np.stack(pictures), code, lossy=is_lossy(paths[0]), levels=levels)
 
 
 def stacked(
@@ -235,16 +234,13 @@ def stacked(
         orientation: EXIF's. lossy: whether they were compressed. levels: as for ``read_stack``.
     """
     full = int(np.iinfo(stack.dtype).max)
-    full = round(_LOSSY_FULL * full) if lossy else full
-    if levels is not None:
-        full = min(full, levels.saturation)
+    limit = round(_LOSSY_FULL * full) if lossy else full
     # By the largest of the three colors, written out: NumPy reduces a last axis of three slowly.
     top = np.maximum(np.maximum(stack[..., 0], stack[..., 1]), stack[..., 2])
-    clipped = np.asarray(top >= full)
-    lit = np.asarray(top.any(axis=0))
-    if levels is not None and levels.white != np.iinfo(stack.dtype).max:
-        stack = rescaled(stack, levels.white)
-    return Shots(stack, orientation, clipped, ~lit)
+    if levels is not None:
+        limit = min(limit, levels.saturation)
+        stack = stack if levels.white == full else rescaled(stack, levels.white)
+    return Shots(stack, orientation, np.asarray(top >= limit), ~top.any(axis=0))
 
 
 def _read_shot(path: Path, gains: tuple[float, float, float]) -> tuple[NDArray[Any], int]:
