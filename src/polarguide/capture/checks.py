@@ -26,15 +26,48 @@ from polarguide.capture.angle_evidence import angle_difference, jackknife_error
 from polarguide.capture.view import FULL_CODE, listed
 from polarguide.geometry.polarizer import ANGLES
 
-TOP_SHARE = 0.02
-"""Share of the code range, from its top, in the histogram for ``full_scale``."""
-_FULL_SHARE = 0.002
-_DARK = 0.01
-_BLOWN_SHARE = 0.1
-_LOW_CODE = FULL_CODE // 256
-_SAMPLES = 20_000
-_RESIDUAL = 0.05
-# Curvature (see Measures) of encoded data taken as linear is about -0.6, of linear data decoded as sRGB about
+
+class CheckLimits:
+    """Constants of the checks.
+
+    Attributes:
+        top_share: share of the code range, from its top, in the histogram for ``full_scale``.
+        full_share: share of the code range, from its top, in which values can be full scale.
+        dark: 99th percentile of the intensities below which a view is almost black.
+        blown: share of saturated pixels above which a view is heavily saturated.
+        low_code: code below which quantization hides the polarization.
+        samples: largest number of pixels of a view that are measured.
+        residual: residual of the pair sums of a sound capture, as a share of S0.
+        right_angle: degrees by which two angles may differ from right ones: a pair sum is then off by two percent of
+            the polarized light.
+        other_exposure: difference of logarithms from which on exposures differ: half of a third of a stop, the step of
+            cameras.
+        sure: standard errors that count as certain.
+        tiles: tiles of a picture in each direction, for jackknife errors.
+        hidden: share of the largest value below which read-out noise hides the polarization.
+        fewest: number of pixels that a regression needs.
+        least_spread: standard deviation of the regressor that a regression needs.
+        moment_samples: largest number of pixels of a view for second moments.
+    """
+
+    top_share = 0.02
+    full_share = 0.002
+    dark = 0.01
+    blown = 0.1
+    low_code = FULL_CODE // 256
+    samples = 20_000
+    residual = 0.05
+    right_angle = 1.0
+    other_exposure = math.log(2.0) / 6
+    sure = 3.0
+    tiles = 4
+    hidden = 0.01
+    fewest = 1000
+    least_spread = 0.005
+    moment_samples = 1 << 18
+
+
+# Curvature (see ``pair_slopes``) of encoded data taken as linear is about -0.6, of linear data decoded as sRGB about
 # +0.3; the gain differences of real sensors leave less than 0.1.
 ENCODED = (-0.12, -0.25)
 """Curvatures below which files seem encoded: for a doubt, and for a decision."""
@@ -68,7 +101,7 @@ def sampled(codes: NDArray[Any]) -> NDArray[Any]:
 
 def _step(pixels: int) -> int:
     """Distance of the pixels that are measured."""
-    return max(1, math.ceil(math.sqrt(pixels / _SAMPLES)))
+    return max(1, math.ceil(math.sqrt(pixels / CheckLimits.samples)))
 
 
 def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_], *, four: bool = True) -> Measures:
@@ -84,7 +117,7 @@ def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_], *, four: bool 
     bright = float(np.percentile(sample, 99.0)) / FULL_CODE
     gray = sample.mean(axis=3)
     usable = usable[::step, ::step]
-    angles = gray[:, usable & (gray.min(axis=0) > _LOW_CODE)]
+    angles = gray[:, usable & (gray.min(axis=0) > CheckLimits.low_code)]
     if not four or angles.shape[1] < 16:
         return Measures(bright, (0.0, 0.0, 0.0), [])
     i0, i45, i90, i135 = angles
@@ -97,7 +130,7 @@ def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_], *, four: bool 
 def top_histogram(raw: NDArray[Any]) -> NDArray[np.int64]:
     """Counts of the stored values in the top 2 % of their range, the last for the largest possible value."""
     full = int(np.iinfo(raw.dtype).max)
-    low = full - int(full * TOP_SHARE)
+    low = full - int(full * CheckLimits.top_share)
     return np.bincount(raw[raw >= low].astype(np.int64) - low, minlength=full - low + 1)
 
 
@@ -121,7 +154,7 @@ def full_scale(histogram: NDArray[np.int64], full: int) -> int | None:
         return value
     near = int(histogram[:top].max(initial=0))
     piled_up = histogram[top] >= 3 and histogram[top] > 3 * near
-    return value if value >= full * (1.0 - _FULL_SHARE) and piled_up else None
+    return value if value >= full * (1.0 - CheckLimits.full_share) and piled_up else None
 
 
 def exposure_warnings(
@@ -143,13 +176,13 @@ def exposure_warnings(
             f"The pictures are 16-bit files, yet no value exceeds {largest}: they look like unscaled {bits}-bit "
             f"data. Multiply the values by {2 ** (16 - bits)}."
         ]
-    dark = [name for name, measure in zip(names, measures, strict=True) if measure.bright < _DARK]
+    dark = [name for name, measure in zip(names, measures, strict=True) if measure.bright < CheckLimits.dark]
     if dark:
         warnings.append(
-            f"{len(dark)} of {len(names)} views are almost black: 99% of their values are under {_DARK:.0%} "
+            f"{len(dark)} of {len(names)} views are almost black: 99% of their values are under {CheckLimits.dark:.0%} "
             f"of full scale ({listed(dark)}). Expose longer, or leave them out."
         )
-    over = [name for name, share in zip(names, blown, strict=True) if share > _BLOWN_SHARE]
+    over = [name for name, share in zip(names, blown, strict=True) if share > CheckLimits.blown]
     if over:
         warnings.append(
             f"{len(over)} of {len(names)} views are heavily saturated: up to {max(blown):.0%} of the pixels "
@@ -174,7 +207,7 @@ def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], tr
         )[best]
         warnings.append(
             f"I0 + I90 differs from I45 + I135 by {pairs[0]:.1%} of S0 (median) in {len(off)} of "
-            f"{len(names)} views ({listed(list(off))}); a sound capture stays under {_RESIDUAL:.0%}. {hint}."
+            f"{len(names)} views ({listed(list(off))}); a sound capture stays under {CheckLimits.residual:.0%}. {hint}."
         )
     curvature = curvature_of([tile for measure in measures for tile in measure.slopes])
     if swapped or curvature is None:  # the slope is meaningless with wrong pairs
@@ -194,21 +227,19 @@ def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], tr
 
 FOUR_PAIRS = ((0, 2), (1, 3))
 """Places of the perpendicular pictures among four at 0, 45, 90 and 135 degrees."""
-_RIGHT = 1.0
-"""Degrees by which two angles may differ from right ones: a pair sum is off by two percent of the polarized light."""
 
 
 def right_pairs(angles: Sequence[object]) -> list[tuple[int, int]]:
     """Places of pictures that lie at right angles to one another, each in one pair; words are no angles."""
-    free = {place: angle for place, angle in enumerate(angles) if isinstance(angle, int | float)}
+    free = [(place, angle) for place, angle in enumerate(angles) if isinstance(angle, int | float)]
     pairs = []
     while free:
-        place, angle = next(iter(free.items()))
-        del free[place]
-        other = next((k for k, at in free.items() if abs(angle_difference(at, angle + 90)) <= _RIGHT), None)
+        place, angle = free.pop(0)
+        allowed = CheckLimits.right_angle
+        other = next((one for one in free if abs(angle_difference(one[1], angle + 90)) <= allowed), None)
         if other is not None:
-            del free[other]
-            pairs.append((place, other))
+            free.remove(other)
+            pairs.append((place, other[0]))
     return pairs
 
 
@@ -221,11 +252,11 @@ class Curvature:
 
     def surely_below(self, limit: float) -> bool:
         """Return true if the curvature is below a limit by more than three standard errors."""
-        return self.value + _SURE * self.error < limit
+        return self.value + CheckLimits.sure * self.error < limit
 
     def surely_above(self, limit: float) -> bool:
         """Return true if the curvature is above a limit by more than three standard errors."""
-        return self.value - _SURE * self.error > limit
+        return self.value - CheckLimits.sure * self.error > limit
 
 
 def pair_slopes(
@@ -246,14 +277,14 @@ def pair_slopes(
     if len(pairs) < 2:
         return []
     gray = codes.mean(axis=3, dtype=np.float64)
-    usable = usable & (gray.min(axis=0) > _LOW_CODE)
-    rows, columns = (np.arange(size) * _TILES // size for size in usable.shape)
-    tile = (rows[:, None] * _TILES + columns)[usable]
+    usable = usable & (gray.min(axis=0) > CheckLimits.low_code)
+    rows, columns = (np.arange(size) * CheckLimits.tiles // size for size in usable.shape)
+    tile = (rows[:, None] * CheckLimits.tiles + columns)[usable]
     first, second = (gray[:, usable][[pair[side] for pair in pairs]] for side in (0, 1))
     s0 = (first + second).mean(axis=0)
     sums = (first + second) / s0
     polarized = (first - second) / s0
-    tiles = np.zeros((_TILES**2, 3))
+    tiles = np.zeros((CheckLimits.tiles**2, 3))
     for one, other in itertools.combinations(range(len(pairs)), 2):
         taken_off = np.stack([np.ones_like(s0), polarized[one], polarized[other]], axis=1)
         both = np.stack([polarized[one] ** 2 - polarized[other] ** 2, sums[one] - sums[other]], axis=1)
@@ -266,7 +297,7 @@ def pair_slopes(
 def curvature_of(tiles: Sequence[NDArray[np.float64]]) -> Curvature | None:
     """Return the curvature of the response by the ``pair_slopes`` of all views; None with too little polarization."""
     total = np.sum(tiles, axis=0)
-    if len(tiles) < 2 or total[0] < _FEWEST or total[1] < total[0] * _LEAST_SPREAD**2:
+    if len(tiles) < 2 or total[0] < CheckLimits.fewest or total[1] < total[0] * CheckLimits.least_spread**2:
         return None
     value = total[2] / total[1]
     without = total - np.stack(tiles)
@@ -289,18 +320,7 @@ def encoding(found: Curvature | None) -> Literal["linear", "srgb"] | None:
 def _is_off(residuals: tuple[float, float, float]) -> bool:
     """Whether the residual of the named pairing is large, or much larger than that of another pairing."""
     right, *others = residuals
-    return right > _RESIDUAL or (right > 0.4 * _RESIDUAL and min(others) < 0.25 * right)
-
-
-OTHER_EXPOSURE = math.log(2.0) / 6
-"""Difference of logarithms from which on exposures differ: half of a third of a stop, the step of cameras."""
-_SURE = 3.0
-_TILES = 4
-# Of the largest value; read-out noise hides the polarization of darker pixels.
-_HIDDEN = 0.01
-_FEWEST = 1000
-_LEAST_SPREAD = 0.005
-_MOMENT_SAMPLES = 1 << 18
+    return right > CheckLimits.residual or (right > 0.4 * CheckLimits.residual and min(others) < 0.25 * right)
 
 
 @dataclass(frozen=True)
@@ -330,7 +350,7 @@ class MeasuredGains:
         deviations = {}
         for place, angle in enumerate(ANGLES):
             apart = off[place] - float(np.median(off[:place] + off[place + 1 :]))
-            if abs(apart) > max(OTHER_EXPOSURE, _SURE * max(self.errors)):
+            if abs(apart) > max(CheckLimits.other_exposure, CheckLimits.sure * max(self.errors)):
                 deviations[angle] = math.exp(apart)
         return deviations
 
@@ -341,15 +361,15 @@ def pair_moments(gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> 
     Args:
         gray: linear intensities [4, H, W]. usable: [H, W].
     """
-    step = max(1, math.ceil(math.sqrt(usable.size / _MOMENT_SAMPLES)))
+    step = max(1, math.ceil(math.sqrt(usable.size / CheckLimits.moment_samples)))
     gray = gray[:, ::step, ::step].astype(np.float64)
     usable = usable[::step, ::step]
     total = gray.sum(axis=0)
-    usable = usable & (total > 4 * _HIDDEN * float(gray.max(initial=0)))
+    usable = usable & (total > 4 * CheckLimits.hidden * float(gray.max(initial=0)))
     rows = np.where(usable, gray / np.where(usable, total, 1.0), 0.0)
     tiles = []
-    for band in np.array_split(np.concatenate([rows, usable[None]]), _TILES, axis=1):
-        for part in np.array_split(band, _TILES, axis=2):
+    for band in np.array_split(np.concatenate([rows, usable[None]]), CheckLimits.tiles, axis=1):
+        for part in np.array_split(band, CheckLimits.tiles, axis=2):
             flat = part[:4].reshape(4, -1)
             tiles.append(np.vstack([flat @ flat.T, [part[4].sum()] * 4]))
     return np.stack(tiles)
@@ -365,7 +385,7 @@ def measured_gains(moments: NDArray[np.float64]) -> MeasuredGains | None:
         None where too few pixels are bright enough.
     """
     moments = moments[moments[:, 4, 0] > 0]
-    if len(moments) < 2 or moments[:, 4, 0].sum() < _FEWEST:
+    if len(moments) < 2 or moments[:, 4, 0].sum() < CheckLimits.fewest:
         return None
     total = moments.sum(axis=0)
     vector = _least(total)

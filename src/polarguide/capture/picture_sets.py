@@ -20,20 +20,28 @@ from polarguide.capture.view import FULL_CODE
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
-MARKS = 2.0
-"""Degrees to which a ring is set by its marks: an angle that is off by less is not called wrong."""
-AGAINST = 4.0
-"""Times the typical difference of the other pictures from which on one contradicts them."""
-BRIGHTER = 0.03
-"""Share of the light from which on a picture that contradicts the others is called brighter, or darker."""
-MOST_PIXELS = 20_000
-"""Most pixels of a set that are compared."""
-FEWEST_PIXELS = 200
-"""Number of pixels from which on pictures are compared."""
-_TELLING = 1.0
-"""Degrees of standard error up to which the light tells a picture's angle."""
-_OVER_NOISE = 3.0
-"""Times what noise alone makes of it, from which on a variation of the polarization over the picture is one."""
+
+
+class SetLimits:
+    """Constants of the comparison of pictures.
+
+    Attributes:
+        marks: degrees to which a ring is set by its marks. A smaller difference is not called wrong.
+        against: times the typical residual of the other pictures from which on a picture contradicts them.
+        brighter: share of the light from which on a contradicting picture is called brighter or darker.
+        most_pixels: largest number of pixels of a set that are compared.
+        fewest_pixels: number of pixels from which on pictures are compared.
+        determined: standard error in degrees up to which the light determines a picture's angle.
+        over_noise: times the noise from which on the polarization varies over the picture.
+    """
+
+    marks = 2.0
+    against = 4.0
+    brighter = 0.03
+    most_pixels = 20_000
+    fewest_pixels = 200
+    determined = 1.0
+    over_noise = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +160,7 @@ def chosen_pixels(samples: SetSamples) -> tuple[NDArray[Any], NDArray[Any]]:
     for lost in samples.lost:
         good &= ~lost
     places = np.flatnonzero(good)
-    places = places[:: max(1, len(places) // MOST_PIXELS)]
+    places = places[:: max(1, len(places) // SetLimits.most_pixels)]
     return np.unravel_index(places, good.shape)  # type: ignore[return-value]
 
 
@@ -169,7 +177,7 @@ def judge(samples: SetSamples, gray: Floats) -> SetJudgment:
     count = len(samples.labels)
     used = np.ones(count, bool)
     reasons: dict[int, str] = {}
-    while gray.shape[1] >= FEWEST_PIXELS:
+    while gray.shape[1] >= SetLimits.fewest_pixels:
         predicted = _predictions(samples, gray, used, used)
         # Candidates: the picture with the largest residual, and the one with the largest error of its angle.
         doubtful = (
@@ -184,7 +192,7 @@ def judge(samples: SetSamples, gray: Floats) -> SetJudgment:
     notes = [reasons[k] for k in sorted(reasons)]
     final = _predictions(samples, gray, used, np.ones(count, bool))
     off_by = [final[k].off for k in np.flatnonzero(used).tolist() if final[k].angle is not None]
-    if count > 3 and off_by and np.median(off_by) > MARKS:
+    if count > 3 and off_by and np.median(off_by) > SetLimits.marks:
         notes.append(
             f"The angles contradict one another by {np.median(off_by):.0f} degrees (median); "
             f"{int(used.sum())} pictures do not tell which are wrong."
@@ -214,15 +222,18 @@ def _contradicts(samples: SetSamples, gray: Floats, used: Mask, worst: int, pred
     others = _predictions(samples, gray, rest, rest).values()
     typical = float(np.median([other.off for other in others]))
     left = float(np.median([other.residual for other in others]))
-    return predicted.off > tolerance(MARKS, 0.0, typical) or predicted.residual > AGAINST * left
+    return (
+        predicted.off > tolerance(SetLimits.marks, 0.0, typical)
+        or predicted.residual > SetLimits.against * left
+    )
 
 
 def _reason(samples: SetSamples, k: int, predicted: _Prediction) -> str:
     """Return the reason why a picture is rejected, for the user."""
     change = predicted.gain - 1
-    if predicted.angle is not None and predicted.off > MARKS:
+    if predicted.angle is not None and predicted.off > SetLimits.marks:
         reason = f"looks like {predicted.angle:.0f} degrees: its angle is probably wrong"
-    elif abs(change) > BRIGHTER:
+    elif abs(change) > SetLimits.brighter:
         way = "brighter" if change > 0 else "darker"
         reason = f"is {abs(change):.0%} {way} than the others predict (exposure or light)"
     else:
@@ -271,11 +282,11 @@ def _predicted(rows: Floats, gray: Floats, others: Mask, k: int, stated: float) 
     form = forms[:, best]
     slope = 2 * np.array([0.0, -form[2], form[1]])
     spread = float(slope @ moments @ slope - (slope @ moments @ form) ** 2 / along[best])
-    certain = spread > _OVER_NOISE * float(slope @ extra @ slope) and spread > 0
+    certain = spread > SetLimits.over_noise * float(slope @ extra @ slope) and spread > 0
     error = math.inf
     if certain:
         error = math.degrees(math.sqrt(noise * (1 + leverage) / (pixels * spread)) / float(gain[best]))
-    if error >= _TELLING:
+    if error >= SetLimits.determined:
         return _Prediction(None, error, 0.0, float(gain[best]), residual)
     angle = float(angles[best])
     return _Prediction(angle, error, abs(angle_difference(angle, stated)), float(gain[best]), residual)
