@@ -31,7 +31,7 @@ Array = NDArray[np.float32]
 
 
 @dataclass(eq=False)
-class PixelFit:
+class SetFit:
     """The fit of some pixels.
 
     Attributes:
@@ -62,7 +62,7 @@ class SetModel:
         """Variances [K, N] of the samples of Stokes vectors [3, N]."""
         return np.asarray(self._floor + self._slope * np.maximum(self.rows @ stokes, 0), np.float32)
 
-    def fit(self, gray: Array, lost: NDArray[np.bool_]) -> PixelFit:
+    def fit(self, gray: Array, lost: NDArray[np.bool_]) -> SetFit:
         """Fit pixels [K, N]: least squares, then with the variances that these predict, then without outliers."""
         usable = (~lost & self._used[:, None]).astype(np.float32)
         determined = self._determined(usable)
@@ -70,11 +70,11 @@ class SetModel:
         stokes, _ = self._solve(usable, gray)
         weights = usable / self.variances(stokes)
         stokes, covariance = self._solve(weights, gray)
-        fit = PixelFit(stokes, covariance, weights, determined)
+        fit = SetFit(stokes, covariance, weights, determined)
         self._drop_outliers(gray, fit)
         return fit
 
-    def _drop_outliers(self, gray: Array, fit: PixelFit) -> None:
+    def _drop_outliers(self, gray: Array, fit: SetFit) -> None:
         """Leave out the sample that is off most, pixel by pixel, while one is off by more than noise is."""
         doubled = self._squares * np.float32([[1], [2], [2], [1], [2], [1]])
         at = np.flatnonzero(fit.determined)

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from polarguide.capture.angle_evidence import (
-    FAILURE,
     ORDERS,
+    AngleLimits,
     OrderEvidence,
     OrderPosterior,
     combine,
@@ -60,7 +60,7 @@ def test_order_and_offset_are_found_with_their_error(sense: int, zero: float, be
     assert found.offset == pytest.approx(offset, abs=max(3 * found.offset_error, 0.1))
     assert 0.05 <= found.offset_error < 1.0
     assert sum(found.probabilities) == pytest.approx(1.0)
-    assert max(found.probabilities) == pytest.approx(1 - FAILURE * 7 / 8, abs=1e-3)
+    assert max(found.probabilities) == pytest.approx(1 - AngleLimits.failure * 7 / 8, abs=1e-3)
     assert found.sense_probability > 0.95 if sense > 0 else found.sense_probability < 0.05
 
 
@@ -71,8 +71,8 @@ def test_weak_evidence_decides_nothing() -> None:
 
 
 def some_odds(best: int, offset: float, error: float) -> OrderPosterior:
-    probabilities = [FAILURE / 8] * 8
-    probabilities[best] += 1 - FAILURE
+    probabilities = [AngleLimits.failure / 8] * 8
+    probabilities[best] += 1 - AngleLimits.failure
     against = [20.0] * 8
     against[best] = 0.0
     return OrderPosterior(tuple(against), tuple(probabilities), offset, error)

@@ -36,6 +36,32 @@ TO_DEVIATION = 1.4826
 """Standard deviation of normal errors over the median of their absolute values."""
 
 
+class AngleLimits:
+    """Constants of the models.
+
+    Attributes:
+        alike: smallest length of the mean of (cos 2d, sin 2d), with d the differences of angles, that gives a common
+            offset.
+        same_direction: length of the mean of doubled (or fourfold) stated angles above which they do not determine a
+            sense.
+        outlier: degrees from the mean difference beyond which a picture does not contribute to the common offset.
+        failure: prior probability that the model of a source of evidence does not hold (polarized light, ...).
+        cells: cells along the longest side of the box that contains the middle 90 % of the points.
+        least_error: smallest standard error of a zero in degrees; profiles have steps of one degree.
+        window: degrees around the zero of an order in which its maximum is searched.
+        groups: groups of clusters for jackknife errors.
+    """
+
+    alike = 0.4
+    same_direction = 0.95
+    outlier = 30.0
+    failure = 0.01
+    cells = 12
+    least_error = 0.05
+    window = 22
+    groups = 8
+
+
 def angle_difference(angle: Any, other: Any) -> Any:
     """Return the difference of two polarizer angles in degrees modulo 180, in [-90, 90)."""
     return (angle - other + 90.0) % 180.0 - 90.0
@@ -79,14 +105,6 @@ def mean_angle(angles: Sequence[float], spreads: Sequence[float], least_spread: 
     return mean, min(math.degrees(math.sqrt(-2 * math.log(length))) / 2, 90.0)
 
 
-ALIKE = 0.4
-"""Smallest length of the mean of (cos 2d, sin 2d), with d the differences of angles, that gives a common offset."""
-SAME_DIRECTION = 0.95
-"""Length of the mean of doubled (or fourfold) stated angles above which they do not determine a sense."""
-OUTLYING = 30.0
-"""Degrees from the mean difference beyond which a picture does not contribute to the common offset."""
-
-
 class CommonRotation(NamedTuple):
     """Sense and zero that turn stated angles into estimated ones: ``sense * stated + offset``.
 
@@ -106,13 +124,13 @@ def common_rotation(estimated: Sequence[float], stated: Sequence[float]) -> Comm
     found = np.radians(estimated)
     given = np.radians(stated)
     turns = {sense: np.exp(2j * (found - sense * given)) for sense in (1, -1)}
-    alike = abs(np.exp(2j * given).mean()) > SAME_DIRECTION
+    alike = abs(np.exp(2j * given).mean()) > AngleLimits.same_direction
     sense = 1 if alike or abs(turns[1].mean()) >= abs(turns[-1].mean()) else -1
     turn = turns[sense]
-    if abs(turn.mean()) < ALIKE:
+    if abs(turn.mean()) < AngleLimits.alike:
         return CommonRotation()
     # The mean, then once more without the outliers.
-    near = turn[np.abs(np.angle(turn / turn.mean())) < math.radians(2 * OUTLYING)]
+    near = turn[np.abs(np.angle(turn / turn.mean())) < math.radians(2 * AngleLimits.outlier)]
     apart = np.degrees(np.angle(near / near.mean())) / 2
     error = float(TO_DEVIATION * np.median(np.abs(apart)) / math.sqrt(len(near)) * 1.25)
     return CommonRotation(sense, float(np.degrees(np.angle(near.mean())) / 2), error)
@@ -163,14 +181,6 @@ def swaps(files: FileOrder) -> str:
 
 DEGREES = 180
 """Number of zeros in a profile, one per degree."""
-FAILURE = 0.01
-"""Prior probability that the model of a source of evidence does not hold for a capture (polarized light, ...)."""
-CELLS = 12
-"""Cells along the longest side of the box that contains the middle 90 % of the points."""
-LEAST_ERROR = 0.05
-"""Smallest standard error of a zero in degrees: profiles have steps of one degree."""
-_WINDOW = torch.arange(-22, 23)
-_GROUPS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +242,9 @@ def posterior(evidence: OrderEvidence) -> OrderPosterior:
     best = int(at_best.sum(dim=0).argmax())
     log_odds = tuple(tempered(at_best[:, best] - at_best[:, k]) for k in range(len(ORDERS)))
     weights = [math.exp(-value) for value in log_odds]
-    probabilities = tuple((1 - FAILURE) * w / sum(weights) + FAILURE / len(ORDERS) for w in weights)
+    probabilities = tuple(
+        (1 - AngleLimits.failure) * w / sum(weights) + AngleLimits.failure / len(ORDERS) for w in weights
+    )
     return OrderPosterior(log_odds, probabilities, *_offset(clusters[:, rows[best]], ORDERS[best].zero))
 
 
@@ -245,7 +257,7 @@ def combine(parts: Sequence[OrderPosterior]) -> OrderPosterior:
     product = np.prod([part.probabilities for part in parts], axis=0)
     best = int(product.argmax())
     agreeing = [part for part in parts if part.best == best] or parts
-    weights = [1 / max(part.offset_error, LEAST_ERROR) ** 2 for part in agreeing]
+    weights = [1 / max(part.offset_error, AngleLimits.least_error) ** 2 for part in agreeing]
     offset = sum(w * part.offset for w, part in zip(weights, agreeing, strict=True)) / sum(weights)
     return OrderPosterior(
         tuple((log_odds - log_odds.min()).tolist()),
@@ -267,7 +279,7 @@ def tempered(ratios: Tensor) -> float:
 
 def _peak(profile: Tensor, zero: int) -> int:
     """Return the position of the maximum of a profile [180] within 22 degrees of ``zero``."""
-    window = (_WINDOW + zero) % DEGREES
+    window = (torch.arange(-AngleLimits.window, AngleLimits.window + 1) + zero) % DEGREES
     return int(window[int(profile[window].argmax())])
 
 
@@ -275,11 +287,11 @@ def _offset(clusters: Tensor, zero: int) -> tuple[float, float]:
     """Return the best zero minus ``zero`` in degrees, and its standard error from neighboring groups of clusters."""
     total = clusters.sum(dim=0)
     estimate = _refined(total, zero)
-    groups = min(_GROUPS, len(clusters))
+    groups = min(AngleLimits.groups, len(clusters))
     if groups < 2:
         return estimate, math.inf
     without = [_refined(total - part.sum(dim=0), zero) for part in clusters.tensor_split(groups)]
-    return estimate, max(float(jackknife_error(estimate, without)), LEAST_ERROR)
+    return estimate, max(float(jackknife_error(estimate, without)), AngleLimits.least_error)
 
 
 def _refined(profile: Tensor, zero: int) -> float:
@@ -295,12 +307,12 @@ def spatial_cells(points: Tensor) -> Tensor:
     """Return the cell index of each point [N, 3] in a regular grid, [N] int64, from 0 up without gaps."""
     step = max(1, len(points) // 100_000)
     low, high = (torch.quantile(points[::step].double(), q, dim=0) for q in (0.05, 0.95))
-    side = float((high - low).max()) / CELLS
+    side = float((high - low).max()) / AngleLimits.cells
     if side <= 0:
         return torch.zeros(len(points), dtype=torch.int64)
     # Points far outside share one layer of cells: they are few.
-    numbers = ((points.double() - low) / side).floor().clamp(-1, CELLS + 1).long() + 1
-    key = (numbers[:, 0] * (CELLS + 3) + numbers[:, 1]) * (CELLS + 3) + numbers[:, 2]
+    numbers = ((points.double() - low) / side).floor().clamp(-1, AngleLimits.cells + 1).long() + 1
+    key = (numbers[:, 0] * (AngleLimits.cells + 3) + numbers[:, 1]) * (AngleLimits.cells + 3) + numbers[:, 2]
     return torch.unique(key, return_inverse=True)[1]
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from polarguide.capture import Scene
 from polarguide.capture.angle_evidence import (
-    SAME_DIRECTION,
+    AngleLimits,
     CommonRotation,
     angle_difference,
     common_rotation,
@@ -307,7 +307,7 @@ def _sense(findings: ShotFindings, sense: int | None) -> Check:
     if len(findings.telling) < ShotLimits.fewest:
         return Check("handedness", *findings.undecided)
     stated = np.radians([angle for _, angle in findings.telling])
-    alike = max(abs(np.exp(1j * times * stated).mean()) for times in (2, 4)) > SAME_DIRECTION
+    alike = max(abs(np.exp(1j * times * stated).mean()) for times in (2, 4)) > AngleLimits.same_direction
     outcome = first_outcome(
         (alike, "not verified", "The stated angles, modulo 90 degrees, differ too little to tell.", ""),
         (sense is None, "warning", "The pictures agree with neither sense.", CHAOS),
