@@ -23,6 +23,7 @@ from polarguide.capture.exposures import (
     angles_of_names,
     conditioning,
     covers_turn,
+    folders_of_angles,
     nominal,
     normalized,
     parse_angle,
@@ -198,52 +199,36 @@ def by_name(files: Sequence[Path]) -> tuple[list[ExposureSet], list[Path]]:
                 rest.append(path)
             else:
                 views.setdefault(name[0], []).append(SetPicture(path, name[1]))
-        more, four = _any_angles(folder, views)
-        sets += more
-        rest += four
+        for view, mine in sorted(views.items()):
+            paths = [picture.path for picture in mine]
+            four = all(picture.angle in ANGLES for picture in mine)
+            # Names with a mark such as cup_a45 are known here alone.
+            if four and not (len(mine) == 4 and group_files(paths)[1]):
+                rest += paths
+            else:
+                sets.append(_named_set(folder, view, mine))
     return sets, rest
 
 
 def by_folder(root: Path) -> list[ExposureSet]:
     """Sets by folders named like angles, a file of each view in each; nothing where these are four at most."""
-    folders = [path for path in sorted(root.iterdir()) if path.is_dir() and not path.name.startswith(".")]
-    stated = angles_of_names([path.name for path in folders], folders=True)
     views: dict[str, list[SetPicture]] = {}
-    for folder, name in zip(folders, stated, strict=True):
-        if name is not None and name[0] == "":
-            for path in list_files(folder, SHOT_SUFFIXES):
-                views.setdefault(stem_of(path), []).append(SetPicture(path, name[1]))
+    for folder, angle in folders_of_angles(root).items():
+        for path in list_files(folder, SHOT_SUFFIXES):
+            views.setdefault(stem_of(path), []).append(SetPicture(path, angle))
     if all(picture.angle in ANGLES for mine in views.values() for picture in mine):
         return []
     return [_named_set(root, view, mine) for view, mine in sorted(views.items())]
-
-
-def _any_angles(folder: Path, views: dict[str, list[SetPicture]]) -> tuple[list[ExposureSet], list[Path]]:
-    """The sets of a folder; and the files of views at 0, 45, 90 and 135 degrees, or some of them."""
-    sets = []
-    four = []
-    for view, mine in sorted(views.items()):
-        paths = [picture.path for picture in mine]
-        # Of these angles, names with a mark such as cup_a45 are known here alone.
-        if all(picture.angle in ANGLES for picture in mine) and not (
-            len(mine) == 4 and group_files(paths)[1]
-        ):
-            four += paths
-        else:
-            sets.append(_named_set(folder, view, mine))
-    return sets, four
 
 
 def _named_set(folder: Path, view: str, pictures: Sequence[SetPicture]) -> ExposureSet:
     """A set by names: two files that state the same number are one picture too many."""
     first: dict[Angle, Path] = {}
     for picture in pictures:
-        if picture.angle in first:
-            what = f"one picture of {view} at {angle_text(picture.angle)} degrees"
-            return _exposure_set(
-                view, pictures, fault=ambiguous(folder, what, first[picture.angle], picture.path)
-            )
-        first[picture.angle] = picture.path
+        earlier = first.setdefault(picture.angle, picture.path)
+        if earlier is not picture.path:
+            expected = f"one picture of {view} at {angle_text(picture.angle)} degrees"
+            return _exposure_set(view, pictures, fault=ambiguous(folder, expected, earlier, picture.path))
     return _exposure_set(view, pictures)
 
 
