@@ -76,7 +76,7 @@ class SetModel:
 
     def _drop_outliers(self, gray: Array, fit: SetFit) -> None:
         """Leave out the sample that is off most, pixel by pixel, while one is off by more than noise is."""
-        doubled = self._squares * np.float32([[1], [2], [2], [1], [2], [1]])
+        doubled = self._squares * np.array([[1], [2], [2], [1], [2], [1]], np.float32)
         at = np.flatnonzero(fit.determined)
         while at.size:
             # Of four samples nobody can tell which is wrong: all are equally far off.
@@ -149,7 +149,7 @@ def maps_of_set(name: str, files: tuple[Path, ...], samples: SetSamples, options
             "Three pictures leave no residual: the noise is that of neighboring pixels (--full-well states it)."
         )
     size = (height, width)
-    maps = {key: np.zeros(size, np.float32) for key in _FLOAT_MAPS}
+    maps: dict[str, Any] = {key: np.zeros(size, np.float32) for key in _FLOAT_MAPS}
     maps["intensities"] = np.empty((4, *size, channels), np.float32)
     maps["stokes"] = np.empty((3, *size), np.float32)
     maps["reason"] = np.zeros(size, np.uint8)

@@ -252,7 +252,8 @@ def _video(path: Path, frames: Sequence[int | None]) -> Iterator[Shots]:
     read = dict(zip(rising, read_frames(path, rising), strict=True))
     for frame in frames:
         picture = read[frame or 0]
-        yield Shots(picture[None], 1, (picture >= _COMPRESSED_FULL).any(axis=2)[None], ~picture.any(axis=2))
+        clipped = np.asarray((picture >= _COMPRESSED_FULL).any(axis=2))
+        yield Shots(picture[None], 1, clipped[None], np.asarray(~picture.any(axis=2)))
 
 
 def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:

@@ -49,7 +49,7 @@ def neighbor_noise(samples: SetSamples) -> NoiseModel:
     step = max(1, height // max(1, 20 * SetLimits.most_pixels // max(width, 1)))
     bad = samples.lost[:, ::step] | samples.dark[::step] | samples.masked[::step]
     good = ~(bad[..., :-2] | bad[..., 1:-1] | bad[..., 2:])
-    pictures = samples.gains[:, None, None] * samples.gray(np.s_[::step]).astype(np.float64)
+    pictures = samples.gains.astype(np.float64)[:, None, None] * samples.gray(np.s_[::step])
     level = pictures[..., 1:-1][good]
     apart = (pictures[..., 1:-1] - (pictures[..., :-2] + pictures[..., 2:]) / 2)[good]
     if len(level) < SetLimits.fewest_pixels:

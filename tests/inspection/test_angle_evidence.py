@@ -137,7 +137,7 @@ def test_polarization_beyond_any_dielectric_is_flagged(ball_views) -> None:
     assert dielectric_check(measurements, pixels, INDEX).verdict == "ok"
     strong = type(pixels)(
         pixels.aolp, torch.full_like(pixels.dolp, 0.9), pixels.noise, pixels.azimuth,
-        torch.full_like(pixels.zenith, 0.3), pixels.position,
+        torch.full_like(pixels.zenith, 0.3), position=pixels.position,
     )  # fmt: skip
     check = dielectric_check(measurements, strong, INDEX)
     assert check.verdict == "warning"

@@ -16,7 +16,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +135,7 @@ class SurfaceSamples:
     noise: Tensor
     azimuth: Tensor
     zenith: Tensor
-    position: Tensor
+    position: Tensor = field(kw_only=True)
 
     def certainly_specular(self, index: float) -> Tensor:
         """Whether the DoLP exceeds that of diffuse light at this zenith, [N] bool."""
@@ -178,7 +178,7 @@ def sample_surfaces(pairs: Iterable[tuple[InspectedView, ViewSurface]], pairing:
         rows = (optics.aolp(stokes), degree, spread, azimuth, zenith, *position.unbind(-1))
         samples.append(torch.stack([row.flatten() for row in rows])[:, chosen])
     joined = torch.cat(samples, dim=1) if samples else torch.zeros(8, 0)
-    return SurfaceSamples(*joined[:5], joined[5:].T)
+    return SurfaceSamples(*joined[:5], position=joined[5:].T)
 
 
 def normal_evidence(pixels: SurfaceSamples, index: float) -> OrderEvidence:
@@ -304,7 +304,7 @@ def _seen_pixels(
     zenith = torch.asin(sine)[good].float()
     nothing = torch.zeros_like(zenith)
     return SurfaceSamples(
-        nothing, degrees[0][good], degrees[1][good], nothing, zenith, points[good.nonzero()[:, 0]]
+        nothing, degrees[0][good], degrees[1][good], nothing, zenith, position=points[good.nonzero()[:, 0]]
     )
 
 

@@ -34,7 +34,7 @@ Predict = Callable[[View], Tensor]
 """Stokes vectors [3, H, W, 3] that the present state predicts for a view."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Judgment(FittedAngle):
     """The training's judgment of a picture's angle.
 
@@ -275,7 +275,14 @@ class Polarizers:
     def _judged(self, fit: Tensor) -> list[Judgment]:
         """The judgment of each picture by one fit [P, 8]."""
         rows = [
-            Judgment(*row[:-1], view.name, k, view.exposures[k], view.exposures[k], rules=self._rules)
+            Judgment(
+                *row[:-1],
+                view=view.name,
+                number=k,
+                specified=view.exposures[k],
+                believed=view.exposures[k],
+                rules=self._rules,
+            )
             for (view, k), row in zip(self._places, fit.tolist(), strict=True)
         ]
         offs = [abs(row.off) for row in rows if row.tells and row.specified.angle is not None]
