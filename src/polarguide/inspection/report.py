@@ -187,32 +187,33 @@ RECORD = "inspection.json"
 def inspection_record(inspection: Inspection) -> dict[str, Any]:
     """The findings as plain JSON types; docs/reference/inspection.md describes the keys."""
     capture = inspection.capture
-    record: dict[str, Any] = json_value(
-        {
-            "schema": SCHEMA,
-            "program": f"polarguide {__version__}",
-            "scene": {
-                "name": capture.name,
-                "views": len(capture.views),
-                "posed_views": len(capture.posed),
-                "size": list(capture.size),
-                "bits": capture.bits,
-                "digest": capture.digest,
-            },
-            "settings": {
-                "downscale": capture.factor,
-                "transfer": capture.transfer,
-                "refractive_index": inspection.index,
-                "normals": inspection.settings.normals,
-                "steps": inspection.settings.steps,
-            },
-            "verdict": inspection.verdict,
-            "checks": [check.record() for check in inspection.checks],
-            "angles": inspection.angles.record(),
-            "views": [measured.record() for measured in inspection.measurements],
-        }
+    return dict(
+        json_value(
+            {
+                "schema": SCHEMA,
+                "program": f"polarguide {__version__}",
+                "scene": {
+                    "name": capture.name,
+                    "views": len(capture.views),
+                    "posed_views": len(capture.posed),
+                    "size": list(capture.size),
+                    "bits": capture.bits,
+                    "digest": capture.digest,
+                },
+                "settings": {
+                    "downscale": capture.factor,
+                    "transfer": capture.transfer,
+                    "refractive_index": inspection.index,
+                    "normals": inspection.settings.normals,
+                    "steps": inspection.settings.steps,
+                },
+                "verdict": inspection.verdict,
+                "checks": [check.record() for check in inspection.checks],
+                "angles": inspection.angles.record(),
+                "views": [measured.record() for measured in inspection.measurements],
+            }
+        )
     )
-    return record
 
 
 def write_inspection(inspection: Inspection, out: Path, reporter: Reporter = SILENT) -> tuple[Path, Path]:

@@ -99,8 +99,7 @@ class Check:
 
     def record(self) -> dict[str, Any]:
         """Return the check as JSON types; numbers that are not finite become null."""
-        record: dict[str, Any] = json_value({"key": self.key, "title": self.title, **vars(self)})
-        return record
+        return dict(json_value({"key": self.key, "title": self.title, **vars(self)}))
 
 
 def first_outcome(*rows: tuple[object, Verdict, str, str]) -> tuple[Verdict, str, str]:
