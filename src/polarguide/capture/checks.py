@@ -305,7 +305,7 @@ def curvature_of(tiles: Sequence[NDArray[np.float64]]) -> Curvature | None:
 
 
 def encoding(found: Curvature | None) -> Literal["linear", "srgb"] | None:
-    """How files are encoded that have this curvature when they are read as linear; None where it does not tell.
+    """Return the encoding of files with this curvature when read as linear; None if it is undecided.
 
     The one judgment of ``prepare``, ``inspect`` and the warnings of ``train``.
     """
@@ -318,7 +318,7 @@ def encoding(found: Curvature | None) -> Literal["linear", "srgb"] | None:
 
 
 def _is_off(residuals: tuple[float, float, float]) -> bool:
-    """Whether the residual of the named pairing is large, or much larger than that of another pairing."""
+    """Return true if the residual of the named pairing is large, or much larger than another."""
     right, *others = residuals
     return right > CheckLimits.residual or (right > 0.4 * CheckLimits.residual and min(others) < 0.25 * right)
 

@@ -110,7 +110,7 @@ class Capture:
 
     @property
     def four(self) -> bool:
-        """Whether every view has its four pictures at 0, 45, 90 and 135 degrees."""
+        """True if every view has four pictures at 0, 45, 90 and 135 degrees."""
         return all(view.exposures == FOUR for view in self.views)
 
     @property
@@ -192,7 +192,7 @@ MEASURABLE = 1.0 / 256.0
 POLARIZED = 0.05
 """DoLP from which a pixel counts as polarized."""
 OF_FOUR = ("noise", "noise_share", "pair_ratio", "sum_error", "dolp", "polarized", "above_limit")
-"""What only four angles of a view tell."""
+"""Measurements that need four angles of a view."""
 _QUANTILE_SAMPLES = 200_000
 
 
@@ -231,7 +231,7 @@ class ViewMeasurements:
     exposures: str = ""
 
     def record(self) -> dict[str, Any]:
-        """As plain JSON types."""
+        """Return the measurements as JSON types."""
         measured = {**vars(self), "dolp": {"median": self.dolp[0], "p99": self.dolp[1]}}
         if self.exposures:
             return {key: None if key in OF_FOUR else value for key, value in measured.items()}

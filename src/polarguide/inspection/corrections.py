@@ -42,7 +42,7 @@ METADATA = "scene.json"
 
 
 def correction(capture: Capture, angles: AngleFindings) -> Calibration | None:
-    """The correction of the angles, or None if they are right.
+    """Return the correction of the angles, or None if they are right.
 
     Raises:
         PolarguideError: the order is not decided.
@@ -214,7 +214,7 @@ class _SceneNotes(msgspec.Struct):
 
 
 def corrected(capture: Capture, path: Path) -> Capture:
-    """The capture as the calibration of its sensor corrects it.
+    """Return the capture corrected with the calibration of its sensor.
 
     The matrices follow what ``prepare`` did: its region, the gains that it divided by, the order of the angles, the
     removal of the distortion. Where pictures were averaged, so are the matrices.

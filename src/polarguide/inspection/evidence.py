@@ -138,7 +138,7 @@ class SurfaceSamples:
     position: Tensor = field(kw_only=True)
 
     def certainly_specular(self, index: float) -> Tensor:
-        """Whether the DoLP exceeds that of diffuse light at this zenith, [N] bool."""
+        """Return true where the DoLP exceeds that of diffuse light at this zenith, [N] bool."""
         most = optics.diffuse_dolp((self.zenith + EvidenceLimits.zenith_margin).clamp(max=math.pi / 2), index)
         return self.dolp > most + 2 * self.noise
 
@@ -399,7 +399,7 @@ def short_run(
     recipe: Recipe | None = None,
     until: int = 0,
 ) -> TrainingState:
-    """Train, or go on, or take what is there.
+    """Run or resume the short training, or load its finished state.
 
     Args:
         scene: at the size to train at.
@@ -444,7 +444,7 @@ def short_run(
 
 
 def _same(folder: Path, wanted: dict[str, object]) -> bool:
-    """Whether the folder holds a readable state of the same training."""
+    """Return true if the folder holds a readable state of the same training."""
     try:
         return read_record(folder / KEY, dict[str, Any]) == wanted and (folder / CHECKPOINT).exists()
     except PolarguideError:
@@ -453,7 +453,7 @@ def _same(folder: Path, wanted: dict[str, object]) -> bool:
 
 @torch.no_grad()
 def trained_surface(state: TrainingState, view: View, backend: Backend) -> ViewSurface:
-    """The surface of the trained Gaussians in one view, on the CPU, where pictures are compared with it."""
+    """Return the surface of the trained Gaussians in one view, on the CPU."""
     request = RenderRequest(sh_degree=0, depth=True)
     result = render(state.gaussians, view.camera, backend.rasterize, request).to("cpu")
     assert result.normal is not None

@@ -283,7 +283,7 @@ class Inspection:
         return worst(self.checks)
 
     def check(self, key: str) -> Check:
-        """The check with this key."""
+        """Return the check with this key."""
         return next(check for check in self.checks if check.key == key)
 
 
@@ -358,7 +358,7 @@ def _shots(
     backend: Backend,
     reporter: Reporter,
 ) -> tuple[list[Check], ShotFindings]:
-    """The checks of a capture with other pictures than four angles a view, and what these tell of their polarizers."""
+    """Return the checks of a capture with pictures at other angles, and the findings on their polarizers."""
     checks = [pictures_check(capture), *agreement_checks(capture), *light_checks(capture, measurements)]
     with reporter.track("matching features", 1):
         checks += [pose_check(capture), lens_check(capture), coverage_check(capture)]

@@ -63,7 +63,7 @@ class PictureLimits:
 
 
 def find_pairing(capture: Capture) -> int | None:
-    """The pairs of perpendicular pictures by their sums, an index into ``PAIRINGS``; None if they do not decide."""
+    """Return the pairing with the best pair sums, an index into ``PAIRINGS``; None if they do not decide."""
     residuals = np.array(
         [checks.measure(view.codes.numpy(), view.usable.numpy()).residuals for view in capture.views]
     )
@@ -370,7 +370,7 @@ def dielectric_check(
 
 
 def exceeds_dielectric(pixels: SurfaceSamples, index: float) -> torch.Tensor:
-    """Whether the DoLP exceeds that of specular and diffuse light at every zenith within the margin, [N] bool."""
+    """Return true where the DoLP exceeds both lobes at every zenith within the margin, [N] bool."""
     steps = EvidenceLimits.zenith_margin * torch.linspace(-1, 1, 7)
     zenith = (pixels.zenith[:, None] + steps).clamp(0, math.pi / 2)
     most = torch.maximum(optics.specular_dolp(zenith, index), optics.diffuse_dolp(zenith, index)).amax(dim=1)

@@ -27,7 +27,7 @@ REMEDY = (
     "Note the angle of each shot; or take three or four shots of each view at known angles, from a tripod; or treat "
     "the pictures as ordinary photographs: prepare them with --angles none."
 )
-"""What to do where most angles are doubtful."""
+"""Advice for captures with mostly doubtful angles."""
 UNFITTED = (0.0, 1.0, 0.0, 90.0, 1.0, 0.0, 0.0)
 """Values of ``FittedAngle`` for a picture without polarization to fit an angle to."""
 Predict = Callable[[View], Tensor]
@@ -64,32 +64,32 @@ class Judgment(FittedAngle):
 
     @property
     def unfiltered(self) -> bool:
-        """Whether it was taken without a filter, as it looks."""
+        """True if the picture looks as if taken without a filter."""
         return self.modulation + self.doubt < self.rules.weak
 
     @property
     def vague(self) -> bool:
-        """Whether the picture does not tell its angle."""
+        """True if the picture does not determine its angle."""
         return (self.spread > self.rules.vague or self.modulation < self.rules.weak) and not self.unfiltered
 
     @property
     def tells(self) -> bool:
-        """Whether the picture tells its angle."""
+        """True if the picture determines its angle."""
         return not self.vague and not self.unfiltered
 
     @property
     def guesses(self) -> bool:
-        """Whether its angle is worth believing where nothing else is known."""
+        """True if the angle is usable as a best guess."""
         return self.spread <= self.rules.lost and self.modulation >= self.rules.weak
 
     @property
     def unsettled(self) -> bool:
-        """Whether it tells an angle, and the fits do not agree on which."""
+        """True if the picture determines an angle on which the fits disagree."""
         return self.tells and self.scatter > self.rules.disagree
 
     @property
     def poorly_explained(self) -> bool:
-        """Whether it tells an angle, and may well be at another all the same."""
+        """True if the scene explains the picture poorly, so that its determined angle may be wrong."""
         return self.tells and self.unexplained > self.rules.poor
 
     @property
@@ -106,7 +106,7 @@ class Judgment(FittedAngle):
 
     @property
     def contradicts(self) -> bool:
-        """Whether the picture contradicts its specified angle, by more than its ``limit``."""
+        """True if the picture contradicts its specified angle by more than its ``limit``."""
         return not (self.unfiltered or self.overruled) and abs(self.off) > self.limit
 
     def resembles(self, other: Judgment) -> bool:
@@ -116,7 +116,7 @@ class Judgment(FittedAngle):
 
     @property
     def doubtful(self) -> bool:
-        """Whether the angle that the training goes by may well be wrong."""
+        """True if the angle that the training uses is probably wrong."""
         sought = not self.specified.known and (not self.tells or self.unsettled or self.poorly_explained)
         return sought or self.unfiltered or self.contradicts
 
@@ -168,18 +168,18 @@ class Polarizers:
         self.beliefs = self._beliefs()
 
     def due(self, step: int) -> bool:
-        """Whether angles are to be fitted before a step; False once all fits are made."""
+        """Return true if angles are fitted before a step."""
         return not self.settled and step in self._rounds[self.ended]
 
     @property
     def ended(self) -> int:
-        """Searches of which all fits have been made."""
+        """Number of finished searches."""
         count = 0 if self.table is None else len(self.table)
         return sum(count >= end for end in itertools.accumulate(map(len, self._rounds)))
 
     @property
     def settled(self) -> bool:
-        """Whether all fits have been made."""
+        """True if all fits are done."""
         return self.ended == len(self._rounds)
 
     @property
