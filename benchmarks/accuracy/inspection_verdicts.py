@@ -18,10 +18,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from polarguide.capture import checks
+from polarguide.capture.angle_evidence import ORDERS
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.geometry.polarizer import ANGLES
-from polarguide.inspection.angles import ORDERS, combine_evidence, order_check, zero_check
+from polarguide.inspection.angles import angle_checks, combine_evidence
 from polarguide.inspection.capture import Capture, measure_view, read_capture
 from polarguide.inspection.evidence import point_evidence
 from polarguide.inspection.picture_checks import find_pairing, picture_checks
@@ -37,11 +37,8 @@ def altered(capture: Capture, change: Change) -> Capture:
         values = change(view.intensities().numpy())
         codes = np.rint(np.clip(values, 0, 1) * 65535).astype(np.uint16)
         saturated = view.saturated.numpy() | (codes == 65535).any(axis=(0, 3))
-        measures = checks.measure(codes, ~(view.invalid.numpy() | saturated))
         views.append(
-            dataclasses.replace(
-                view, codes=torch.from_numpy(codes), saturated=torch.from_numpy(saturated), measures=measures
-            )
+            dataclasses.replace(view, codes=torch.from_numpy(codes), saturated=torch.from_numpy(saturated))
         )
     return dataclasses.replace(capture, views=tuple(views))
 
@@ -67,7 +64,7 @@ def angles_line(capture: Capture, refractive_index: float) -> str:
     pairing = find_pairing(capture) or 0
     evidence, _ = point_evidence(capture.posed, capture.model, refractive_index, pairing)
     angles = combine_evidence([evidence], pairing)
-    order, zero = order_check(angles), zero_check(angles)
+    order, _, zero = angle_checks(angles)
     if angles.posterior is None:
         return f"order {order.verdict}: {evidence.note}"
     best = ORDERS[angles.posterior.best].files()

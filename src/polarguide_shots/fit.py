@@ -13,9 +13,9 @@ from scipy.special import erfcinv
 
 from polarguide import optics
 from polarguide.capture.exposures import WELL_CONDITIONED
-from polarguide.capture.picture_sets import SetSamples, chosen_pixels, judge, luminance
+from polarguide.capture.picture_sets import SetSamples, chosen_pixels, judge, mean_color
 from polarguide.geometry.polarizer import four_intensities
-from polarguide_shots.maps import Map, NoiseModel, Reason, ShotMaps, given_noise
+from polarguide_shots.maps import NoiseModel, Reason, ShotMaps, given_noise
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.set_noise import estimated_set_noise, neighbor_noise
 
@@ -31,7 +31,7 @@ Array = NDArray[np.float32]
 
 
 @dataclass(eq=False)
-class PixelFit:
+class SetFit:
     """The fit of some pixels.
 
     Attributes:
@@ -62,7 +62,7 @@ class SetModel:
         """Variances [K, N] of the samples of Stokes vectors [3, N]."""
         return np.asarray(self._floor + self._slope * np.maximum(self.rows @ stokes, 0), np.float32)
 
-    def fit(self, gray: Array, lost: NDArray[np.bool_]) -> PixelFit:
+    def fit(self, gray: Array, lost: NDArray[np.bool_]) -> SetFit:
         """Fit pixels [K, N]: least squares, then with the variances that these predict, then without outliers."""
         usable = (~lost & self._used[:, None]).astype(np.float32)
         determined = self._determined(usable)
@@ -70,26 +70,19 @@ class SetModel:
         stokes, _ = self._solve(usable, gray)
         weights = usable / self.variances(stokes)
         stokes, covariance = self._solve(weights, gray)
-        fit = PixelFit(stokes, covariance, weights, determined)
+        fit = SetFit(stokes, covariance, weights, determined)
         self._drop_outliers(gray, fit)
         return fit
 
-    def _drop_outliers(self, gray: Array, fit: PixelFit) -> None:
+    def _drop_outliers(self, gray: Array, fit: SetFit) -> None:
         """Leave out the sample that is off most, pixel by pixel, while one is off by more than noise is."""
+        doubled = self._squares * np.array([[1], [2], [2], [1], [2], [1]], np.float32)
         at = np.flatnonzero(fit.determined)
         while at.size:
-            weights = fit.weights[:, at]
-            picked = gray[:, at]
             # Of four samples nobody can tell which is wrong: all are equally far off.
-            testable = (weights > 0).sum(axis=0) >= 5
-            at = at[testable]
-            weights = weights[:, testable]
-            picked = picked[:, testable]
-            if not at.size:
-                return
-            off = picked - self.rows @ fit.stokes[:, at]
-            doubled = self._squares.copy()
-            doubled[[1, 2, 4]] *= 2
+            at = at[(fit.weights[:, at] > 0).sum(axis=0) >= 5]
+            weights = fit.weights[:, at]
+            off = gray[:, at] - self.rows @ fit.stokes[:, at]
             leverage = weights * (doubled.T @ fit.covariance[:, at])
             far = off**2 * weights / np.maximum(1 - leverage, 1e-3)
             worst = far.argmax(axis=0)
@@ -98,12 +91,9 @@ class SetModel:
             weights[worst[beyond], np.arange(beyond.size)] = 0
             determined = self._determined((weights > 0).astype(np.float32))
             weights = weights[:, determined]
-            beyond = beyond[determined]
-            at = at[beyond]
-            picked = picked[:, beyond]
-            if at.size:
-                fit.weights[:, at] = weights
-                fit.stokes[:, at], fit.covariance[:, at] = self._solve(weights, picked)
+            at = at[beyond[determined]]
+            fit.weights[:, at] = weights
+            fit.stokes[:, at], fit.covariance[:, at] = self._solve(weights, gray[:, at])
 
     def _determined(self, usable: Array) -> NDArray[np.bool_]:
         """Whether the samples that are used, [K, N] of 0 and 1, determine a Stokes vector well, [N]."""
@@ -143,13 +133,13 @@ class SetModel:
 
 
 def maps_of_set(name: str, files: tuple[Path, ...], samples: SetSamples, options: ShotOptions) -> ShotMaps:
-    """The maps of a set of pictures at any angles."""
+    """Return the maps of a set of pictures at any angles."""
     chosen = chosen_pixels(samples)
     gray = samples.gray(chosen).astype(np.float64)
     judgment = judge(samples, gray)
     notes = [*samples.notes, *judgment.notes]
     noise = given_noise(options, samples.step)
-    channels = samples.values.shape[-1]
+    count, height, width, channels = samples.values.shape
     share = 1.0 if noise is None else 1 / channels
     if noise is None and judgment.used.sum() > 3:
         noise = estimated_set_noise(samples, gray, judgment.used)
@@ -158,84 +148,69 @@ def maps_of_set(name: str, files: tuple[Path, ...], samples: SetSamples, options
         notes.append(
             "Three pictures leave no residual: the noise is that of neighboring pixels (--full-well states it)."
         )
+    size = (height, width)
+    maps: dict[str, Any] = {key: np.zeros(size, np.float32) for key in _FLOAT_MAPS}
+    maps["intensities"] = np.empty((4, *size, channels), np.float32)
+    maps["stokes"] = np.empty((3, *size), np.float32)
+    maps["reason"] = np.zeros(size, np.uint8)
+    maps["left_out"] = np.zeros(size, np.uint8)
     model = SetModel(samples, judgment.used, noise, share)
-    arrays = _Arrays(samples)
-    for top in range(0, arrays.height, arrays.rows):
-        arrays.fill(slice(top, min(top + arrays.rows, arrays.height)), samples, model, options.snr)
-    for mask, kind in (
-        (samples.dark, Reason.DARK),
-        (~arrays.determined, Reason.SATURATED),
-        (samples.masked, Reason.MASKED),
-    ):
-        arrays.reason[mask] = kind
+    rows = max(1, _TILE // width)
+    for top in range(0, height, rows):
+        _fill(maps, slice(top, min(top + rows, height)), samples, model, options.snr)
+    residual = maps.pop("residual")
     return ShotMaps(
         name=name,
         files=files,
-        intensities=arrays.intensities,
-        stokes=arrays.stokes,
-        dolp=arrays.dolp,
-        dolp_debiased=arrays.debiased,
-        aolp=arrays.aolp,
-        sigma_dolp=arrays.sigma_dolp,
-        sigma_aolp=arrays.sigma_aolp,
-        reason=arrays.reason,
         noise=noise,
         pair_ratio=None,
         notes=tuple(notes),
         pictures=judgment.pictures,
-        residual=arrays.residual if len(samples.labels) > 3 else None,
-        left_out=arrays.left_out,
+        residual=residual if count > 3 else None,
+        **maps,
     )
 
 
-class _Arrays:
-    """The maps while they are filled, some rows at a time."""
+_FLOAT_MAPS = ("dolp", "dolp_debiased", "aolp", "sigma_dolp", "sigma_aolp", "residual")
+"""Maps [H, W] of 32-bit floats."""
 
-    def __init__(self, samples: SetSamples) -> None:
-        self.height, width, channels = samples.values.shape[1:]
-        size = (self.height, width)
-        self.rows = max(1, _TILE // width)
-        self.intensities: Map = np.empty((4, *size, channels), np.float32)
-        self.stokes: Map = np.empty((3, *size), np.float32)
-        self.dolp, self.debiased, self.aolp, self.sigma_dolp, self.sigma_aolp, self.residual = (
-            np.zeros(size, np.float32) for _ in range(6)
-        )
-        self.reason = np.zeros(size, np.uint8)
-        self.left_out = np.zeros(size, np.uint8)
-        self.determined = np.ones(size, bool)
 
-    def fill(self, part: slice, samples: SetSamples, model: SetModel, snr: float) -> None:
-        """Fit the pixels of some rows."""
-        values = samples.intensities(part)
-        count, height, width, channels = values.shape
-        flat = values.reshape(count, -1, channels)
-        gray = luminance(flat)
-        fit = model.fit(gray, samples.lost[:, part].reshape(count, -1))
-        colors = [fit.stokes] if channels == 1 else [
-            model.project(fit.covariance, fit.weights, np.ascontiguousarray(flat[..., c])) for c in range(channels)
-        ]  # fmt: skip
-        size = (height, width)
-        for channel, stokes in enumerate(colors):
-            for place, values in enumerate(four_intensities(stokes)):
-                self.intensities[place, part, :, channel] = values.reshape(size)
-        self._state(part, fit, size, snr)
-        self.determined[part] = fit.determined.reshape(size)
-        self.left_out[part] = np.minimum((fit.weights == 0).sum(axis=0), 255).reshape(size)
-        if count > 3:
-            self.residual[part] = model.residual(gray, fit.stokes).reshape(size)
-
-    def _state(self, part: slice, fit: PixelFit, size: tuple[int, int], snr: float) -> None:
-        """DoLP, AoLP and their uncertainty, and which pixels say nothing."""
-        stokes = torch.from_numpy(fit.stokes)
-        spread = optics.fitted_uncertainty(stokes, torch.from_numpy(fit.covariance))
-        degree = optics.dolp(stokes)
-        self.stokes[:, part] = fit.stokes.reshape(3, *size)
-        self.dolp[part] = degree.reshape(size).numpy()
-        self.aolp[part] = optics.aolp(stokes).reshape(size).numpy()
-        self.sigma_dolp[part] = spread.dolp.reshape(size).numpy()
-        self.sigma_aolp[part] = spread.aolp.reshape(size).numpy()
-        self.debiased[part] = spread.debiased.reshape(size).numpy()
-        why = np.zeros(degree.shape, np.uint8)
-        why[(degree <= snr * spread.dolp).numpy()] = Reason.NOISE
-        why[fit.stokes[0] <= DARK_SNR * np.sqrt(fit.covariance[0])] = Reason.DARK
-        self.reason[part] = why.reshape(size)
+def _fill(maps: dict[str, Any], part: slice, samples: SetSamples, model: SetModel, snr: float) -> None:
+    """Fit the pixels of some rows: intensities, DoLP and AoLP with uncertainty, and pixels without information."""
+    values = samples.intensities(part)
+    count, height, width, channels = values.shape
+    flat = values.reshape(count, -1, channels)
+    gray = mean_color(flat)
+    fit = model.fit(gray, samples.lost[:, part].reshape(count, -1))
+    colors = [fit.stokes] if channels == 1 else [
+        model.project(fit.covariance, fit.weights, np.ascontiguousarray(flat[..., c])) for c in range(channels)
+    ]  # fmt: skip
+    size = (height, width)
+    for channel, of_color in enumerate(colors):
+        for place, intensity in enumerate(four_intensities(of_color)):
+            maps["intensities"][place, part, :, channel] = intensity.reshape(size)
+    stokes = torch.from_numpy(fit.stokes)
+    spread = optics.fitted_uncertainty(stokes, torch.from_numpy(fit.covariance))
+    degree = optics.dolp(stokes)
+    maps["stokes"][:, part] = fit.stokes.reshape(3, *size)
+    found = {
+        "dolp": degree,
+        "aolp": optics.aolp(stokes),
+        "sigma_dolp": spread.dolp,
+        "sigma_aolp": spread.aolp,
+        "dolp_debiased": spread.debiased,
+    }
+    for key, tensor in found.items():
+        maps[key][part] = tensor.reshape(size).numpy()
+    if count > 3:
+        maps["residual"][part] = model.residual(gray, fit.stokes).reshape(size)
+    maps["left_out"][part] = np.minimum((fit.weights == 0).sum(axis=0), 255).reshape(size)
+    reason = maps["reason"][part].reshape(-1)
+    for mask, kind in (
+        ((degree <= snr * spread.dolp).numpy(), Reason.NOISE),
+        (fit.stokes[0] <= DARK_SNR * np.sqrt(fit.covariance[0]), Reason.DARK),
+        (samples.dark[part].reshape(-1), Reason.DARK),
+        (~fit.determined, Reason.SATURATED),
+        (samples.masked[part].reshape(-1), Reason.MASKED),
+    ):
+        reason[mask] = kind

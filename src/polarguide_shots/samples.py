@@ -47,31 +47,28 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
     known = [picture for picture in pictures if not isinstance(picture.angle, str)]
     kinds = ((kind_of_file(p.path) if p.frame is None else VIDEO, p.path) for p in known)
     require_one(known[0].path.parent, kinds, "a set of one kind of file", COMPARABLE)
-    read, kind = _gathered(name, known[0].path, len(known), _read_each(known))
-    gains, words = _gains(known)
-    angles = [_degrees(picture.angle) for picture in known]
-    labels = tuple(picture.label for picture in known)
+    read = _gathered(name, known[0].path, len(known), _read_each(known))
+    gains, notes = _gains(known)
     files = list(dict.fromkeys(picture.path for picture in known))
-    film = files[0] if known[0].frame is not None else None
-    samples = _samples(read, kind, labels, angles, gains, options, files, film)
-    return replace(samples, notes=(*samples.notes, *words, *_unused(len(pictures) - len(known))))
+    return _samples(read, pictures, gains, notes, files, options)
 
 
 def samples_of_arrays(
     name: str, stored: NDArray[Any], angles: Sequence[Angle], options: ShotOptions
 ) -> SetSamples:
-    """The samples of a set in memory.
+    """Return the samples of a set in memory.
 
     Args:
-        name: name of the shot. stored: [K, H, W, 3] uint8 or uint16. angles: angles of the K pictures.
+        name: name of the shot.
+        stored: [K, H, W, 3] uint8 or uint16.
+        angles: angles of the K pictures.
+        options: options of the shot.
     """
     require_no_order(options.calibration, name)
+    pictures = [SetPicture(Path(f"picture {k + 1}"), angle) for k, angle in enumerate(angles)]
     places = [k for k, angle in enumerate(angles) if not isinstance(angle, str)]
-    read, kind = _gathered(name, Path(name), len(places), (stacked(stored[k : k + 1]) for k in places))
-    labels = tuple(f"picture {k + 1}" for k in places)
-    known = [_degrees(angles[k]) for k in places]
-    samples = _samples(read, kind, labels, known, [1.0] * len(places), options)
-    return replace(samples, notes=(*samples.notes, *_unused(len(angles) - len(places))))
+    read = _gathered(name, Path(name), len(places), (stacked(stored[k : k + 1]) for k in places))
+    return _samples(read, pictures, [1.0] * len(places), [], [], options)
 
 
 def _gathered(name: str, where: Path, count: int, pictures: Iterator[Shots]) -> tuple[Shots, np.dtype[Any]]:
@@ -105,53 +102,63 @@ def _is_gray(shot: Shots) -> bool:
 
 
 def _samples(
-    read: Shots,
-    kind: np.dtype[Any],
-    labels: tuple[str, ...],
-    angles: Sequence[float],
+    gathered: tuple[Shots, np.dtype[Any]],
+    pictures: Sequence[SetPicture],
     gains: Sequence[float],
+    notes: Sequence[str],
+    files: Sequence[Path],
     options: ShotOptions,
-    files: Sequence[Path] = (),
-    film: Path | None = None,
 ) -> SetSamples:
-    """Linear samples of stored ones, upright; ``read`` is used up: uint16, whatever ``kind`` the values have.
+    """Return linear samples, upright, of stored ones, whose arrays are used up.
 
-    ``files``: of the pictures; ``film``: the video that they are frames of.
+    Args:
+        gathered: result of ``_gathered``.
+        pictures: pictures of the set, also those without a known angle.
+        gains: exposures of the pictures at known angles.
+        notes: notes for the user on the exposures.
+        files: files of the pictures at known angles; empty for pictures in memory.
+        options: options of the shot.
     """
-    values = read.pictures
-    lost = read.clipped
-    dark = read.dark
+    read, kind = gathered
+    known = [picture for picture in pictures if not isinstance(picture.angle, str)]
+    angles = [float(picture.angle) for picture in known]
     code = read.orientation
-    levels, notes = levels_of_shot(values, 8 * kind.itemsize, options)
+    levels, level_notes = levels_of_shot(read.pictures, 8 * kind.itemsize, options)
     every = np.arange(np.iinfo(kind).max + 1, dtype=kind)
     step = 1 / float(np.iinfo(kind).max)
     if levels is not None:
         every = rescaled(every, levels.white)
         step = 1 / levels.white
+    film = files[0] if known[0].frame is not None else None
     decision = transfer_of_pictures(
         files, options.transfer, lambda: [(_judged(read, every), angles)], video=film
     )
-    transfer = decision.transfer
-    linear = linear_codes(every, transfer)
-    as_stored = levels is None and kind == np.uint16 and transfer == "linear"
-    for picture, clipped in zip(values, lost, strict=True):  # one after the other, as memory is
+    linear = linear_codes(every, decision.transfer)
+    as_stored = levels is None and kind == np.uint16 and decision.transfer == "linear"
+    for picture, clipped in zip(
+        read.pictures, read.clipped, strict=True
+    ):  # one after the other, as memory is
         if levels is not None:
             clipped |= (picture >= levels.saturation).any(axis=2)
         if not as_stored:
             picture[...] = linear[picture]
     turn = orientation_calibration(code)
+    dark = apply_orientation(read.dark, code)
     return SetSamples(
-        labels=labels,
-        values=apply_orientation(values.transpose(1, 2, 0, 3), code).transpose(2, 0, 1, 3),
+        labels=tuple(picture.label for picture in known),
+        values=apply_orientation(read.pictures.transpose(1, 2, 0, 3), code).transpose(2, 0, 1, 3),
         exposures=tuple(
-            Exposure(_degrees(turned(turned(angle, options.calibration), turn)), gain=gain)
+            Exposure(float(turned(turned(angle, options.calibration), turn)), gain=gain)
             for angle, gain in zip(angles, gains, strict=True)
         ),
-        lost=apply_orientation(lost.transpose(1, 2, 0), code).transpose(2, 0, 1),
-        dark=apply_orientation(dark, code),
-        masked=np.zeros(apply_orientation(dark, code).shape, bool),
+        lost=apply_orientation(read.clipped.transpose(1, 2, 0), code).transpose(2, 0, 1),
+        dark=dark,
+        masked=np.zeros(dark.shape, bool),
         step=step,
-        notes=(decision.note, *filter(None, [decision.doubt]), *notes),
+        notes=(
+            *(decision.note, *filter(None, [decision.doubt]), *level_notes, *notes),
+            *_unused(len(pictures) - len(known)),
+        ),
     )
 
 
@@ -187,10 +194,10 @@ def levels_of_shot(
 def piled_up(values: NDArray[Any], container: int, options: ShotOptions) -> tuple[int | None, list[str]]:
     """The value below full scale at which samples of 16-bit files clip, unless options state it; and a note of it."""
     top = int(values.max())
-    if container != 16 or top == FULL_16 or options.bits is not None or options.saturation is not None:
-        return None, []
     bits = top.bit_length()
-    if top != (1 << bits) - 1:  # cheaper than to count values, and the rule of what follows
+    specified = options.bits is not None or options.saturation is not None
+    # The last condition is cheaper than counting values, and follows from the rule of ``clipping_bits``.
+    if container != 16 or top == FULL_16 or specified or top != (1 << bits) - 1:
         return None, []
     counts = sum((np.bincount(part.ravel(), minlength=FULL_16 + 1) for part in values), np.zeros(1, np.int64))
     if clipping_bits(counts) is None:
@@ -241,13 +248,12 @@ def _read_each(pictures: Sequence[SetPicture]) -> Iterator[Shots]:
 
 def _video(path: Path, frames: Sequence[int | None]) -> Iterator[Shots]:
     """Frames of a video, in the order that is asked for, as pictures are read."""
-    wanted = [frame for frame in frames if frame is not None]
-    rising = sorted(wanted)
-    read = {frame: picture for frame, picture in zip(rising, read_frames(path, rising), strict=True)}
-    for frame in wanted:
-        picture = read[frame]
-        clipped, lit = (np.asarray(mask.any(axis=2)) for mask in (picture >= _COMPRESSED_FULL, picture > 0))
-        yield Shots(picture[None], 1, clipped[None], ~lit)
+    rising = sorted(frame for frame in frames if frame is not None)
+    read = dict(zip(rising, read_frames(path, rising), strict=True))
+    for frame in frames:
+        picture = read[frame or 0]
+        clipped = np.asarray((picture >= _COMPRESSED_FULL).any(axis=2))
+        yield Shots(picture[None], 1, clipped[None], np.asarray(~picture.any(axis=2)))
 
 
 def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:
@@ -271,7 +277,7 @@ def samples_of_view(data: ViewData, full: int | None, options: ShotOptions) -> S
         labels=tuple(f"picture {k + 1}" for k in places),
         values=data.codes[places],
         exposures=tuple(
-            replace(e, angle=_degrees(turned(e.angle or 0.0, options.calibration)))
+            replace(e, angle=float(turned(e.angle or 0.0, options.calibration)))
             for e in (data.exposures[k] for k in places)
         ),
         lost=np.broadcast_to(saturated, (len(places), *saturated.shape)),
@@ -326,12 +332,6 @@ def samples_of_loaded(view: View) -> SetSamples:
     )
 
 
-def _degrees(angle: Angle) -> float:
-    """An angle that is known to be a number."""
-    assert not isinstance(angle, str)
-    return angle
-
-
 def _unused(count: int) -> tuple[str, ...]:
     """The note about pictures that a fit cannot use."""
     return (f"{count} pictures without a known angle are not used.",) if count else ()
@@ -340,9 +340,8 @@ def _unused(count: int) -> tuple[str, ...]:
 def stated_of_shot(paths: Sequence[Path]) -> tuple[list[float], list[str]]:
     """The relative exposures that the files of a single shot state, else ones; and notes for the user."""
     stated, missing = stated_exposures({"": paths})
-    exposures = stated.get("", [1.0] * len(paths))
-    factor = f"{max(exposures) / min(exposures):.3g}" if stated else ""
-    corrected = (
-        f"The files state exposures that differ by a factor of {factor}; corrected." if stated else missing
-    )
-    return exposures, [corrected] if corrected else []
+    if not stated:
+        return [1.0] * len(paths), [missing] if missing else []
+    exposures = stated[""]
+    factor = max(exposures) / min(exposures)
+    return exposures, [f"The files state exposures that differ by a factor of {factor:.3g}; corrected."]

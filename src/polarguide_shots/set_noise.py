@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.picture_sets import FEWEST_PIXELS, MOST_PIXELS, SetSamples, typical_variance
+from polarguide.capture.picture_sets import SetLimits, SetSamples, typical_variance
 from polarguide_shots.maps import NoiseModel, binned_noise
 
 Floats = NDArray[np.float64]
 _REDUNDANT = 0.05
-"""Share of a sample's noise that the fit has to leave for its residual to say something."""
+"""Smallest share of a sample's noise in the residual of a fit from which noise is estimated."""
 
 
 def estimated_set_noise(samples: SetSamples, gray: Floats, used: NDArray[np.bool_]) -> NoiseModel:
@@ -28,7 +28,7 @@ def estimated_set_noise(samples: SetSamples, gray: Floats, used: NDArray[np.bool
     hat = rows @ np.linalg.pinv(rows)
     free = 1 - np.diag(hat)
     freedom = int(used.sum()) - 3
-    if freedom < 1 or gray.shape[1] < FEWEST_PIXELS or free.max() < _REDUNDANT:
+    if freedom < 1 or gray.shape[1] < SetLimits.fewest_pixels or free.max() < _REDUNDANT:
         return NoiseModel(least, 0.0, "estimated")
     gains = samples.gains[used].astype(np.float64)
     fitted = hat @ gray[used]
@@ -46,17 +46,12 @@ def neighbor_noise(samples: SetSamples) -> NoiseModel:
     """
     least = samples.step**2 / 12 / samples.values.shape[-1]
     height, width = samples.dark.shape
-    step = max(1, height // max(1, 20 * MOST_PIXELS // max(width, 1)))
-    levels = []
-    differences = []
-    for k, picture in enumerate(samples.gray(np.s_[::step]).astype(np.float64)):
-        bad = samples.lost[k, ::step] | samples.dark[::step] | samples.masked[::step]
-        good = ~(bad[:, :-2] | bad[:, 1:-1] | bad[:, 2:])
-        gain = float(samples.gains[k])
-        levels.append(gain * picture[:, 1:-1][good])
-        differences.append(gain * (picture[:, 1:-1] - (picture[:, :-2] + picture[:, 2:]) / 2)[good])
-    level = np.concatenate(levels)
-    apart = np.concatenate(differences)
-    if len(level) < FEWEST_PIXELS:
+    step = max(1, height // max(1, 20 * SetLimits.most_pixels // max(width, 1)))
+    bad = samples.lost[:, ::step] | samples.dark[::step] | samples.masked[::step]
+    good = ~(bad[..., :-2] | bad[..., 1:-1] | bad[..., 2:])
+    pictures = samples.gains.astype(np.float64)[:, None, None] * samples.gray(np.s_[::step])
+    level = pictures[..., 1:-1][good]
+    apart = (pictures[..., 1:-1] - (pictures[..., :-2] + pictures[..., 2:]) / 2)[good]
+    if len(level) < SetLimits.fewest_pixels:
         return NoiseModel(least, 0.0, "estimated")
     return binned_noise(level, lambda part: typical_variance(apart[part] ** 2, 1) / 1.5, least)

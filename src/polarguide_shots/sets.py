@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,14 +23,19 @@ from polarguide.capture.exposures import (
     angles_of_names,
     conditioning,
     covers_turn,
-    files_of,
+    folders_of_angles,
     nominal,
     normalized,
     parse_angle,
-    read_table,
 )
 from polarguide.capture.filter.consecutive import VIDEO_SUFFIXES
-from polarguide.capture.filter.shots import SHOT_SUFFIXES, group_files
+from polarguide.capture.filter.shots import (
+    SHOT_SUFFIXES,
+    angle_order,
+    group_files,
+    listed_pictures,
+    views_of_names,
+)
 from polarguide.capture.layout import ambiguous, list_files
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
@@ -167,7 +172,7 @@ def _exposure_set(
 
     One picture each at 0, 45, 90 and 135 degrees, without gains, are a shot of four.
     """
-    mine = tuple(sorted(pictures, key=_order))
+    mine = tuple(sorted(pictures, key=lambda p: (*angle_order(p.angle), p.path.name, p.frame or 0)))
     if fault is None:
         try:
             require_determined(f"{(table or mine[0].path.parent)} ({name})", [p.angle for p in mine])
@@ -179,12 +184,6 @@ def _exposure_set(
     return ExposureSet(name, "set", {}, fault=fault, pictures=mine, table=table)
 
 
-def _order(picture: SetPicture) -> tuple[bool, float, str, int]:
-    word = isinstance(picture.angle, str)
-    angle = 0.0 if isinstance(picture.angle, str) else picture.angle
-    return word, angle, picture.path.name, picture.frame or 0
-
-
 def by_name(files: Sequence[Path]) -> tuple[list[ExposureSet], list[Path]]:
     """Sets by the names of files, and the files that belong to no set: of four angles at most, or without an angle.
 
@@ -194,62 +193,42 @@ def by_name(files: Sequence[Path]) -> tuple[list[ExposureSet], list[Path]]:
     rest: list[Path] = []
     for folder in dict.fromkeys(path.parent for path in files):
         inside = [path for path in files if path.parent == folder]
-        stated = angles_of_names([stem_of(path) for path in inside])
-        alone = all(name is not None and name[0] == "" for name in stated)
         views: dict[str, list[SetPicture]] = {}
-        for path, name in zip(inside, stated, strict=True):
-            if name is None or (name[0] == "" and not alone):
+        for path, name in zip(inside, views_of_names(folder, inside), strict=True):
+            if name is None:
                 rest.append(path)
             else:
-                views.setdefault(name[0] or canonical(folder.resolve().name), []).append(
-                    SetPicture(path, name[1])
-                )
-        more, four = _any_angles(folder, views)
-        sets += more
-        rest += four
+                views.setdefault(name[0], []).append(SetPicture(path, name[1]))
+        for view, mine in sorted(views.items()):
+            paths = [picture.path for picture in mine]
+            four = all(picture.angle in ANGLES for picture in mine)
+            # Names with a mark such as cup_a45 are known here alone.
+            if four and not (len(mine) == 4 and group_files(paths)[1]):
+                rest += paths
+            else:
+                sets.append(_named_set(folder, view, mine))
     return sets, rest
 
 
 def by_folder(root: Path) -> list[ExposureSet]:
     """Sets by folders named like angles, a file of each view in each; nothing where these are four at most."""
-    folders = [path for path in sorted(root.iterdir()) if path.is_dir() and not path.name.startswith(".")]
-    stated = angles_of_names([path.name for path in folders], folders=True)
     views: dict[str, list[SetPicture]] = {}
-    for folder, name in zip(folders, stated, strict=True):
-        if name is not None and name[0] == "":
-            for path in list_files(folder, SHOT_SUFFIXES):
-                views.setdefault(stem_of(path), []).append(SetPicture(path, name[1]))
+    for folder, angle in folders_of_angles(root).items():
+        for path in list_files(folder, SHOT_SUFFIXES):
+            views.setdefault(stem_of(path), []).append(SetPicture(path, angle))
     if all(picture.angle in ANGLES for mine in views.values() for picture in mine):
         return []
     return [_named_set(root, view, mine) for view, mine in sorted(views.items())]
-
-
-def _any_angles(folder: Path, views: dict[str, list[SetPicture]]) -> tuple[list[ExposureSet], list[Path]]:
-    """The sets of a folder; and the files of views at 0, 45, 90 and 135 degrees, or some of them."""
-    sets = []
-    four = []
-    for view, mine in sorted(views.items()):
-        paths = [picture.path for picture in mine]
-        # Of these angles, names with a mark such as cup_a45 are known here alone.
-        if all(picture.angle in ANGLES for picture in mine) and not (
-            len(mine) == 4 and group_files(paths)[1]
-        ):
-            four += paths
-        else:
-            sets.append(_named_set(folder, view, mine))
-    return sets, four
 
 
 def _named_set(folder: Path, view: str, pictures: Sequence[SetPicture]) -> ExposureSet:
     """A set by names: two files that state the same number are one picture too many."""
     first: dict[Angle, Path] = {}
     for picture in pictures:
-        if picture.angle in first:
-            what = f"one picture of {view} at {angle_text(picture.angle)} degrees"
-            return _exposure_set(
-                view, pictures, fault=ambiguous(folder, what, first[picture.angle], picture.path)
-            )
-        first[picture.angle] = picture.path
+        earlier = first.setdefault(picture.angle, picture.path)
+        if earlier is not picture.path:
+            expected = f"one picture of {view} at {angle_text(picture.angle)} degrees"
+            return _exposure_set(view, pictures, fault=ambiguous(folder, expected, earlier, picture.path))
     return _exposure_set(view, pictures)
 
 
@@ -263,25 +242,12 @@ def by_table(root: Path) -> tuple[list[ExposureSet], list[Path]]:
         PolarguideError: the table cannot be read, or names files outside of the folder or of other kinds.
     """
     table = root / TABLE
-    lines = read_table(table)
-    base = root.resolve()
-    files = dict(zip((line.file for line in lines), files_of(root, table, lines), strict=True))
-    for line in lines:
-        path = files[line.file]
-        inside = path.resolve().is_relative_to(base)
-        if not inside or path.suffix.lower() not in SHOT_SUFFIXES:
-            raise PolarguideError(
-                f"{table} (line {line.number})",
-                expected=f"a picture in {root} ({', '.join(SHOT_SUFFIXES)})",
-                found=line.file,
-                remedy="Copy or convert the file, or remove the line.",
-            )
-    views: dict[str, list[Line]] = {}
-    for line, view in zip(lines, _views_of(root, lines), strict=True):
-        views.setdefault(view, []).append(line)
-    taken = {path.resolve() for path in files.values()}
-    others = [path for path in list_files(root, SHOT_SUFFIXES) if path.resolve() not in taken]
-    return [_of_lines(files, table, view, mine) for view, mine in sorted(views.items())], others
+    rows, others = listed_pictures(root, table)
+    lines = [line for line, _ in rows]
+    views: dict[str, list[SetPicture]] = {}
+    for (line, path), view in zip(rows, _views_of(root, lines), strict=True):
+        views.setdefault(view, []).append(SetPicture(path, line.angle, line.gain))
+    return [_of_table(table, view, mine) for view, mine in sorted(views.items())], others
 
 
 def _views_of(root: Path, lines: Sequence[Line]) -> list[str]:
@@ -296,33 +262,36 @@ def _views_of(root: Path, lines: Sequence[Line]) -> list[str]:
     return [of_file[line.file] if line.view is None else line.view for line in lines]
 
 
-def _of_lines(files: Mapping[str, Path], table: Path, view: str, lines: Sequence[Line]) -> ExposureSet:
-    pictures = [SetPicture(files[line.file], line.angle, line.gain) for line in lines]
-    missing = [picture.path for picture in pictures if not picture.path.is_file()]
-    if not missing:
-        return _exposure_set(view, pictures, table)
+def _of_table(table: Path, view: str, pictures: Sequence[SetPicture]) -> ExposureSet:
+    """Return the set of a view's pictures; a missing file is its fault."""
+    there = [picture for picture in pictures if picture.path.is_file()]
+    missing = next((picture.path for picture in pictures if not picture.path.is_file()), None)
+    if missing is None:
+        return _exposure_set(view, there, table)
     fault = PolarguideError(
         table,
-        expected=f"the file {missing[0]}",
+        expected=f"the file {missing}",
         found="nothing of this name",
         remedy="Correct the file's name in the table, or remove its line.",
     )
-    there = [picture for picture in pictures if picture.path.is_file()]
     return _exposure_set(view, there, table, fault)
 
 
 def videos(files: Sequence[Path]) -> list[ExposureSet]:
     """Each video as a set, with the frames that the table beside it lists."""
-    return [_video(path) for path in files if path.suffix.lower() in VIDEO_SUFFIXES]
-
-
-def _video(path: Path) -> ExposureSet:
-    table = path.with_suffix(".csv")
-    try:
-        pictures = [SetPicture(path, angle, None, frame) for frame, angle in read_frame_table(table, path)]
-    except PolarguideError as error:
-        return _exposure_set(stem_of(path), [SetPicture(path, "unknown")], None, error)
-    return _exposure_set(stem_of(path), pictures, table)
+    sets = []
+    for path in files:
+        if path.suffix.lower() not in VIDEO_SUFFIXES:
+            continue
+        table = path.with_suffix(".csv")
+        try:
+            frames = read_frame_table(table, path)
+        except PolarguideError as error:
+            sets.append(_exposure_set(stem_of(path), [SetPicture(path, "unknown")], None, error))
+        else:
+            pictures = [SetPicture(path, angle, None, frame) for frame, angle in frames]
+            sets.append(_exposure_set(stem_of(path), pictures, table))
+    return sets
 
 
 _COLUMNS = ["frame", "angle"]

@@ -267,5 +267,5 @@ def test_full_scale_of_eight_bits() -> None:
 def test_curvature_needs_polarized_light() -> None:
     gray = np.full((4, 60, 60, 3), 30000, np.uint16)
     usable = np.ones((60, 60), bool)
-    assert checks.curvature([checks.measure(gray, usable)]) is None
-    assert checks.curvature([checks.measure(gray, ~usable)]) is None
+    assert checks.curvature_of(checks.measure(gray, usable).slopes) is None
+    assert checks.curvature_of(checks.measure(gray, ~usable).slopes) is None

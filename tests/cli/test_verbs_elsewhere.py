@@ -18,7 +18,7 @@ from polarguide.cli.app import run
 from polarguide.cli.runs import render
 from polarguide.core.options import ComputeOptions
 from polarguide.geometry.scene_frame import scene_frame
-from polarguide.inspection.evidence import short_run, surface_of
+from polarguide.inspection.evidence import short_run, trained_surface
 from polarguide.results.evaluation.metrics import HAZE_DEPTH
 from polarguide.results.evaluation.perceptual import load_package
 from polarguide.results.evaluation.scores import ErrorsByObject, score_view
@@ -102,7 +102,7 @@ def test_the_inspection_trains_there_and_compares_here(
         with pytest.raises(KeyboardInterrupt):
             short_run(scene, tmp_path, steps=2, backend=BACKEND, on_step=stop)
         state = short_run(scene, tmp_path, steps=2, backend=BACKEND, on_step=lambda _: None)
-        surface = surface_of(state, scene.views[0], BACKEND)
+        surface = trained_surface(state, scene.views[0], BACKEND)
     assert json.loads((tmp_path / "short_run.json").read_text())["steps"] == 2
     assert state.step == 2
     assert {t.device.type for t in (surface.normal, surface.depth, surface.known)} == {"cpu"}

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.capture import ColmapModel, checks
+from polarguide.capture import ColmapModel
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.polarizer import ANGLES
 from polarguide.inspection.capture import InspectedView
-from polarguide.inspection.evidence import Surface
+from polarguide.inspection.evidence import ViewSurface
 
 WIDTH, HEIGHT, INDEX = 72, 64, 1.5
 
@@ -77,7 +77,6 @@ def pictures_of(
             torch.zeros(HEIGHT, WIDTH, dtype=torch.bool),
             torch.zeros(HEIGHT, WIDTH, dtype=torch.bool),
             camera,
-            checks.Measures(0.0, (0.0, 0.0, 0.0), np.zeros(5)),
             60000,
         ),
         values.numpy(),
@@ -87,8 +86,7 @@ def pictures_of(
 def with_intensities(view: InspectedView, values: np.ndarray) -> InspectedView:
     """A view with other pictures."""
     codes = np.rint(np.clip(values, 0, 1) * 65535).astype(np.uint16)
-    usable = ~(view.invalid | view.saturated).numpy()
-    return dataclasses.replace(view, codes=torch.from_numpy(codes), measures=checks.measure(codes, usable))
+    return dataclasses.replace(view, codes=torch.from_numpy(codes))
 
 
 def mistaken(view: InspectedView, *, files: tuple[int, ...] = ANGLES, zero: float = 0.0) -> InspectedView:
@@ -97,13 +95,13 @@ def mistaken(view: InspectedView, *, files: tuple[int, ...] = ANGLES, zero: floa
     return with_intensities(view, values[[ANGLES.index(angle) for angle in files]])
 
 
-def surfaces(views: tuple[InspectedView, ...]) -> list[tuple[InspectedView, Surface]]:
+def surfaces(views: tuple[InspectedView, ...]) -> list[tuple[InspectedView, ViewSurface]]:
     """Views with the true surface."""
     pairs = []
     for view in views:
         assert view.camera is not None
         normal, depth, hit = ball(view.camera)
-        pairs.append((view, Surface(view.camera, normal, depth, hit)))
+        pairs.append((view, ViewSurface(view.camera, normal, depth, hit)))
     return pairs
 
 

@@ -8,21 +8,27 @@ import pytest
 import torch
 from glossy_ball import INDEX, mistaken, model_of, surfaces, views_around
 
+from polarguide.capture.angle_evidence import ORDERS, PAIRINGS, posterior
 from polarguide.capture.calibration import Calibration
-from polarguide.inspection.angles import (
-    ORDERS,
-    PAIRINGS,
-    combine_evidence,
-    handedness_check,
-    order_check,
-    posterior,
-    zero_check,
-)
+from polarguide.inspection.angles import AngleFindings, angle_checks, combine_evidence
 from polarguide.inspection.capture import measure_view
 from polarguide.inspection.evidence import normal_evidence, point_evidence, sample_surfaces
 from polarguide.inspection.picture_checks import dielectric_check, exceeds_dielectric
+from polarguide.inspection.settings import Check
 
 FIRST = ORDERS[0].files()
+
+
+def order_check(angles: AngleFindings) -> Check:
+    return angle_checks(angles)[0]
+
+
+def handedness_check(angles: AngleFindings) -> Check:
+    return angle_checks(angles)[1]
+
+
+def zero_check(angles: AngleFindings) -> Check:
+    return angle_checks(angles)[2]
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -131,7 +137,7 @@ def test_polarization_beyond_any_dielectric_is_flagged(ball_views) -> None:
     assert dielectric_check(measurements, pixels, INDEX).verdict == "ok"
     strong = type(pixels)(
         pixels.aolp, torch.full_like(pixels.dolp, 0.9), pixels.noise, pixels.azimuth,
-        torch.full_like(pixels.zenith, 0.3), pixels.position,
+        torch.full_like(pixels.zenith, 0.3), position=pixels.position,
     )  # fmt: skip
     check = dielectric_check(measurements, strong, INDEX)
     assert check.verdict == "warning"

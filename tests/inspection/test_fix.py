@@ -12,10 +12,11 @@ import pytest
 from captures import soft_intensities, write_scene
 from faults import Fault
 
+from polarguide.capture.angle_evidence import ORDERS, PAIRINGS, OrderPosterior
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.geometry.polarizer import ANGLES
 from polarguide.inspection import corrections as fixing
-from polarguide.inspection.angles import ORDERS, PAIRINGS, AngleFindings, OrderPosterior
+from polarguide.inspection.angles import AngleFindings
 from polarguide.inspection.capture import read_capture
 
 

@@ -26,7 +26,8 @@ TURNS = (0.0, 45.0, 90.0, 135.0)
 
 def judgment(view: int, angle: float, modulation: float = 0.9, spread: float = 3.0) -> Judgment:
     unknown = Exposure()
-    return Judgment(f"v{view}", 0, unknown, unknown, angle % 180.0, 1.0, modulation, spread, 0.02)
+    fitted = (angle % 180.0, 1.0, modulation, spread, 0.02, 0.0, 0.0)
+    return Judgment(*fitted, view=f"v{view}", number=0, specified=unknown, believed=unknown)
 
 
 def findings(found: list[float], said: list[float | None], modulation: float = 0.9) -> ShotFindings:

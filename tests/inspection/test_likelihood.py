@@ -7,10 +7,10 @@ import math
 import pytest
 import torch
 
-from polarguide.inspection.angles import (
-    FAILURE,
+from polarguide.capture.angle_evidence import (
     ORDERS,
-    Evidence,
+    AngleLimits,
+    OrderEvidence,
     OrderPosterior,
     combine,
     posterior,
@@ -39,7 +39,7 @@ def test_ratios_for_the_other_side_and_single_clusters_say_nothing() -> None:
     assert tempered(torch.tensor([5.0])) == 0.0
 
 
-def evidence_for(sense: int, zero: float, strength: float, clusters: int = 60) -> Evidence:
+def evidence_for(sense: int, zero: float, strength: float, clusters: int = 60) -> OrderEvidence:
     """Noisy evidence for one sense and zero."""
     generator = torch.Generator().manual_seed(3)
     angles = torch.deg2rad(torch.arange(180, dtype=torch.float64))
@@ -47,7 +47,7 @@ def evidence_for(sense: int, zero: float, strength: float, clusters: int = 60) -
     profile = strength * torch.cos(2 * (angles - torch.deg2rad(shifts)))
     other = 0.1 * strength * torch.randn(clusters, 180, generator=generator, dtype=torch.float64)
     rows = [profile, other] if sense > 0 else [other, profile]
-    return Evidence("test", torch.stack(rows, dim=1), clusters, True, "")
+    return OrderEvidence("test", torch.stack(rows, dim=1), clusters, True, "")
 
 
 @pytest.mark.parametrize(
@@ -60,19 +60,19 @@ def test_order_and_offset_are_found_with_their_error(sense: int, zero: float, be
     assert found.offset == pytest.approx(offset, abs=max(3 * found.offset_error, 0.1))
     assert 0.05 <= found.offset_error < 1.0
     assert sum(found.probabilities) == pytest.approx(1.0)
-    assert max(found.probabilities) == pytest.approx(1 - FAILURE * 7 / 8, abs=1e-3)
+    assert max(found.probabilities) == pytest.approx(1 - AngleLimits.failure * 7 / 8, abs=1e-3)
     assert found.sense_probability > 0.95 if sense > 0 else found.sense_probability < 0.05
 
 
 def test_weak_evidence_decides_nothing() -> None:
     generator = torch.Generator().manual_seed(5)
     noise = torch.randn(40, 2, 180, generator=generator)
-    assert max(posterior(Evidence("test", noise, 40, True, "")).probabilities) < 0.8
+    assert max(posterior(OrderEvidence("test", noise, 40, True, "")).probabilities) < 0.8
 
 
 def some_odds(best: int, offset: float, error: float) -> OrderPosterior:
-    probabilities = [FAILURE / 8] * 8
-    probabilities[best] += 1 - FAILURE
+    probabilities = [AngleLimits.failure / 8] * 8
+    probabilities[best] += 1 - AngleLimits.failure
     against = [20.0] * 8
     against[best] = 0.0
     return OrderPosterior(tuple(against), tuple(probabilities), offset, error)

@@ -10,19 +10,11 @@ import pytest
 import torch
 
 from polarguide import optics
+from polarguide.capture.angle_evidence import IDENTITY, ORDERS, PAIRINGS, Order, OrderPosterior, swaps
 from polarguide.capture.calibration import Calibration, oriented
 from polarguide.capture.sensor.pattern import sensor_pattern
 from polarguide.geometry.polarizer import ANGLES
-from polarguide.inspection.angles import (
-    IDENTITY,
-    MOSAICS,
-    ORDERS,
-    PAIRINGS,
-    AngleFindings,
-    Order,
-    OrderPosterior,
-    swaps,
-)
+from polarguide.inspection.angles import MOSAICS, AngleFindings
 
 
 def test_three_pairings_of_eight_orders_are_all_permutations() -> None:

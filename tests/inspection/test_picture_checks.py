@@ -10,8 +10,8 @@ import pytest
 from captures import gained, one_view, write_scene
 from tiny_capture import encode_srgb
 
+from polarguide.capture.angle_evidence import PAIRINGS
 from polarguide.geometry.polarizer import ANGLES
-from polarguide.inspection.angles import PAIRINGS
 from polarguide.inspection.capture import measure_view, read_capture
 from polarguide.inspection.picture_checks import find_pairing, picture_checks
 from polarguide.inspection.settings import Check

@@ -117,7 +117,7 @@ def test_gaps_and_few_views_are_named(posed, monkeypatch) -> None:
     near = tuple(
         dataclasses.replace(view, camera=camera_at(0.2 * k, 0.3, 0)) for k, view in enumerate(posed.views)
     )
-    monkeypatch.setattr(inspect, "FEW_VIEWS", 5)
+    monkeypatch.setattr(inspect.PoseLimits, "few_views", 5)
     assert inspect.coverage_check(dataclasses.replace(posed, views=near)).verdict == "ok"
     far = (*near[:-1], dataclasses.replace(near[-1], camera=camera_at(3.6, 0.3, 0)))
     check = inspect.coverage_check(dataclasses.replace(posed, views=far))

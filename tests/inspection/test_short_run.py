@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from polarguide.capture import load_scene
-from polarguide.inspection.evidence import photograph_digest, short_run, surface_of
+from polarguide.inspection.evidence import photograph_digest, short_run, trained_surface
 from polarguide.raster import choose_backend
 
 
@@ -46,7 +46,7 @@ def test_it_goes_on_and_is_not_repeated(small, tmp_path) -> None:
     assert seen == [0, 1, 2, 3, 4]
     state = short_run(small, tmp_path, steps=5, backend=backend, on_step=lambda r: seen.append(r.step))
     assert len(seen) == 5
-    surface = surface_of(state, small.views[0], backend)
+    surface = trained_surface(state, small.views[0], backend)
     assert surface.normal.shape == (*surface.known.shape, 3)
     assert surface.depth.shape == surface.known.shape
     short_run(small, tmp_path, steps=2, backend=backend, on_step=lambda r: seen.append(r.step))

@@ -22,19 +22,53 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.angle_evidence import angle_difference, jackknife_error
 from polarguide.capture.view import FULL_CODE
 from polarguide.core.text import listed
 from polarguide.geometry.polarizer import ANGLES
 
-TOP_SHARE = 0.02
-"""Share of the code range, from its top, in the histogram for ``full_scale``."""
-_FULL_SHARE = 0.002
-_DARK = 0.01
-_BLOWN_SHARE = 0.1
-_LOW_CODE = FULL_CODE // 256
-_SAMPLES = 20_000
-_RESIDUAL = 0.05
-# Curvature (see Measures) of encoded data taken as linear is about -0.6, of linear data decoded as sRGB about
+
+class CheckLimits:
+    """Constants of the checks.
+
+    Attributes:
+        top_share: share of the code range, from its top, in the histogram for ``full_scale``.
+        full_share: share of the code range, from its top, in which values can be full scale.
+        dark: 99th percentile of the intensities below which a view is almost black.
+        blown: share of saturated pixels above which a view is heavily saturated.
+        low_code: code below which quantization hides the polarization.
+        samples: largest number of pixels of a view that are measured.
+        residual: residual of the pair sums of a sound capture, as a share of S0.
+        right_angle: degrees by which two angles may differ from right ones: a pair sum is then off by two percent of
+            the polarized light.
+        other_exposure: difference of logarithms from which on exposures differ: half of a third of a stop, the step of
+            cameras.
+        sure: standard errors that count as certain.
+        tiles: tiles of a picture in each direction, for jackknife errors.
+        hidden: share of the largest value below which read-out noise hides the polarization.
+        fewest: number of pixels that a regression needs.
+        least_spread: standard deviation of the regressor that a regression needs.
+        moment_samples: largest number of pixels of a view for second moments.
+    """
+
+    top_share = 0.02
+    full_share = 0.002
+    dark = 0.01
+    blown = 0.1
+    low_code = FULL_CODE // 256
+    samples = 20_000
+    residual = 0.05
+    right_angle = 1.0
+    other_exposure = math.log(2.0) / 6
+    sure = 3.0
+    tiles = 4
+    hidden = 0.01
+    fewest = 1000
+    least_spread = 0.005
+    moment_samples = 1 << 18
+
+
+# Curvature (see ``pair_slopes``) of encoded data taken as linear is about -0.6, of linear data decoded as sRGB about
 # +0.3; the gain differences of real sensors leave less than 0.1.
 ENCODED = (-0.12, -0.25)
 """Curvatures below which files seem encoded: for a doubt, and for a decision."""
@@ -52,14 +86,12 @@ class Measures:
         bright: 99th percentile of the linear intensities, in [0, 1].
         residuals: median of |difference of the two pair sums| / S0 for the three ways to pair the pictures:
             (0, 90 | 45, 135), (0, 45 | 90, 135), (0, 135 | 45, 90). The first is zero for an ideal capture.
-        sums: sums of the regression of r = (I0 + I90 - I45 - I135) / S0 on q = ((I0 - I90) / S0)^2 -
-            ((I45 - I135) / S0)^2: number of pixels, sums of q, r, q q, q r. Linear data have slope 0 whatever
-            the gains of the four pictures; a concave encoding bends it down, a convex one up.
+        slopes: ``pair_slopes`` of the two pairs; empty with too few pixels.
     """
 
     bright: float
     residuals: tuple[float, float, float]
-    sums: NDArray[np.float64]
+    slopes: list[NDArray[np.float64]]
 
 
 def sampled(codes: NDArray[Any]) -> NDArray[Any]:
@@ -70,7 +102,7 @@ def sampled(codes: NDArray[Any]) -> NDArray[Any]:
 
 def _step(pixels: int) -> int:
     """Distance of the pixels that are measured."""
-    return max(1, math.ceil(math.sqrt(pixels / _SAMPLES)))
+    return max(1, math.ceil(math.sqrt(pixels / CheckLimits.samples)))
 
 
 def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_], *, four: bool = True) -> Measures:
@@ -85,23 +117,21 @@ def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_], *, four: bool 
     sample = (codes if codes.shape[1:3] != usable.shape else codes[:, ::step, ::step]).astype(np.float64)
     bright = float(np.percentile(sample, 99.0)) / FULL_CODE
     gray = sample.mean(axis=3)
-    angles = gray[:, usable[::step, ::step] & (gray.min(axis=0) > _LOW_CODE)]
+    usable = usable[::step, ::step]
+    angles = gray[:, usable & (gray.min(axis=0) > CheckLimits.low_code)]
     if not four or angles.shape[1] < 16:
-        return Measures(bright, (0.0, 0.0, 0.0), np.zeros(5))
+        return Measures(bright, (0.0, 0.0, 0.0), [])
     i0, i45, i90, i135 = angles
     s0 = (i0 + i45 + i90 + i135) / 2.0
     differences = (i0 + i90 - i45 - i135, i0 + i45 - i90 - i135, i0 + i135 - i45 - i90)
     first, second, third = (float(np.median(np.abs(difference) / s0)) for difference in differences)
-    r = differences[0] / s0
-    q = ((i0 - i90) / s0) ** 2 - ((i45 - i135) / s0) ** 2
-    sums = np.array([len(r), q.sum(), r.sum(), (q * q).sum(), (q * r).sum()])
-    return Measures(bright, (first, second, third), sums)
+    return Measures(bright, (first, second, third), pair_slopes(sample, usable, FOUR_PAIRS))
 
 
 def top_histogram(raw: NDArray[Any]) -> NDArray[np.int64]:
     """Counts of the stored values in the top 2 % of their range, the last for the largest possible value."""
     full = int(np.iinfo(raw.dtype).max)
-    low = full - int(full * TOP_SHARE)
+    low = full - int(full * CheckLimits.top_share)
     return np.bincount(raw[raw >= low].astype(np.int64) - low, minlength=full - low + 1)
 
 
@@ -125,7 +155,7 @@ def full_scale(histogram: NDArray[np.int64], full: int) -> int | None:
         return value
     near = int(histogram[:top].max(initial=0))
     piled_up = histogram[top] >= 3 and histogram[top] > 3 * near
-    return value if value >= full * (1.0 - _FULL_SHARE) and piled_up else None
+    return value if value >= full * (1.0 - CheckLimits.full_share) and piled_up else None
 
 
 def exposure_warnings(
@@ -147,13 +177,13 @@ def exposure_warnings(
             f"The pictures are 16-bit files, yet no value exceeds {largest}: they look like unscaled {bits}-bit "
             f"data. Multiply the values by {2 ** (16 - bits)}."
         ]
-    dark = [name for name, measure in zip(names, measures, strict=True) if measure.bright < _DARK]
+    dark = [name for name, measure in zip(names, measures, strict=True) if measure.bright < CheckLimits.dark]
     if dark:
         warnings.append(
-            f"{len(dark)} of {len(names)} views are almost black: 99% of their values are under {_DARK:.0%} "
+            f"{len(dark)} of {len(names)} views are almost black: 99% of their values are under {CheckLimits.dark:.0%} "
             f"of full scale ({listed(dark)}). Expose longer, or leave them out."
         )
-    over = [name for name, share in zip(names, blown, strict=True) if share > _BLOWN_SHARE]
+    over = [name for name, share in zip(names, blown, strict=True) if share > CheckLimits.blown]
     if over:
         warnings.append(
             f"{len(over)} of {len(names)} views are heavily saturated: up to {max(blown):.0%} of the pixels "
@@ -169,128 +199,114 @@ def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], tr
     swapped = False
     if off:
         pairs = np.median(list(off.values()), axis=0)
-        hint = "Probably files are swapped, or the transfer is wrong"
         best = int(pairs.argmin())
-        if best:
-            swap = ("45 and 90 (or 0 and 135)", "90 and 135 (or 0 and 45)")[best - 1]
-            hint = f"The pictures at {swap} degrees are probably swapped"
-            swapped = len(off) * 2 > len(names)
+        swapped = best > 0 and len(off) * 2 > len(names)
+        hint = (
+            "Probably files are swapped, or the transfer is wrong",
+            "The pictures at 45 and 90 (or 0 and 135) degrees are probably swapped",
+            "The pictures at 90 and 135 (or 0 and 45) degrees are probably swapped",
+        )[best]
         warnings.append(
             f"I0 + I90 differs from I45 + I135 by {pairs[0]:.1%} of S0 (median) in {len(off)} of "
-            f"{len(names)} views ({listed(list(off))}); a sound capture stays under {_RESIDUAL:.0%}. {hint}."
+            f"{len(names)} views ({listed(list(off))}); a sound capture stays under {CheckLimits.residual:.0%}. {hint}."
         )
-    slope = curvature(measures)
-    if swapped or slope is None:  # the slope is meaningless with wrong pairs
+    curvature = curvature_of([tile for measure in measures for tile in measure.slopes])
+    if swapped or curvature is None:  # the slope is meaningless with wrong pairs
         return warnings
-    if transfer == "linear" and encoding(Curvature(slope)) == "srgb":
+    if transfer == "linear" and encoding(curvature) == "srgb":
         warnings.append(
-            f"The pictures look sRGB-encoded (curvature {slope:.2f}, linear ones have 0): "
+            f"The pictures look sRGB-encoded (curvature {curvature.value:.2f}, linear ones have 0): "
             "if they are, read them with transfer srgb."
         )
-    if transfer == "srgb" and slope > DECODED[1]:
+    if transfer == "srgb" and curvature.value > DECODED[1]:
         warnings.append(
-            f"The pictures look linear already (curvature {slope:.2f} after decoding, 0 is right): "
+            f"The pictures look linear already (curvature {curvature.value:.2f} after decoding, 0 is right): "
             "if they are, read them with transfer linear."
         )
     return warnings
 
 
-def curvature(measures: Sequence[Measures]) -> float | None:
-    """Slope of the regression described in ``Measures``, over all views; None if too few pixels are polarized."""
-    return slope([measure.sums for measure in measures])
-
-
-def slope(sums: Sequence[NDArray[np.float64]]) -> float | None:
-    """The slope of several such regressions together; None if too few pixels are polarized."""
-    if not sums:
-        return None
-    count, q, r, qq, qr = np.sum(sums, axis=0)
-    if count < 1000:
-        return None
-    spread = qq / count - (q / count) ** 2
-    if spread < 0.005**2:
-        return None
-    return float((qr / count - q / count * r / count) / spread)
-
-
-_RIGHT = 1.0
-"""Degrees by which two angles may differ from right ones: a pair sum is off by two percent of the polarized light."""
+FOUR_PAIRS = ((0, 2), (1, 3))
+"""Places of the perpendicular pictures among four at 0, 45, 90 and 135 degrees."""
 
 
 def right_pairs(angles: Sequence[object]) -> list[tuple[int, int]]:
     """Places of pictures that lie at right angles to one another, each in one pair; words are no angles."""
-    free = {place: angle for place, angle in enumerate(angles) if isinstance(angle, int | float)}
+    free = [(place, angle) for place, angle in enumerate(angles) if isinstance(angle, int | float)]
     pairs = []
     while free:
-        place, angle = next(iter(free.items()))
-        del free[place]
-        other = next((k for k, at in free.items() if abs((at - angle) % 180 - 90) <= _RIGHT), None)
+        place, angle = free.pop(0)
+        allowed = CheckLimits.right_angle
+        other = next((one for one in free if abs(angle_difference(one[1], angle + 90)) <= allowed), None)
         if other is not None:
-            del free[other]
-            pairs.append((place, other))
+            free.remove(other)
+            pairs.append((place, other[0]))
     return pairs
 
 
 @dataclass(frozen=True)
 class Curvature:
-    """A slope of the regression described in ``Measures``, with its standard error (jackknife over tiles)."""
+    """Curvature of the response, with its standard error (jackknife over tiles)."""
 
     value: float
-    error: float = 0.0
+    error: float
 
     def surely_below(self, limit: float) -> bool:
-        """True where the slope is below a limit by more than three standard errors."""
-        return self.value + _SURE * self.error < limit
+        """Return true if the curvature is below a limit by more than three standard errors."""
+        return self.value + CheckLimits.sure * self.error < limit
 
     def surely_above(self, limit: float) -> bool:
-        """True where the slope is above a limit by more than three standard errors."""
-        return self.value - _SURE * self.error > limit
+        """Return true if the curvature is above a limit by more than three standard errors."""
+        return self.value - CheckLimits.sure * self.error > limit
 
 
 def pair_slopes(
-    codes: NDArray[np.uint16], usable: NDArray[np.bool_], pairs: Sequence[tuple[int, int]]
+    codes: NDArray[Any], usable: NDArray[np.bool_], pairs: Sequence[tuple[int, int]]
 ) -> list[NDArray[np.float64]]:
-    """Sums of the regression described in ``Measures`` over every two of a view's pairs, for each of its tiles.
+    """Return sums of a regression over every two of a view's pairs for each tile: number of pixels, q q, q r.
 
-    Pictures of different exposures add shares of I0 - I90 and I45 - I135 to the difference of the sums (to first order,
-    and before a curve, too). A fit of both is taken off, so that nothing is assumed of the exposures.
+    The regression is that of the difference r of two pair sums over S0, (I0 + I90 - I45 - I135) / S0, on the difference
+    q of the squared polarizations, ((I0 - I90) / S0)^2 - ((I45 - I135) / S0)^2. Linear data have slope 0; a concave
+    encoding bends it down, a convex one up. Pictures of different exposures add shares of I0 - I90 and I45 - I135 to
+    the difference of the sums, to first order. A fit of both is subtracted, so nothing is assumed of the exposures.
 
     Args:
-        codes: linear codes [K, H, W, C] of a sample of the view. usable: [H, W]. pairs: of ``right_pairs``.
+        codes: linear codes [K, H, W, C] of a view, or of a sample of it.
+        usable: [H, W].
+        pairs: places of perpendicular pictures, see ``right_pairs``.
     """
     if len(pairs) < 2:
         return []
     gray = codes.mean(axis=3, dtype=np.float64)
-    usable = usable & (gray.min(axis=0) > _LOW_CODE)
-    rows, columns = (np.arange(size) * _TILES // size for size in usable.shape)
-    tile = (rows[:, None] * _TILES + columns)[usable]
+    usable = usable & (gray.min(axis=0) > CheckLimits.low_code)
+    rows, columns = (np.arange(size) * CheckLimits.tiles // size for size in usable.shape)
+    tile = (rows[:, None] * CheckLimits.tiles + columns)[usable]
     first, second = (gray[:, usable][[pair[side] for pair in pairs]] for side in (0, 1))
     s0 = (first + second).mean(axis=0)
     sums = (first + second) / s0
     polarized = (first - second) / s0
-    tiles = np.zeros((_TILES**2, 5))
+    tiles = np.zeros((CheckLimits.tiles**2, 3))
     for one, other in itertools.combinations(range(len(pairs)), 2):
         taken_off = np.stack([np.ones_like(s0), polarized[one], polarized[other]], axis=1)
         both = np.stack([polarized[one] ** 2 - polarized[other] ** 2, sums[one] - sums[other]], axis=1)
         q, r = (both - taken_off @ np.linalg.lstsq(taken_off, both, rcond=None)[0]).T
-        for place, values in ((0, np.ones_like(q)), (3, q * q), (4, q * r)):
+        for place, values in enumerate((np.ones_like(q), q * q, q * r)):
             tiles[:, place] += np.bincount(tile, values, len(tiles))
     return [tile for tile in tiles if tile[0] > 0]
 
 
 def curvature_of(tiles: Sequence[NDArray[np.float64]]) -> Curvature | None:
-    """The curvature by the tiles of all views (``pair_slopes``); None if too few pixels are polarized."""
-    value = slope(tiles)
-    if value is None or len(tiles) < 2:
+    """Return the curvature of the response by the ``pair_slopes`` of all views; None with too little polarization."""
+    total = np.sum(tiles, axis=0)
+    if len(tiles) < 2 or total[0] < CheckLimits.fewest or total[1] < total[0] * CheckLimits.least_spread**2:
         return None
-    without = np.sum(tiles, axis=0) - np.stack(tiles)
-    slopes = without[:, 4] / without[:, 3]
-    error = math.sqrt(((slopes - value) ** 2).sum() * (len(tiles) - 1) / len(tiles))
-    return Curvature(value, error)
+    value = total[2] / total[1]
+    without = total - np.stack(tiles)
+    return Curvature(float(value), float(jackknife_error(value, without[:, 2] / without[:, 1])))
 
 
 def encoding(found: Curvature | None) -> Literal["linear", "srgb"] | None:
-    """How files are encoded that have this curvature when they are read as linear; None where it does not tell.
+    """Return the encoding of files with this curvature when read as linear; None if it is undecided.
 
     The one judgment of ``prepare``, ``inspect`` and the warnings of ``train``.
     """
@@ -303,19 +319,9 @@ def encoding(found: Curvature | None) -> Literal["linear", "srgb"] | None:
 
 
 def _is_off(residuals: tuple[float, float, float]) -> bool:
-    """Whether the residual of the named pairing is large, or much larger than that of another pairing."""
+    """Return true if the residual of the named pairing is large, or much larger than another."""
     right, *others = residuals
-    return right > _RESIDUAL or (right > 0.4 * _RESIDUAL and min(others) < 0.25 * right)
-
-
-OTHER_EXPOSURE = math.log(2.0) / 6
-"""Difference of logarithms from which on exposures differ: half of a third of a stop, the step of cameras."""
-_SURE = 3.0
-_TILES = 4
-# Of the largest value; read-out noise hides the polarization of darker pixels.
-_HIDDEN = 0.01
-_FEWEST = 1000
-_MOMENT_SAMPLES = 1 << 18
+    return right > CheckLimits.residual or (right > 0.4 * CheckLimits.residual and min(others) < 0.25 * right)
 
 
 @dataclass(frozen=True)
@@ -329,8 +335,8 @@ class MeasuredGains:
             pair, 1 where 0 and 45 are, 2 where 0 and 135 are; None where the samples contradict any.
     """
 
-    logs: tuple[float, float, float, float]
-    errors: tuple[float, float, float, float]
+    logs: tuple[float, ...]
+    errors: tuple[float, ...]
     pairing: int | None
 
     def deviating(self, stated: Sequence[float] = (0.0, 0.0, 0.0, 0.0)) -> dict[int, float]:
@@ -345,7 +351,7 @@ class MeasuredGains:
         deviations = {}
         for place, angle in enumerate(ANGLES):
             apart = off[place] - float(np.median(off[:place] + off[place + 1 :]))
-            if abs(apart) > max(OTHER_EXPOSURE, _SURE * max(self.errors)):
+            if abs(apart) > max(CheckLimits.other_exposure, CheckLimits.sure * max(self.errors)):
                 deviations[angle] = math.exp(apart)
         return deviations
 
@@ -356,21 +362,17 @@ def pair_moments(gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> 
     Args:
         gray: linear intensities [4, H, W]. usable: [H, W].
     """
-    step = max(1, math.ceil(math.sqrt(usable.size / _MOMENT_SAMPLES)))
+    step = max(1, math.ceil(math.sqrt(usable.size / CheckLimits.moment_samples)))
     gray = gray[:, ::step, ::step].astype(np.float64)
     usable = usable[::step, ::step]
     total = gray.sum(axis=0)
-    usable = usable & (total > 4 * _HIDDEN * float(gray.max(initial=0)))
+    usable = usable & (total > 4 * CheckLimits.hidden * float(gray.max(initial=0)))
     rows = np.where(usable, gray / np.where(usable, total, 1.0), 0.0)
     tiles = []
-    for band, mask in zip(
-        np.array_split(rows, _TILES, axis=1), np.array_split(usable, _TILES, axis=0), strict=True
-    ):
-        for part, mine in zip(
-            np.array_split(band, _TILES, axis=2), np.array_split(mask, _TILES, axis=1), strict=True
-        ):
-            flat = part.reshape(4, -1)
-            tiles.append(np.vstack([flat @ flat.T, [mine.sum()] * 4]))
+    for band in np.array_split(np.concatenate([rows, usable[None]]), CheckLimits.tiles, axis=1):
+        for part in np.array_split(band, CheckLimits.tiles, axis=2):
+            flat = part[:4].reshape(4, -1)
+            tiles.append(np.vstack([flat @ flat.T, [part[4].sum()] * 4]))
     return np.stack(tiles)
 
 
@@ -384,19 +386,15 @@ def measured_gains(moments: NDArray[np.float64]) -> MeasuredGains | None:
         None where too few pixels are bright enough.
     """
     moments = moments[moments[:, 4, 0] > 0]
-    if len(moments) < 2 or moments[:, 4, 0].sum() < _FEWEST:
+    if len(moments) < 2 or moments[:, 4, 0].sum() < CheckLimits.fewest:
         return None
     total = moments.sum(axis=0)
     vector = _least(total)
-    without = np.stack([_least(total - tile) for tile in moments])
-    pairs = [(0, 2), (0, 1), (0, 3)]
     signs = np.sign(vector)
-    alike = [k for k, (a, b) in enumerate(pairs) if signs[a] == signs[b] and signs.sum() == 0]
+    alike = [k for k, other in enumerate((2, 1, 3)) if signs[0] == signs[other] and signs.sum() == 0]
     logs = _logs(vector)
-    spread = _logs(without) - logs
-    count = len(moments)
-    errors = np.sqrt((spread**2).sum(axis=0) * (count - 1) / count)
-    return MeasuredGains(_four(logs), _four(errors), alike[0] if len(alike) == 1 else None)
+    errors = jackknife_error(logs, _logs(np.stack([_least(total - tile) for tile in moments])))
+    return MeasuredGains(tuple(logs.tolist()), tuple(errors.tolist()), alike[0] if len(alike) == 1 else None)
 
 
 def _least(moments: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -408,8 +406,3 @@ def _logs(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Logarithms of gains, mean 0, of vectors of their inverses [..., 4]."""
     logs = -np.log(np.maximum(np.abs(vectors), 1e-9))
     return np.asarray(logs - logs.mean(axis=-1, keepdims=True))
-
-
-def _four(values: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    first, second, third, fourth = (float(value) for value in values)
-    return first, second, third, fourth

@@ -14,25 +14,34 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from polarguide.capture.angle_evidence import angle_difference, tolerance
 from polarguide.capture.exposures import WELL_CONDITIONED, Exposure, conditioning, nominal
 from polarguide.capture.view import FULL_CODE
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
-MARKS = 2.0
-"""Degrees to which a ring is set by its marks: an angle that is off by less is not called wrong."""
-AGAINST = 4.0
-"""Times the typical difference of the other pictures from which on one contradicts them."""
-BRIGHTER = 0.03
-"""Share of the light from which on a picture that contradicts the others is called brighter, or darker."""
-MOST_PIXELS = 20_000
-"""Most pixels of a set that are compared."""
-FEWEST_PIXELS = 200
-"""Number of pixels from which on pictures are compared."""
-_TELLING = 1.0
-"""Degrees of standard error up to which the light tells a picture's angle."""
-_OVER_NOISE = 3.0
-"""Times what noise alone makes of it, from which on a variation of the polarization over the picture is one."""
+
+
+class SetLimits:
+    """Constants of the comparison of pictures.
+
+    Attributes:
+        marks: degrees to which a ring is set by its marks. A smaller difference is not called wrong.
+        against: times the typical residual of the other pictures from which on a picture contradicts them.
+        brighter: share of the light from which on a contradicting picture is called brighter or darker.
+        most_pixels: largest number of pixels of a set that are compared.
+        fewest_pixels: number of pixels from which on pictures are compared.
+        determined: standard error in degrees up to which the light determines a picture's angle.
+        over_noise: times the noise from which on the polarization varies over the picture.
+    """
+
+    marks = 2.0
+    against = 4.0
+    brighter = 0.03
+    most_pixels = 20_000
+    fewest_pixels = 200
+    determined = 1.0
+    over_noise = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +87,10 @@ class SetSamples:
 
     def gray(self, at: Any) -> NDArray[np.float32]:
         """The same of the luminance, the plain mean of the colors: [K, ...]."""
-        colors = self.intensities(at)
-        return luminance(colors)
+        return mean_color(self.intensities(at))
 
 
-def luminance(colors: NDArray[np.float32]) -> NDArray[np.float32]:
+def mean_color(colors: NDArray[np.float32]) -> NDArray[np.float32]:
     """The plain mean of one or three colors [..., C], contiguous: [...]. Written out: NumPy's mean of three is slow."""
     if colors.shape[-1] == 1:
         return np.ascontiguousarray(colors[..., 0])
@@ -128,11 +136,20 @@ class SetJudgment:
 
 
 @dataclass(frozen=True)
-class _Angle:
-    """Prediction of a picture from the others: apparent angle, its error (radians; None: undetermined), gain."""
+class _Prediction:
+    """Comparison of a picture with the Stokes vectors of the others.
+
+    Attributes:
+        angle: apparent angle in degrees; None where the light does not tell.
+        error: standard error of the angle, degrees.
+        off: difference of the apparent angle from the stated one, degrees; 0 without an apparent angle.
+        gain: brightness over the predicted one.
+        residual: root mean square of the differences.
+    """
 
     angle: float | None
     error: float
+    off: float
     gain: float
     residual: float
 
@@ -143,7 +160,7 @@ def chosen_pixels(samples: SetSamples) -> tuple[NDArray[Any], NDArray[Any]]:
     for lost in samples.lost:
         good &= ~lost
     places = np.flatnonzero(good)
-    places = places[:: max(1, len(places) // MOST_PIXELS)]
+    places = places[:: max(1, len(places) // SetLimits.most_pixels)]
     return np.unravel_index(places, good.shape)  # type: ignore[return-value]
 
 
@@ -154,128 +171,127 @@ def judge(samples: SetSamples, gray: Floats) -> SetJudgment:
     pixels at once. The picture with the largest deviation is left out, as long as enough others agree without it.
 
     Args:
-        samples: the set. gray: [K, N], its luminance at some pixels that are good in every picture.
+        samples: the set.
+        gray: luminance [K, N] at some pixels that are good in every picture.
     """
-    rows = samples.rows.astype(np.float64)
     count = len(samples.labels)
     used = np.ones(count, bool)
     reasons: dict[int, str] = {}
-    while gray.shape[1] >= FEWEST_PIXELS:
-        predicted = {k: _predicted(rows, gray, used, k) for k in np.flatnonzero(used).tolist()}
+    while gray.shape[1] >= SetLimits.fewest_pixels:
+        predicted = _predictions(samples, gray, used, used)
         # Candidates: the picture with the largest residual, and the one with the largest error of its angle.
         doubtful = (
             max(predicted, key=lambda k: predicted[k].residual),
-            max(predicted, key=lambda k: _off(samples, k, predicted[k])),
+            max(predicted, key=lambda k: predicted[k].off),
         )
-        worst = next((k for k in doubtful if _contradicts(samples, gray, used, k, predicted)), None)
+        worst = next((k for k in doubtful if _contradicts(samples, gray, used, k, predicted[k])), None)
         if worst is None:
             break
         used[worst] = False
         reasons[worst] = _reason(samples, worst, predicted[worst])
-    fits = tuple(_picture(samples, k, _predicted(rows, gray, used, k), bool(used[k])) for k in range(count))
     notes = [reasons[k] for k in sorted(reasons)]
-    off_by = [abs(_apart(f.looks_like, f.angle)) for f in fits if f.looks_like is not None and not f.left_out]
-    if count > 3 and off_by and np.median(off_by) > MARKS:
+    final = _predictions(samples, gray, used, np.ones(count, bool))
+    off_by = [final[k].off for k in np.flatnonzero(used).tolist() if final[k].angle is not None]
+    if count > 3 and off_by and np.median(off_by) > SetLimits.marks:
         notes.append(
             f"The angles contradict one another by {np.median(off_by):.0f} degrees (median); "
             f"{int(used.sum())} pictures do not tell which are wrong."
         )
+    fits = tuple(
+        PictureFit(
+            label=samples.labels[k],
+            angle=samples.exposures[k].angle or 0.0,
+            gain=samples.exposures[k].gain,
+            looks_like=None if found.angle is None else round(found.angle, 1),
+            error=None if found.angle is None else found.error,
+            residual=found.residual,
+            left_out=not used[k],
+        )
+        for k, found in final.items()
+    )
     return SetJudgment(fits, used, tuple(notes))
 
 
-def _apart(angle: float, other: float) -> float:
-    """Difference of two angles in degrees modulo 180, in [-90, 90)."""
-    return (angle - other + 90.0) % 180.0 - 90.0
-
-
-def _off(samples: SetSamples, k: int, predicted: _Angle) -> float:
-    """How far a picture's angle is off, degrees; 0 where the light does not tell."""
-    if predicted.angle is None:
-        return 0.0
-    return abs(_apart(math.degrees(predicted.angle), samples.exposures[k].angle or 0.0))
-
-
-def _contradicts(
-    samples: SetSamples, gray: Floats, used: NDArray[np.bool_], worst: int, predicted: dict[int, _Angle]
-) -> bool:
-    """True where a picture is far further from the others, by angle or residual, than they are from one another."""
+def _contradicts(samples: SetSamples, gray: Floats, used: Mask, worst: int, predicted: _Prediction) -> bool:
+    """Return true if a picture is far further from the others, by angle or residual, than they are from one another."""
     rows = samples.rows.astype(np.float64)
     rest = used.copy()
     rest[worst] = False
     if rest.sum() < 4 or conditioning(torch.from_numpy(2 * rows[rest, 1:])) < WELL_CONDITIONED:
         return False
-    others = {k: _predicted(rows, gray, rest, k) for k in np.flatnonzero(rest).tolist()}
-    typical = float(np.median([_off(samples, k, other) for k, other in others.items()]))
-    left = float(np.median([other.residual for other in others.values()]))
-    by_angle = _off(samples, worst, predicted[worst]) > max(MARKS, AGAINST * typical)
-    return by_angle or predicted[worst].residual > AGAINST * left
+    others = _predictions(samples, gray, rest, rest).values()
+    typical = float(np.median([other.off for other in others]))
+    left = float(np.median([other.residual for other in others]))
+    return (
+        predicted.off > tolerance(SetLimits.marks, 0.0, typical)
+        or predicted.residual > SetLimits.against * left
+    )
 
 
-def _reason(samples: SetSamples, k: int, predicted: _Angle) -> str:
-    """The reason why a picture is rejected, for the user."""
-    head = f"{samples.labels[k]} ({samples.exposures[k].angle or 0.0:g} degrees)"
-    if _off(samples, k, predicted) > MARKS:
-        looks = f"{math.degrees(predicted.angle or 0.0) % 180:.0f} degrees"
-        return f"{head} looks like {looks}: its angle is probably wrong. It is left out."
-    if abs(predicted.gain - 1) > BRIGHTER:
-        way = "brighter" if predicted.gain > 1 else "darker"
-        by = f"{abs(predicted.gain - 1):.0%} {way}"
-        return f"{head} is {by} than the others predict (exposure or light). It is left out."
-    return f"{head} contradicts the others (motion, light or a wrong angle). It is left out."
+def _reason(samples: SetSamples, k: int, predicted: _Prediction) -> str:
+    """Return the reason why a picture is rejected, for the user."""
+    change = predicted.gain - 1
+    if predicted.angle is not None and predicted.off > SetLimits.marks:
+        reason = f"looks like {predicted.angle:.0f} degrees: its angle is probably wrong"
+    elif abs(change) > SetLimits.brighter:
+        way = "brighter" if change > 0 else "darker"
+        reason = f"is {abs(change):.0%} {way} than the others predict (exposure or light)"
+    else:
+        reason = "contradicts the others (motion, light or a wrong angle)"
+    return f"{samples.labels[k]} ({samples.exposures[k].angle or 0.0:g} degrees) {reason}. It is left out."
 
 
-def _predicted(rows: Floats, gray: Floats, used: NDArray[np.bool_], k: int) -> _Angle:
-    """One picture as the others predict it: by least squares over angle and gain.
+def _predictions(samples: SetSamples, gray: Floats, used: Mask, asked: Mask) -> dict[int, _Prediction]:
+    """Compare each picture in ``asked`` with those in ``used`` other than itself."""
+    rows = samples.rows.astype(np.float64)
+    found = {}
+    for k in np.flatnonzero(asked).tolist():
+        others = used.copy()
+        others[k] = False
+        found[k] = _predicted(rows, gray, others, k, samples.exposures[k].angle or 0.0)
+    return found
+
+
+def _predicted(rows: Floats, gray: Floats, others: Mask, k: int, stated: float) -> _Prediction:
+    """Predict one picture from the others, by least squares over angle and gain.
 
     With m = (1, cos 2t, sin 2t) / 2 times the Stokes vector, the angle t has the least sum of (I - g m)^2. Moments of
     the Stokes vectors are taken without what noise adds to them, or unpolarized light would tell an angle.
     """
     if not gray.shape[1]:  # some picture clips everywhere
-        return _Angle(None, math.inf, 1.0, 0.0)
-    others = used.copy()
-    others[k] = False
+        return _Prediction(None, math.inf, 0.0, 1.0, 0.0)
     inverse = np.linalg.pinv(rows[others])
     stokes = inverse @ gray[others]
     picture = gray[k]
     pixels = picture.size
     left = gray[others] - rows[others] @ stokes
     freedom = int(others.sum()) - 3
-    off = picture - rows[k] @ stokes
     leverage = float(((rows[k] @ inverse) ** 2).sum())
-    residual = math.sqrt(float(np.mean(off**2)) / (1 + leverage))
+    residual = math.sqrt(float(np.mean((picture - rows[k] @ stokes) ** 2)) / (1 + leverage))
     # Robust: a few pixels that moved do not make all of them noisy. Without redundancy, the picture's own residual.
     noise = residual**2 if freedom < 1 else typical_variance((left**2).sum(axis=0), freedom)
     extra = noise * inverse @ inverse.T / 4
     moments = stokes @ stokes.T / (4 * pixels) - extra
     product = stokes @ picture / (2 * pixels)
-    turns = np.radians(np.arange(0.0, 180.0, 0.1))
-    forms = np.stack([np.ones_like(turns), np.cos(2 * turns), np.sin(2 * turns)])
+    angles = np.arange(0.0, 180.0, 0.1)
+    doubled = 2 * np.radians(angles)
+    forms = np.stack([np.ones_like(doubled), np.cos(doubled), np.sin(doubled)])
     along = np.maximum((forms * (moments @ forms)).sum(axis=0), 1e-30)
     gain = product @ forms / along
     best = int(np.argmax(np.where(gain > 0, gain * (product @ forms), -np.inf)))
     form = forms[:, best]
     slope = 2 * np.array([0.0, -form[2], form[1]])
     spread = float(slope @ moments @ slope - (slope @ moments @ form) ** 2 / along[best])
-    certain = spread > _OVER_NOISE * float(slope @ extra @ slope) and spread > 0
-    error = math.sqrt(noise * (1 + leverage) / (pixels * spread)) / float(gain[best]) if certain else math.inf
-    determined = math.degrees(error) < _TELLING
-    return _Angle(float(turns[best]) if determined else None, error, float(gain[best]), residual)
+    certain = spread > SetLimits.over_noise * float(slope @ extra @ slope) and spread > 0
+    error = math.inf
+    if certain:
+        error = math.degrees(math.sqrt(noise * (1 + leverage) / (pixels * spread)) / float(gain[best]))
+    if error >= SetLimits.determined:
+        return _Prediction(None, error, 0.0, float(gain[best]), residual)
+    angle = float(angles[best])
+    return _Prediction(angle, error, abs(angle_difference(angle, stated)), float(gain[best]), residual)
 
 
 def typical_variance(squares: Floats, freedom: int) -> float:
-    """Robust variance, from the median of sums of ``freedom`` squares each."""
+    """Return a robust variance, from the median of sums of ``freedom`` squares each."""
     return float(np.median(squares)) / float(2 * gammaincinv(freedom / 2, 0.5))
-
-
-def _picture(samples: SetSamples, k: int, angle: _Angle, used: bool) -> PictureFit:
-    exposure = samples.exposures[k]
-    determined = angle.angle is not None
-    return PictureFit(
-        label=samples.labels[k],
-        angle=exposure.angle or 0.0,
-        gain=exposure.gain,
-        looks_like=round(math.degrees(angle.angle or 0.0) % 180, 1) if determined else None,
-        error=math.degrees(angle.error) if determined else None,
-        residual=angle.residual,
-        left_out=not used,
-    )

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from polarguide import optics
-from polarguide.capture import checks
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import ColmapModel, read_model
 from polarguide.capture.exposures import FOUR, Exposure
@@ -52,7 +51,6 @@ class InspectedView:
         invalid, saturated: as in ``View``, [H, W] bool.
         black: pixels that are 0 in all angles; they count as ``saturated``, too.
         camera: at the size of ``codes``, or None.
-        measures: what ``capture.checks`` measures on them.
         peak: largest stored value.
         exposures: what the pictures are.
     """
@@ -63,7 +61,6 @@ class InspectedView:
     saturated: Tensor
     black: Tensor
     camera: Camera | None
-    measures: checks.Measures
     peak: int
     exposures: tuple[Exposure, ...] = FOUR
 
@@ -113,7 +110,7 @@ class Capture:
 
     @property
     def four(self) -> bool:
-        """Whether every view has its four pictures at 0, 45, 90 and 135 degrees."""
+        """True if every view has four pictures at 0, 45, 90 and 135 degrees."""
         return all(view.exposures == FOUR for view in self.views)
 
     @property
@@ -185,7 +182,6 @@ def _inspected(stored: StoredViews, number: int) -> InspectedView:
         saturated=torch.from_numpy(item.saturated(stored.full_scale)),
         black=torch.from_numpy(item.black),
         camera=stored.cameras[number],
-        measures=stored.measures[number],
         peak=int(item.peak.max()),
         exposures=item.exposures,
     )
@@ -196,7 +192,7 @@ MEASURABLE = 1.0 / 256.0
 POLARIZED = 0.05
 """DoLP from which a pixel counts as polarized."""
 OF_FOUR = ("noise", "noise_share", "pair_ratio", "sum_error", "dolp", "polarized", "above_limit")
-"""What only four angles of a view tell."""
+"""Measurements that need four angles of a view."""
 _QUANTILE_SAMPLES = 200_000
 
 
@@ -235,7 +231,7 @@ class ViewMeasurements:
     exposures: str = ""
 
     def record(self) -> dict[str, Any]:
-        """As plain JSON types."""
+        """Return the measurements as JSON types."""
         measured = {**vars(self), "dolp": {"median": self.dolp[0], "p99": self.dolp[1]}}
         if self.exposures:
             return {key: None if key in OF_FOUR else value for key, value in measured.items()}

@@ -15,7 +15,8 @@ import torch
 from numpy.typing import NDArray
 
 from polarguide import __version__
-from polarguide.capture import checks
+from polarguide.capture import box_filter
+from polarguide.capture.angle_evidence import swaps
 from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented
 from polarguide.capture.colmap.model import MODELS
 from polarguide.capture.colmap.poses import Geometry, undistortion
@@ -28,34 +29,33 @@ from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
 from polarguide.capture.write import intensity_codes, write_view
 from polarguide.core.errors import PolarguideError
-from polarguide.core.files import read_file, write_whole, writing
+from polarguide.core.files import read_file, temporary_folder, write_whole
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import decode, read_record, shortened, to_json
-from polarguide.inspection.angles import AngleFindings, swaps
+from polarguide.inspection.angles import AngleFindings
 from polarguide.inspection.capture import Capture, InspectedView
 from polarguide.inspection.settings import Check
 
-COPIED = ("sparse", "masks", "invalid", "gt", "split.json", PRESENTATION_FILE)
+_COPIED = ("sparse", "masks", "invalid", "gt", "split.json", PRESENTATION_FILE)
 """Files and folders that are copied unchanged."""
 METADATA = "scene.json"
 
 
 def correction(capture: Capture, angles: AngleFindings) -> Calibration | None:
-    """The correction of the angles, or None if they are right.
+    """Return the correction of the angles, or None if they are right.
 
     Raises:
         PolarguideError: the order is not decided.
     """
-    files = angles.files
-    if files is None:
+    if angles.files is None:
         raise PolarguideError(
             capture.root,
             expected="a decided order of the angles",
             found="an order that geometry does not decide",
             remedy="Nothing was written. The report says what to do; --order of prepare sets it by hand.",
         )
-    zero = round(angles.offset, 2) if angles.offset is not None else 0.0
-    return None if files == ANGLES and zero == 0.0 else Calibration(order=files, zero=zero)
+    change = Calibration(order=angles.files, zero=round(angles.offset or 0.0, 2))
+    return None if change == Calibration() else change
 
 
 def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Reporter = SILENT) -> str:
@@ -83,38 +83,31 @@ def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Report
             found="a file" if not out.is_dir() else describe_contents(out),
             remedy="Give another --fix; nothing was written.",
         )
-    partial = out.with_name(f".{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
-        with writing(out):
-            _write(capture, change, partial, reporter)
-            if out.is_dir():
-                out.rmdir()
-            os.replace(partial, out)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
-    return described(change)
+    with temporary_folder(out) as partial:
+        _write(capture, change, partial, reporter)
+        if out.is_dir():
+            out.rmdir()
+        os.replace(partial, out)
+    return describe_correction(change)
 
 
-def described(change: Calibration) -> str:
-    """A correction in words."""
-    parts = []
-    if change.order != ANGLES:
-        parts.append(f"the files were renamed ({swaps(change.order)})")
-    if change.zero:
-        parts.append(f"the Stokes vectors were rotated by {change.zero:+.2f}°")
-    return " and ".join(parts)
+def describe_correction(change: Calibration) -> str:
+    """Describe a correction."""
+    parts = {
+        f"the files were renamed ({swaps(change.order)})": change.order != ANGLES,
+        f"the Stokes vectors were rotated by {change.zero:+.2f}°": change.zero != 0.0,
+    }
+    return " and ".join(part for part, changed in parts.items() if changed)
 
 
 def _write(capture: Capture, change: Calibration, folder: Path, reporter: Reporter) -> None:
-    (folder / "polar").mkdir(parents=True)
-    for name in COPIED:
+    (folder / "polar").mkdir()
+    for name in _COPIED:
         source = capture.root / name
         _require_inside(capture.root, source)
-        if source.is_dir():
-            shutil.copytree(source, folder / name)
-        elif source.exists():
-            shutil.copy2(source, folder / name)
+        if source.exists():
+            copy = shutil.copytree if source.is_dir() else shutil.copy2
+            copy(source, folder / name)
     with reporter.track("fixing", len(capture.layout.names)) as advance:
         for done, view in enumerate(capture.layout.names, 1):
             if change.zero:
@@ -135,10 +128,8 @@ def _require_inside(root: Path, source: Path) -> None:
     """
     whole = root.resolve()
     for path in (source, *(source.rglob("*") if source.is_dir() else ())):
-        leaves = path.exists() and not path.resolve().is_relative_to(whole)
-        if leaves or (
-            path != source and path.is_symlink() and path.is_dir()
-        ):  # such links may lead in a circle
+        circular = path != source and path.is_symlink() and path.is_dir()
+        if circular or (path.exists() and not path.resolve().is_relative_to(whole)):
             raise PolarguideError(
                 path,
                 expected="a file of the scene",
@@ -166,7 +157,7 @@ def _corrected_metadata(capture: Capture, change: Calibration) -> bytes:
         "program": f"polarguide {__version__}",
         "from": capture.name,
         "digest": capture.digest,
-        "change": described(change),
+        "change": describe_correction(change),
         **change.record(),
         "scale": 1.0 / change.peak,
     }
@@ -194,42 +185,36 @@ class _Warp(msgspec.Struct):
 _Gain = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 
 
-class _View(msgspec.Struct):
+class _PreparedView(msgspec.Struct):
     geometry: Geometry
     warp: _Warp | None = None
 
 
-class _Settings(msgspec.Struct):
+class _MosaicOffsets(msgspec.Struct):
     offset_x: int = 0
     offset_y: int = 0
 
 
-class _Request(msgspec.Struct):
-    settings: _Settings = msgspec.field(default_factory=_Settings)
+class _PrepareRequest(msgspec.Struct):
+    settings: _MosaicOffsets = msgspec.field(default_factory=_MosaicOffsets)
 
 
-class _Prepared(msgspec.Struct):
-    request: _Request = msgspec.field(default_factory=_Request)
-    views: dict[str, _View] = {}
+class _PrepareNotes(msgspec.Struct):
+    request: _PrepareRequest = msgspec.field(default_factory=_PrepareRequest)
+    views: dict[str, _PreparedView] = {}
 
 
-class _Simulated(msgspec.Struct):
-    """The sensor of ``synth``, whose mosaics lie beside pictures that it did not take."""
+class _SceneNotes(msgspec.Struct):
+    """The fields of ``scene.json`` that are read; ``sensor`` is an object in scenes of ``synth``."""
 
-    name: str
-
-
-class _Scene(msgspec.Struct):
-    """The fields of ``scene.json`` that are read."""
-
-    sensor: str | _Simulated | None = None
+    sensor: str | dict[str, Any] | None = None
     gains: tuple[_Gain, _Gain, _Gain, _Gain] | None = None
     analyzers: _Analyzers | None = None
-    prepare: _Prepared | None = None
+    prepare: _PrepareNotes | None = None
 
 
 def corrected(capture: Capture, path: Path) -> Capture:
-    """The capture as the calibration of its sensor corrects it.
+    """Return the capture corrected with the calibration of its sensor.
 
     The matrices follow what ``prepare`` did: its region, the gains that it divided by, the order of the angles, the
     removal of the distortion. Where pictures were averaged, so are the matrices.
@@ -242,40 +227,42 @@ def corrected(capture: Capture, path: Path) -> Capture:
         PolarguideError: the file cannot be used, is of another sensor or size, or has been applied already.
     """
     calibration = read_analyzers(path)
-    about = _about(capture)
-    if about.analyzers is not None:
+    notes = _notes(capture)
+    if notes.analyzers is not None:
         raise PolarguideError(
             capture.root,
             expected="a scene that was prepared without --calibration",
-            found=f"the calibration of {about.analyzers.sensor} (checksum {about.analyzers.sha256[:16]}...)",
+            found=f"the calibration of {notes.analyzers.sensor} (checksum {notes.analyzers.sha256[:16]}...)",
             remedy="Leave --calibration out.",
         )
-    if isinstance(about.sensor, _Simulated) or (about.prepare is not None and about.sensor is None):
+    if isinstance(notes.sensor, dict) or (notes.prepare is not None and notes.sensor is None):
         raise PolarguideError(
             capture.root,
             expected="a scene of the mosaics of a sensor",
             found="a scene of shots through a filter, of a dataset, or rendered",
             remedy="Leave --calibration out.",
         )
-    calibration.require_sensor(about.sensor, path)
+    calibration.require_sensor(notes.sensor, path)
     applied = capture.applied
-    if (applied is None and about.prepare is not None) or (applied is not None and not applied.permutes):
+    turned = notes.prepare is not None if applied is None else not applied.permutes
+    if turned:
         raise PolarguideError(
             capture.root,
             expected="angles in steps of 45 degrees from those of the sensor",
             found="a scene whose zero was turned",
             remedy=_REMEDY,
         )
-    known: dict[Any, NDArray[np.float32]] = {}
+    known: dict[bytes, NDArray[np.float32]] = {}
     views = []
     for view in capture.views:
-        prepared = None if about.prepare is None else about.prepare.views.get(view.name)
-        key = None if prepared is None else msgspec.json.encode(prepared)
+        prepared = None if notes.prepare is None else notes.prepare.views.get(view.name)
+        key = msgspec.json.encode(prepared)
         if key not in known:
-            if prepared is not None:
-                _require_geometry(capture, view, prepared)
-            matrices = _matrices(calibration, about, prepared, capture.size)
-            known[key] = _averaged(_as_named(matrices, applied, about.gains), capture.factor)
+            matrices = _as_named(
+                _matrices(calibration, notes, prepared, capture, view.name), applied, notes.gains
+            )
+            boxes = box_filter.mean(np.moveaxis(matrices, (2, 3), (0, 1)), capture.factor)
+            known[key] = np.moveaxis(boxes, (0, 1), (2, 3))
             if known[key].shape[2:4] != view.codes.shape[1:3]:
                 raise _changed(capture, view.name, "a size that its pictures have not")
         views.append(_corrected_view(view, known[key]))
@@ -284,69 +271,66 @@ def corrected(capture: Capture, path: Path) -> Capture:
 
 def _changed(capture: Capture, view: str, found: str) -> PolarguideError:
     return PolarguideError(
-        f"{capture.root / 'scene.json'} (prepare.views.{view})",
+        f"{capture.root / METADATA} (prepare.views.{view})",
         expected="the record that prepare wrote",
         found=found,
         remedy="Prepare the scene again.",
     )
 
 
-def _require_geometry(capture: Capture, view: InspectedView, prepared: _View) -> None:
-    """Refuse a geometry or a camera that ``prepare`` cannot have written."""
-    if prepared.geometry.step not in STEPS:
-        raise _changed(capture, view.name, f"a step of {prepared.geometry.step}")
-    if prepared.warp is not None:
-        model = prepared.warp.model
-        parameters = prepared.warp.parameters
-        if model not in MODELS or len(parameters) != MODELS[model][1]:
-            found = f"a camera {shortened(model)} with {len(parameters)} parameters"
-            raise _changed(capture, view.name, found)
-
-
 def analyzer_check(capture: Capture, path: Path | None) -> Check | None:
-    """The calibration of the sensor's analyzers; None where nothing was calibrated."""
-    key = "analyzers"
-    title = "Analyzers of the sensor"
+    """Report the calibration of the sensor's analyzers; None where nothing was calibrated."""
     if path is not None:
-        calibration = read_analyzers(path)
-        text = f"Corrected for this inspection with the calibration of {calibration.sensor}"
+        record = read_analyzers(path).record()
+        text = "Corrected for this inspection with"
         remedy = "The scene itself is as it was: prepare its mosaics with --calibration."
-        record = calibration.record()
     else:
-        analyzers = _about(capture).analyzers
+        analyzers = _notes(capture).analyzers
         if analyzers is None:
             return None
-        text = f"Prepared with the calibration of {analyzers.sensor}"
-        remedy = ""
         record = msgspec.to_builtins(analyzers)
+        text = "Prepared with"
+        remedy = ""
     lens = f" and {record['lens']}" if record["lens"] else ""
-    return Check(key, title, "ok", f"{text}{lens} ({record['sha256'][:16]}).", remedy, figures=record)
+    finding = f"{text} the calibration of {record['sensor']}{lens} ({record['sha256'][:16]})."
+    return Check("analyzers", "ok", finding, remedy, figures=record)
 
 
-def _about(capture: Capture) -> _Scene:
-    path = capture.root / "scene.json"
-    if not path.exists():
-        return _Scene()
-    return decode(read_file(path), _Scene, path, remedy="Prepare the scene again.")
+def _notes(capture: Capture) -> _SceneNotes:
+    path = capture.root / METADATA
+    data = read_file(path) if path.exists() else b"{}"
+    return decode(data, _SceneNotes, path, remedy="Prepare the scene again.")
 
 
 def _matrices(
-    calibration: AnalyzerCalibration, about: _Scene, prepared: _View | None, size: tuple[int, int]
+    calibration: AnalyzerCalibration,
+    notes: _SceneNotes,
+    prepared: _PreparedView | None,
+    capture: Capture,
+    view: str,
 ) -> NDArray[np.float32]:
-    """Matrices [4, 4, h, w] or [4, 4, h, w, 3] at the pixels of a view's pictures."""
-    if prepared is None or about.prepare is None:
-        return calibration.of_pictures(size[::-1])
-    settings = about.prepare.request.settings
+    """Return matrices [4, 4, h, w] or [4, 4, h, w, 3] at the pixels of a view's pictures.
+
+    Raises:
+        PolarguideError: ``prepare`` cannot have written the geometry or the camera.
+    """
+    if prepared is None or notes.prepare is None:
+        return calibration.of_pictures(capture.size[::-1])
+    settings = notes.prepare.request.settings
     geometry = prepared.geometry
+    if geometry.step not in STEPS:
+        raise _changed(capture, view, f"a step of {geometry.step}")
     matrices = calibration.of_pictures(
         geometry.size[::-1], offset=(settings.offset_x, settings.offset_y), scale=geometry.step
     )
     if prepared.warp is None:
         return matrices
+    model = prepared.warp.model
+    parameters = prepared.warp.parameters
+    if model not in MODELS or len(parameters) != MODELS[model][1]:
+        raise _changed(capture, view, f"a camera {shortened(model)} with {len(parameters)} parameters")
     width, height = geometry.size
-    camera = pycolmap.Camera(
-        model=prepared.warp.model, width=width, height=height, params=prepared.warp.parameters
-    )
+    camera = pycolmap.Camera(model=model, width=width, height=height, params=parameters)
     planes = matrices.reshape(16, *matrices.shape[2:])
     moved, _ = undistortion(camera).apply(planes, np.zeros((height, width), bool))
     return moved.reshape(4, 4, *moved.shape[1:])
@@ -363,28 +347,11 @@ def _as_named(
     return scaled[source][:, source]
 
 
-def _averaged(matrices: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
-    """Means over boxes of ``factor`` x ``factor`` pixels."""
-    if factor == 1:
-        return matrices
-    height = matrices.shape[2] // factor
-    width = matrices.shape[3] // factor
-    cut = matrices[:, :, : height * factor, : width * factor]
-    boxes = cut.reshape(4, 4, height, factor, width, factor, *matrices.shape[4:])
-    return np.asarray(boxes.mean(axis=(3, 5), dtype=np.float32))
-
-
 def _corrected_view(view: InspectedView, matrices: NDArray[np.float32]) -> InspectedView:
-    codes = view.codes.numpy().astype(np.float32)
+    stored = view.codes.numpy().astype(np.float32)
     weights = matrices if matrices.ndim == 5 else matrices[..., None]
-    done = np.stack([sum(weights[k, j] * codes[j] for j in range(4)) for k in range(4)])
+    done = np.stack([sum(weights[k, j] * stored[j] for j in range(4)) for k in range(4)])
     over = (done > FULL_CODE).any(axis=(0, 3))
     saturated = view.saturated | torch.from_numpy(over)
-    corrected_codes = np.rint(np.clip(done, 0, FULL_CODE)).astype(np.uint16)
-    usable = ~(view.invalid | saturated).numpy()
-    return replace(
-        view,
-        codes=torch.from_numpy(corrected_codes),
-        saturated=saturated,
-        measures=checks.measure(corrected_codes, usable),
-    )
+    codes = np.rint(np.clip(done, 0, FULL_CODE)).astype(np.uint16)
+    return replace(view, codes=torch.from_numpy(codes), saturated=saturated)

@@ -16,7 +16,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,14 @@ from torch.nn.functional import grid_sample, interpolate
 
 from polarguide import __version__, optics
 from polarguide.capture import Scene, View
+from polarguide.capture.angle_evidence import (
+    DEGREES,
+    PAIRINGS,
+    SENSES,
+    OrderEvidence,
+    spatial_cells,
+    sum_by_cluster,
+)
 from polarguide.capture.colmap.model import ColmapModel
 from polarguide.capture.exposures import FOUR
 from polarguide.core.errors import PolarguideError
@@ -33,7 +41,6 @@ from polarguide.core.files import write_text
 from polarguide.core.records import read_record
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
-from polarguide.inspection.angles import DEGREES, PAIRINGS, SENSES, Evidence, spatial_cells, sum_by_cluster
 from polarguide.inspection.capture import InspectedView
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
@@ -48,26 +55,59 @@ from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
 
 NORMALS = "normals of a short training"
-SAMPLES = 400
-"""Largest number of pixels that are sampled in a view."""
-ZENITH_MARGIN = math.radians(15.0)
-"""Error of a rendered zenith up to which a pixel still counts as certainly specular."""
-LEAST_ZENITH = math.radians(15.0)
-LEAST_DOLP = 0.03
-FEWEST = 500
-LEAST_INLIERS = 0.5
-"""Least share of pixels whose normals agree."""
-LARGEST_ERROR = math.radians(10.0)
-"""Largest error of these normals."""
-LEAST_CONCENTRATION = 0.25
-"""Least length of the mean of ``exp(4 i (AoLP - azimuth))``: 1 for agreement modulo 90 degrees, 0 for none."""
-_SPECULAR = 0.95
-_NORMAL_ERRORS = tuple(math.radians(angle) for angle in (3.0, 6.0, 10.0, 16.0))
-_INLIERS = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97)
+"""Name of the evidence from normals."""
+POINTS = "points observed in several views"
+"""Name of the evidence from points."""
+
+
+_SENSES = torch.tensor(SENSES)[:, None]
+
+
+class EvidenceLimits:
+    """Constants of the evidence.
+
+    Attributes:
+        samples: largest number of pixels that are sampled in a view.
+        zenith_margin: error of a rendered zenith, radians, up to which a pixel still counts as certainly specular.
+        least_zenith: zenith of a normal from which on its azimuth is reliable, radians.
+        least_dolp: DoLP from which on the AoLP of a pixel is used.
+        fewest_pixels: pixels with a normal that the evidence needs.
+        least_inliers: least share of pixels whose normals agree.
+        largest_error: largest error of the normals, radians.
+        least_concentration: least length of the mean of ``exp(4 i (AoLP - azimuth))``: 1 for agreement modulo 90
+            degrees, 0 for none.
+        specular: share of certainly specular pixels that are polarized perpendicular to the plane of incidence.
+        normal_errors: errors of normals that are tried, radians.
+        inliers: shares of agreeing pixels that are tried.
+        fewest_observations: views that a point has to be observed in.
+        fewest_points: points that the evidence needs.
+        largest_misfit: median angle in degrees between fields and their common plane above which points are not used.
+        least_scale: smallest mean square of the fields' components along a normal that counts.
+        opaque: alpha from which on a rendered normal counts.
+        agreement: least cosine between the rendered normal and that of the depth.
+    """
+
+    samples = 400
+    zenith_margin = math.radians(15.0)
+    least_zenith = math.radians(15.0)
+    least_dolp = 0.03
+    fewest_pixels = 500
+    least_inliers = 0.5
+    largest_error = math.radians(10.0)
+    least_concentration = 0.25
+    specular = 0.95
+    normal_errors = tuple(math.radians(angle) for angle in (3.0, 6.0, 10.0, 16.0))
+    inliers = (0.05, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.97)
+    fewest_observations = 4
+    fewest_points = 20
+    largest_misfit = 8.0
+    least_scale = 2e-4
+    opaque = 0.9
+    agreement = 0.9
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class ViewSurface:
     """The surface that one view sees.
 
     Attributes:
@@ -96,50 +136,53 @@ class SurfaceSamples:
     noise: Tensor
     azimuth: Tensor
     zenith: Tensor
-    position: Tensor
+    position: Tensor = field(kw_only=True)
 
     def certainly_specular(self, index: float) -> Tensor:
-        """Whether the DoLP exceeds that of diffuse light at this zenith, [N] bool."""
-        most = optics.diffuse_dolp((self.zenith + ZENITH_MARGIN).clamp(max=math.pi / 2), index)
+        """Return true where the DoLP exceeds that of diffuse light at this zenith, [N] bool."""
+        most = optics.diffuse_dolp((self.zenith + EvidenceLimits.zenith_margin).clamp(max=math.pi / 2), index)
         return self.dolp > most + 2 * self.noise
 
 
-def sample_surfaces(pairs: Iterable[tuple[InspectedView, Surface]], pairing: int = 0) -> SurfaceSamples:
+def _polarization_planes(view: InspectedView, pairing: int) -> Tensor:
+    """Return the Stokes vector of the luminance, its noise, and 1 for unusable pixels: [1, 5, H, W]."""
+    gray = view.intensities().mean(dim=-1)[[PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]]
+    unusable = (~view.usable).float()
+    return torch.cat((optics.stokes(gray), optics.intensity_noise(gray)[None], unusable[None]))[None]
+
+
+def sample_surfaces(pairs: Iterable[tuple[InspectedView, ViewSurface]], pairing: int = 0) -> SurfaceSamples:
     """Sample pixels with a reliable normal and significant polarization, at most 400 per view.
 
     Args:
         pairs: views and their surfaces, whose maps may be smaller than the pictures.
         pairing: the pairs of perpendicular pictures, an index into ``PAIRINGS``.
     """
-    order = [PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]
     generator = torch.Generator().manual_seed(0)
     samples: list[Tensor] = []
     for view, surface in pairs:
-        size = surface.known.shape
-        gray = view.intensities().mean(dim=-1)[order]
-        noise = optics.intensity_noise(gray)
-        planes = torch.cat((optics.stokes(gray), noise[None], (~view.usable).float()[None]))
-        planes = interpolate(planes[None], size=size, mode="area")[0]
+        planes = interpolate(_polarization_planes(view, pairing), size=surface.known.shape, mode="area")[0]
         stokes = planes[:3]
-        degree = optics.dolp(planes[:3])
+        degree = optics.dolp(stokes)
         spread = optics.dolp_noise(stokes, planes[3])
         rays = surface.camera.rays()
         zenith = optics.zenith(surface.normal, rays)
-        good = surface.known & (planes[4] < 1e-3) & (stokes[0] > 0.01) & (zenith > LEAST_ZENITH)
-        good &= (degree > LEAST_DOLP) & (degree > 3 * spread)
+        good = (
+            surface.known & (planes[4] < 1e-3) & (stokes[0] > 0.01) & (zenith > EvidenceLimits.least_zenith)
+        )
+        good &= (degree > EvidenceLimits.least_dolp) & (degree > 3 * spread)
         chosen = good.flatten().nonzero()[:, 0]
-        chosen = chosen[torch.randperm(len(chosen), generator=generator)[:SAMPLES]]
+        chosen = chosen[torch.randperm(len(chosen), generator=generator)[: EvidenceLimits.samples]]
         position = surface.camera.to_world(rays / rays[..., 2:] * surface.depth[..., None])
         position = position + surface.camera.center.float()
-        rows = (optics.aolp(stokes), degree, spread, optics.azimuth(surface.normal, rays), zenith)
-        flat = torch.stack([*(row.flatten() for row in rows), *position.reshape(-1, 3).unbind(-1)])
-        samples.append(flat[:, chosen])
-    rows_found = torch.cat(samples, dim=1) if samples else torch.zeros(8, 0)
-    aolp, dolp, noise_of, azimuth, zenith_of = rows_found[:5].unbind(0)
-    return SurfaceSamples(aolp, dolp, noise_of, azimuth, zenith_of, rows_found[5:].T)
+        azimuth = optics.azimuth(surface.normal, rays)
+        rows = (optics.aolp(stokes), degree, spread, azimuth, zenith, *position.unbind(-1))
+        samples.append(torch.stack([row.flatten() for row in rows])[:, chosen])
+    joined = torch.cat(samples, dim=1) if samples else torch.zeros(8, 0)
+    return SurfaceSamples(*joined[:5], position=joined[5:].T)
 
 
-def normal_evidence(pixels: SurfaceSamples, index: float) -> Evidence:
+def normal_evidence(pixels: SurfaceSamples, index: float) -> OrderEvidence:
     """Log-likelihoods of all zeros and both senses, given the normals.
 
     Twice a pixel's angle between AoLP and azimuth follows a mixture: a von Mises distribution about the perpendicular,
@@ -148,17 +191,18 @@ def normal_evidence(pixels: SurfaceSamples, index: float) -> Evidence:
     the AoLP; that error and the uniform share are fitted by maximum likelihood.
     """
     count = len(pixels.aolp)
-    if count < FEWEST:
+    fewest = EvidenceLimits.fewest_pixels
+    if count < fewest:
         note = (
-            f"Only {count} pixels have a reliable normal and significant polarization; {FEWEST} are needed."
+            f"Only {count} pixels have a reliable normal and significant polarization; {fewest} are needed."
         )
-        return Evidence(NORMALS, torch.zeros(1, len(SENSES), DEGREES), count, False, note)
+        return OrderEvidence(NORMALS, torch.zeros(1, len(SENSES), DEGREES), count, False, note)
     must = pixels.certainly_specular(index)
     coarse = torch.arange(0, DEGREES, 4)
     fits = [
         (float(_log_likelihood(pixels, must, coarse, error, inliers).sum(dim=0).max()), error, inliers)
-        for error in _NORMAL_ERRORS
-        for inliers in _INLIERS
+        for error in EvidenceLimits.normal_errors
+        for inliers in EvidenceLimits.inliers
     ]
     _, error, inliers = max(fits)
     values = _log_likelihood(pixels, must, torch.arange(DEGREES), error, inliers)
@@ -167,17 +211,18 @@ def normal_evidence(pixels: SurfaceSamples, index: float) -> Evidence:
         f"{count} pixels, {int(must.sum())} of which are certainly specular; the AoLP of {inliers:.0%} agrees with the "
         f"normals, whose error is about {math.degrees(error):.0f}° (agreement modulo 90°: {coherent:.2f} of 1)."
     )
-    usable = inliers >= LEAST_INLIERS and error <= LARGEST_ERROR and coherent >= LEAST_CONCENTRATION
-    return Evidence(NORMALS, sum_by_cluster(values, spatial_cells(pixels.position)), count, usable, note)
+    usable = (
+        inliers >= EvidenceLimits.least_inliers
+        and error <= EvidenceLimits.largest_error
+        and coherent >= EvidenceLimits.least_concentration
+    )
+    return OrderEvidence(NORMALS, sum_by_cluster(values, spatial_cells(pixels.position)), count, usable, note)
 
 
 def _concentration(pixels: SurfaceSamples) -> float:
     """Agreement of AoLP and azimuth modulo 90 degrees, for the better sense and the best zero, in [0, 1]."""
-    lengths = []
-    for sense in SENSES:
-        angle = 4 * (sense * pixels.aolp - pixels.azimuth)
-        lengths.append(float(torch.hypot(torch.cos(angle).mean(), torch.sin(angle).mean())))
-    return max(lengths)
+    angles = 4 * (_SENSES * pixels.aolp - pixels.azimuth)
+    return float(torch.hypot(torch.cos(angles).mean(dim=1), torch.sin(angles).mean(dim=1)).max())
 
 
 def _log_likelihood(
@@ -186,30 +231,19 @@ def _log_likelihood(
     """Log-density of the pixels' angles for both senses and zeros [Z] in degrees, [N, 2, Z]."""
     aolp_noise = pixels.noise / (2 * pixels.dolp)
     variance = (error / torch.sin(pixels.zenith)) ** 2 + aolp_noise**2
-    concentration = (1 / (4 * variance)).clamp(max=200.0)[:, None]
+    concentration = (1 / (4 * variance)).clamp(max=200.0)[:, None, None]
     height = 1 / (math.pi * torch.special.i0e(concentration))
-    across = torch.where(must, _SPECULAR, 0.5)[:, None]
-    turn = torch.deg2rad(2 * zeros.float())[None]
-    columns = []
-    for sense in SENSES:
-        cosine = torch.cos(2 * (sense * pixels.aolp - pixels.azimuth)[:, None] + turn)
-        lobes = across * torch.exp(-concentration * (1 + cosine))
-        lobes += (1 - across) * torch.exp(-concentration * (1 - cosine))
-        columns.append(torch.log((1 - inliers) / math.pi + inliers * height * lobes))
-    return torch.stack(columns, dim=1)
-
-
-POINTS = "points observed in several views"
-FEWEST_OBSERVATIONS = 4
-FEWEST_POINTS = 20
-LARGEST_MISFIT_DEG = 8.0
-"""Median angle in degrees between fields and their common plane above which the evidence is not used."""
-_LEAST_SCALE = 2e-4
+    across = torch.where(must, EvidenceLimits.specular, 0.5)[:, None, None]
+    doubled = 2 * (_SENSES * pixels.aolp - pixels.azimuth).T
+    cosine = torch.cos(doubled[:, :, None] + torch.deg2rad(2 * zeros.float()))
+    lobes = across * torch.exp(-concentration * (1 + cosine))
+    lobes += (1 - across) * torch.exp(-concentration * (1 - cosine))
+    return torch.log((1 - inliers) / math.pi + inliers * height * lobes)
 
 
 def point_evidence(
     views: tuple[InspectedView, ...], model: ColmapModel, index: float, pairing: int = 0
-) -> tuple[Evidence, SurfaceSamples | None]:
+) -> tuple[OrderEvidence, SurfaceSamples | None]:
     """Log-likelihoods of all zeros and both senses, given the points of a COLMAP model.
 
     Args:
@@ -223,20 +257,21 @@ def point_evidence(
     """
     observations = model.observations([view.name for view in views])
     fields, weights, degrees = _observed_fields(views, model.points.double(), observations, index, pairing)
-    keep = (weights > 0).sum(dim=1) >= FEWEST_OBSERVATIONS
+    fewest = EvidenceLimits.fewest_observations
+    keep = (weights > 0).sum(dim=1) >= fewest
     count = int((weights[keep] > 0).sum())
-    if int(keep.sum()) < FEWEST_POINTS:
+    if int(keep.sum()) < EvidenceLimits.fewest_points:
         note = (
-            f"Only {int(keep.sum())} points have {FEWEST_OBSERVATIONS} observations with a DoLP above the diffuse "
-            f"limit {float(optics.diffuse_dolp_limit(index)):.2f}; {FEWEST_POINTS} are needed."
+            f"Only {int(keep.sum())} points have {fewest} observations with a DoLP above the diffuse limit "
+            f"{float(optics.diffuse_dolp_limit(index)):.2f}; {EvidenceLimits.fewest_points} are needed."
         )
-        return Evidence(POINTS, torch.zeros(1, 2, DEGREES), count, False, note), None
+        return OrderEvidence(POINTS, torch.zeros(1, 2, DEGREES), count, False, note), None
     weights = weights[keep].double()
     points = model.points[keep]
     spreads = torch.stack([_spread(fields[sense][keep].double(), weights) for sense in range(len(SENSES))])
     observed = (weights > 0).sum(dim=1)
     certainty = (weights.sum(dim=1) / observed)[None, :, None]
-    scale = max(float((spreads * certainty).amin(dim=(0, 2)).median()), _LEAST_SCALE)
+    scale = max(float((spreads * certainty).amin(dim=(0, 2)).median()), EvidenceLimits.least_scale)
     likelihood = -0.5 * (observed - 2.0)[None, :, None] * torch.log1p(spreads * certainty / scale)
     total = likelihood.sum(dim=1)
     sense, zero = divmod(int(total.argmax()), DEGREES)
@@ -246,8 +281,8 @@ def point_evidence(
         f"lie within {misfit:.1f}° of a plane (median)."
     )
     clusters = sum_by_cluster(likelihood.movedim(1, 0), spatial_cells(points))
-    usable = misfit <= LARGEST_MISFIT_DEG
-    evidence = Evidence(POINTS, clusters.float(), count, usable, note)
+    usable = misfit <= EvidenceLimits.largest_misfit
+    evidence = OrderEvidence(POINTS, clusters.float(), count, usable, note)
     if not usable:
         return evidence, None
     return evidence, _seen_pixels(
@@ -270,7 +305,7 @@ def _seen_pixels(
     zenith = torch.asin(sine)[good].float()
     nothing = torch.zeros_like(zenith)
     return SurfaceSamples(
-        nothing, degrees[0][good], degrees[1][good], nothing, zenith, points[good.nonzero()[:, 0]]
+        nothing, degrees[0][good], degrees[1][good], nothing, zenith, position=points[good.nonzero()[:, 0]]
     )
 
 
@@ -281,7 +316,6 @@ def _observed_fields(
     noise [P, V, 2].
     """
     limit = float(optics.diffuse_dolp_limit(index))
-    order = [PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]
     fields = torch.zeros(len(SENSES), len(points), len(views), 2, 3)
     weights = torch.zeros(len(points), len(views))
     degrees = torch.zeros(len(points), len(views), 2)
@@ -293,28 +327,24 @@ def _observed_fields(
         u = (camera.fx * local[:, 0] / depth + camera.cx) / camera.width
         v = (camera.fy * local[:, 1] / depth + camera.cy) / camera.height
         inside = (local[:, 2] > 1e-9) & (torch.minimum(u, v) > 0.01) & (torch.maximum(u, v) < 0.99)
-        gray = view.intensities().mean(dim=-1)[order]
-        noise = optics.intensity_noise(gray)
-        planes = torch.cat((optics.stokes(gray), noise[None], (~view.usable).float()[None]))
         grid = torch.stack((2 * u - 1, 2 * v - 1), dim=-1).float()[None, None]
-        sampled = grid_sample(planes[None], grid, align_corners=False)[0, :, 0]
-        stokes = sampled[:3]
-        degree = optics.dolp(sampled[:3])
-        spread = optics.dolp_noise(stokes, sampled[3])
+        planes = grid_sample(_polarization_planes(view, pairing), grid, align_corners=False)[0, :, 0]
+        stokes = planes[:3]
+        degree = optics.dolp(stokes)
+        spread = optics.dolp_noise(stokes, planes[3])
         degrees[:, column] = torch.stack((degree, spread), dim=-1)
         certain = degree > limit + 3 * spread
-        good = visible[:, column] & inside & certain & (sampled[4] < 1e-3) & (stokes[0] > 0.02)
+        good = visible[:, column] & inside & certain & (planes[4] < 1e-3) & (stokes[0] > 0.02)
         # Light that was polarized before the reflection turns the field by about sqrt(1 - d^2) / d times its DoLP,
         # alike in many observations: hence the square of the inverse variance that this suggests.
         weights[:, column] = good * (degree**2 / (1.05 - degree**2)) ** 2
         x_ref, up_ref = optics.lens_frame(unit(local).float())
         turn = camera.rotation.float()
         angle = optics.aolp(stokes)
-        for k, sense in enumerate(SENSES):
-            cosine = torch.cos(angle)[:, None]
-            sine = sense * torch.sin(angle)[:, None]
-            fields[k, :, column, 0] = (cosine * x_ref + sine * up_ref) @ turn
-            fields[k, :, column, 1] = (cosine * up_ref - sine * x_ref) @ turn
+        cosine = torch.cos(angle)[:, None]
+        sine = _SENSES[..., None] * torch.sin(angle)[:, None]
+        fields[:, :, column, 0] = (cosine * x_ref + sine * up_ref) @ turn
+        fields[:, :, column, 1] = (cosine * up_ref - sine * x_ref) @ turn
     return fields, weights, degrees
 
 
@@ -341,8 +371,6 @@ LONGEST = 160
 """Pixels of the longer side that the training's pictures are averaged down to (by a whole factor)."""
 KEY = "short_run.json"
 SAVE_EVERY = 100
-_OPAQUE = 0.9
-_AGREEMENT = 0.9
 
 
 def photograph_digest(scene: Scene) -> str:
@@ -353,12 +381,11 @@ def photograph_digest(scene: Scene) -> str:
     digest = hashlib.sha256(scene.points.numpy().tobytes())
     for view in scene.train_views:
         camera = view.camera
-        digest.update(view.codes.to(torch.int32).sum(dim=0).numpy().tobytes())
-        digest.update(view.invalid.numpy().tobytes())
-        digest.update(camera.rotation.numpy().tobytes() + camera.translation.numpy().tobytes())
-        digest.update(repr((view.name, camera.fx, camera.fy, camera.cx, camera.cy)).encode())
-        if view.exposures != FOUR:
-            digest.update(repr(view.exposures).encode())
+        photograph = view.codes.to(torch.int32).sum(dim=0)
+        for tensor in (photograph, view.invalid, camera.rotation, camera.translation):
+            digest.update(tensor.numpy().tobytes())
+        others = "" if view.exposures == FOUR else repr(view.exposures)
+        digest.update(f"{(view.name, camera.fx, camera.fy, camera.cx, camera.cy)}{others}".encode())
     return digest.hexdigest()
 
 
@@ -373,7 +400,7 @@ def short_run(
     recipe: Recipe | None = None,
     until: int = 0,
 ) -> TrainingState:
-    """Train, or go on, or take what is there.
+    """Run or resume the short training, or load its finished state.
 
     Args:
         scene: at the size to train at.
@@ -418,7 +445,7 @@ def short_run(
 
 
 def _same(folder: Path, wanted: dict[str, object]) -> bool:
-    """Whether the folder holds a readable state of the same training."""
+    """Return true if the folder holds a readable state of the same training."""
     try:
         return read_record(folder / KEY, dict[str, Any]) == wanted and (folder / CHECKPOINT).exists()
     except PolarguideError:
@@ -426,16 +453,14 @@ def _same(folder: Path, wanted: dict[str, object]) -> bool:
 
 
 @torch.no_grad()
-def surface_of(state: TrainingState, view: View, backend: Backend) -> Surface:
-    """The surface of the trained Gaussians in one view, on the CPU, where pictures are compared with it."""
+def trained_surface(state: TrainingState, view: View, backend: Backend) -> ViewSurface:
+    """Return the surface of the trained Gaussians in one view, on the CPU."""
     request = RenderRequest(sh_degree=0, depth=True)
     result = render(state.gaussians, view.camera, backend.rasterize, request).to("cpu")
-    if not {"normal", "depth"} <= result.layers.keys():
-        raise PolarguideError(
-            view.name, expected="normals and depth", found="none", remedy="Report this: it is a fault here."
-        )
     rays = view.camera.rays()
     normal, known = guide_normals(view.camera.to_camera(result.normal), rays, Priors.minimum_normal)
     by_depth = unit(view.camera.to_camera(depth_normals(result.depth, view.camera)))
-    known = known & (result.alpha > _OPAQUE) & (dot(normal, by_depth) > _AGREEMENT)
-    return Surface(view.camera, normal, result.depth, known)
+    known = (
+        known & (result.alpha > EvidenceLimits.opaque) & (dot(normal, by_depth) > EvidenceLimits.agreement)
+    )
+    return ViewSurface(view.camera, normal, result.depth, known)

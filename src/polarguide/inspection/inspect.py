@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from polarguide.capture import Scene, load_scene
+from polarguide.capture.angle_evidence import OrderEvidence, posterior
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError
@@ -26,25 +28,18 @@ from polarguide.core.records import check_options
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.vectors import unit_array
-from polarguide.inspection.angles import (
-    AngleFindings,
-    Evidence,
-    combine_evidence,
-    handedness_check,
-    order_check,
-    zero_check,
-)
+from polarguide.inspection.angles import AngleFindings, angle_checks, combine_evidence
 from polarguide.inspection.capture import Capture, InspectedView, ViewMeasurements, measure_view, read_capture
 from polarguide.inspection.corrections import analyzer_check, corrected
 from polarguide.inspection.evidence import (
     LONGEST,
-    Surface,
     SurfaceSamples,
+    ViewSurface,
     normal_evidence,
     point_evidence,
     sample_surfaces,
     short_run,
-    surface_of,
+    trained_surface,
 )
 from polarguide.inspection.picture_checks import (
     dielectric_check,
@@ -53,23 +48,51 @@ from polarguide.inspection.picture_checks import (
     picture_checks,
     with_noise,
 )
-from polarguide.inspection.settings import Check, InspectSettings, Verdict, worst
+from polarguide.inspection.settings import Check, InspectSettings, Verdict, first_outcome, worst
 from polarguide.inspection.shots import (
     ShotFindings,
     agreement_checks,
-    find_shots,
+    estimate_shot_angles,
     pictures_check,
     shot_checks,
 )
 from polarguide.inspection.view_checks import lens_check, view_exposure_check
 from polarguide.raster import Backend
 
-NEIGHBORS = 4
-FEATURES = 3000
-FEWEST_MATCHES = 15
-RATIO = 0.75
-GATE_SHARE = 0.02
-"""Matches farther from their epipolar line than this share of the picture's diagonal count as mismatches."""
+RUN_FOLDER = "short_run"
+"""Folder of the short training in the folder of an inspection."""
+
+
+class PoseLimits:
+    """Constants of the checks of poses, and of the decision to train.
+
+    Attributes:
+        neighbors: views that a view is matched with.
+        features: most features of a view.
+        fewest_matches: matches from which on two views are compared.
+        ratio: largest distance of a match's descriptors over that of the second best match.
+        gate: share of the picture's diagonal; matches farther from their epipolar line count as mismatches.
+        typical_px: median epipolar error in stored pixels above which a capture gets a warning.
+        view_px: the same of one view.
+        stands_out: times the median view's error that a view also has to exceed.
+        gap: degrees to the nearest view above which a view is lonely.
+        few_views: views below which a capture gets a warning.
+        sure: probability of an order from which on ``auto`` does not train.
+        fewest_to_train: views with a pose from which on a short training is possible.
+    """
+
+    neighbors = 4
+    features = 3000
+    fewest_matches = 15
+    ratio = 0.75
+    gate = 0.02
+    typical_px = 2.0
+    view_px = 2.0
+    stands_out = 2.5
+    gap = 25.0
+    few_views = 20
+    sure = 0.98
+    fewest_to_train = 8
 
 
 @dataclass(frozen=True)
@@ -86,13 +109,11 @@ def epipolar_errors(capture: Capture) -> list[PairError]:
     """Match every posed view with its nearest neighbors in position and viewing direction."""
     views = capture.posed
     features = [_features(view) for view in views]
-    pairs = _neighbor_pairs([view.camera for view in views if view.camera is not None])
-    errors = []
-    for i, j in pairs:
-        error = _pair_error(views[i], views[j], features[i], features[j], capture.factor)
-        if error is not None:
-            errors.append(error)
-    return errors
+    errors = (
+        _pair_error(views[i], views[j], features[i], features[j], capture.factor)
+        for i, j in _neighbor_pairs([view.camera for view in views if view.camera is not None])
+    )
+    return [error for error in errors if error is not None]
 
 
 def view_errors(errors: Sequence[PairError]) -> dict[str, float]:
@@ -108,9 +129,8 @@ def _features(view: InspectedView) -> tuple[NDArray[np.float64], NDArray[np.floa
     gray = view.codes.numpy().astype(np.float64).mean(axis=(0, 3))
     top = max(float(np.percentile(gray, 99.5)), 1.0)
     encoded = (255 * np.clip(gray / top, 0, 1) ** (1 / 2.2)).astype(np.uint8)
-    keypoints, descriptors = cv2.SIFT_create(nfeatures=FEATURES, contrastThreshold=0.02).detectAndCompute(  # type: ignore[attr-defined]
-        encoded, None
-    )
+    sift = cv2.SIFT_create(nfeatures=PoseLimits.features, contrastThreshold=0.02)  # type: ignore[attr-defined]
+    keypoints, descriptors = sift.detectAndCompute(encoded, None)
     # OpenCV has its first pixel center at 0, COLMAP at 0.5.
     places = np.array([point.pt for point in keypoints], dtype=np.float64).reshape(-1, 2) + 0.5
     return places, None if descriptors is None else np.sqrt(
@@ -124,7 +144,7 @@ def _neighbor_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     apart = apart / max(float(np.median(apart)), 1e-12) + 2 * (1 - axes @ axes.T)
     np.fill_diagonal(apart, np.inf)
-    near = np.argsort(apart, axis=1)[:, : min(NEIGHBORS, len(cameras) - 1)]
+    near = np.argsort(apart, axis=1)[:, : min(PoseLimits.neighbors, len(cameras) - 1)]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(near) for j in row})
 
 
@@ -141,10 +161,15 @@ def _pair_error(
     assert second.camera is not None
     if d1 is None or d2 is None or min(len(d1), len(d2)) < 2:
         return None
-    there = cv2.BFMatcher(cv2.NORM_L2).knnMatch(d1, d2, k=2)
-    back = {m.queryIdx: m.trainIdx for m in cv2.BFMatcher(cv2.NORM_L2).match(d2, d1)}
-    matches = [m for m, n in there if m.distance < RATIO * n.distance and back.get(m.trainIdx) == m.queryIdx]
-    if len(matches) < FEWEST_MATCHES:
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    there = matcher.knnMatch(d1, d2, k=2)
+    back = {m.queryIdx: m.trainIdx for m in matcher.match(d2, d1)}
+    matches = [
+        m
+        for m, n in there
+        if m.distance < PoseLimits.ratio * n.distance and back.get(m.trainIdx) == m.queryIdx
+    ]
+    if len(matches) < PoseLimits.fewest_matches:
         return None
     p1 = np.concatenate([x1[[m.queryIdx for m in matches]], np.ones((len(matches), 1))], axis=1)
     p2 = np.concatenate([x2[[m.trainIdx for m in matches]], np.ones((len(matches), 1))], axis=1)
@@ -155,8 +180,8 @@ def _pair_error(
     length = np.sqrt((along1[:, :2] ** 2).sum(1) + (along2[:, :2] ** 2).sum(1))
     nowhere = np.full_like(value, np.inf)  # cameras in one place have no epipolar lines
     distance = np.divide(value, length, out=nowhere, where=length > 0) * np.sqrt(2)
-    near = distance < GATE_SHARE * float(np.hypot(first.camera.width, first.camera.height))
-    if near.sum() < FEWEST_MATCHES:
+    near = distance < PoseLimits.gate * float(np.hypot(first.camera.width, first.camera.height))
+    if near.sum() < PoseLimits.fewest_matches:
         return None
     return PairError(first.name, second.name, int(near.sum()), float(np.median(distance[near])) * factor)
 
@@ -170,59 +195,44 @@ def _fundamental(first: Camera, second: Camera) -> NDArray[np.float64]:
     return np.asarray(inner2.T @ cross @ rotation @ inner1)
 
 
-TYPICAL_PX = 2.0
-"""Median epipolar error in stored pixels above which a capture gets a warning."""
-VIEW_PX = 2.0
-"""The same of one view."""
-STANDS_OUT = 2.5
-"""A view also has to be this many times worse than the median view."""
-GAP_DEG = 25.0
-FEW_VIEWS = 20
-
-
 def pose_check(capture: Capture) -> Check:
     """Check whether feature matches agree with the poses."""
-    key = "poses"
-    title = "Pose quality"
     if capture.model is None:
         remedy = "Run polarguide prepare with --poses sfm or --poses PATH."
-        return Check(key, title, "n/a", "There are no poses.", remedy)
+        return Check("poses", "n/a", "There are no poses.", remedy)
     missing = tuple(view.name for view in capture.views if view.camera is None)
     errors = view_errors(epipolar_errors(capture))
     if len(errors) < 3:
-        return Check(
-            key, title, "n/a" if not missing else "warning",
-            f"Too few features match between neighboring views to judge the poses. {len(missing)} views have none.",
-            "Structure from motion needs static texture." if missing else "", missing,
-            {"views": {}, "without_pose": len(missing)},
-        )  # fmt: skip
+        finding = "Too few features match between neighboring views to judge the poses."
+        finding += f" {len(missing)} views have none."
+        remedy = "Structure from motion needs static texture." if missing else ""
+        figures: dict[str, Any] = {"views": {}, "without_pose": len(missing)}
+        return Check("poses", "warning" if missing else "n/a", finding, remedy, missing, figures)
     typical = float(np.median(list(errors.values())))
-    bad = tuple(name for name, e in errors.items() if e > max(VIEW_PX, STANDS_OUT * typical))
-    figures = {"median_px": typical, "views": errors, "without_pose": len(missing)}
+    bad = tuple(
+        name for name, e in errors.items() if e > max(PoseLimits.view_px, PoseLimits.stands_out * typical)
+    )
     finding = f"Matches lie {typical:.2f} px from their epipolar lines (median view of {len(errors)})."
-    verdict: Verdict = "ok"
+    verdict: Verdict = "warning" if bad or missing else "ok"
     remedies = []
     if bad:
-        verdict = "warning"
         finding += f" Far worse: {listed([f'{name} ({errors[name]:.1f} px)' for name in bad])}."
         remedies.append("Leave these views out, or register them again.")
     if missing:
-        verdict = "warning"
         finding += f" Without a pose: {len(missing)} views ({listed(list(missing))})."
         remedies.append("Remove the pictures of views without a pose, which train refuses, or register them.")
-    if typical > TYPICAL_PX:
-        verdict = "wrong" if typical > 2 * TYPICAL_PX else "warning"
+    if typical > PoseLimits.typical_px:
+        verdict = "wrong" if typical > 2 * PoseLimits.typical_px else "warning"
         remedies.append("Refine the model (bundle adjustment), and check that it belongs to these pictures.")
-    return Check(key, title, verdict, finding, " ".join(remedies), (*bad, *missing), figures)
+    figures = {"median_px": typical, "views": errors, "without_pose": len(missing)}
+    return Check("poses", verdict, finding, " ".join(remedies), (*bad, *missing), figures)
 
 
 def coverage_check(capture: Capture) -> Check:
     """Check whether neighboring views are close enough to each other."""
-    key = "coverage"
-    title = "Coverage"
     cameras = [view.camera for view in capture.posed if view.camera is not None]
     if len(cameras) < 2:
-        return Check(key, title, "n/a", "Fewer than two views have a pose.")
+        return Check("coverage", "n/a", "Fewer than two views have a pose.")
     focus = scene_frame(cameras).center
     directions = unit_array(torch.stack([camera.center - focus for camera in cameras]).numpy())
     angles = np.degrees(np.arccos(np.clip(directions @ directions.T, -1, 1))) + 360 * np.eye(len(directions))
@@ -237,19 +247,17 @@ def coverage_check(capture: Capture) -> Check:
         f"(median; at most {nearest.max():.0f}°), "
         f"within {spread:.0f}° of their mean direction."
     )
-    lonely = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > GAP_DEG)
-    if lonely or len(directions) < FEW_VIEWS:
-        return Check(
-            key, title, "warning", finding,
-            "Reconstruction is unreliable across gaps: add views at most 15 degrees apart.", lonely, figures,
-        )  # fmt: skip
-    return Check(key, title, "ok", finding, figures=figures)
-
-
-SURE = 0.98
-"""Probability from which on ``auto`` is content with the points."""
-FEWEST_TO_TRAIN = 8
-RUN_FOLDER = "short_run"
+    lonely = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > PoseLimits.gap)
+    outcome = first_outcome(
+        (not lonely and len(directions) >= PoseLimits.few_views, "ok", finding, ""),
+        (
+            True,
+            "warning",
+            finding,
+            "Reconstruction is unreliable across gaps: add views at most 15 degrees apart.",
+        ),
+    )
+    return Check("coverage", *outcome, lonely, figures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +283,7 @@ class Inspection:
         return worst(self.checks)
 
     def check(self, key: str) -> Check:
-        """The check with this key."""
+        """Return the check with this key."""
         return next(check for check in self.checks if check.key == key)
 
 
@@ -337,8 +345,7 @@ def inspect_scene(
         checks += [pose_check(capture), lens_check(capture), coverage_check(capture)]
     angles, pixels = _angles(capture, out, settings, index, pairing or 0, backend, reporter)
     angles = with_noise(angles, measurements)
-    checks += [order_check(angles), handedness_check(angles), zero_check(angles)]
-    checks.append(dielectric_check(measurements, pixels, index))
+    checks += [*angle_checks(angles), dielectric_check(measurements, pixels, index)]
     return Inspection(capture, settings, index, tuple(measurements), tuple(checks), angles)
 
 
@@ -351,21 +358,19 @@ def _shots(
     backend: Backend,
     reporter: Reporter,
 ) -> tuple[list[Check], ShotFindings]:
-    """The checks of a capture with other pictures than four angles a view, and what these tell of their polarizers."""
+    """Return the checks of a capture with pictures at other angles, and the findings on their polarizers."""
     checks = [pictures_check(capture), *agreement_checks(capture), *light_checks(capture, measurements)]
     with reporter.track("matching features", 1):
         checks += [pose_check(capture), lens_check(capture), coverage_check(capture)]
-    if len(capture.posed) < FEWEST_TO_TRAIN:
-        why = f"The angles are checked by a short training, which takes {FEWEST_TO_TRAIN} views with a pose."
-        findings = ShotFindings(why=why)
+    needed = "The angles are checked by a short training, which"
+    if len(capture.posed) < PoseLimits.fewest_to_train:
+        findings = ShotFindings(why=f"{needed} takes {PoseLimits.fewest_to_train} views with a pose.")
     elif settings.normals == "points":
-        findings = ShotFindings(
-            why="The angles are checked by a short training, which --normals points leaves out."
-        )
+        findings = ShotFindings(why=f"{needed} --normals points leaves out.")
     else:
         scene = _training_scene(capture, settings, reporter, held_out=())
         with reporter.track("short training", settings.steps) as advance:
-            findings = find_shots(
+            findings = estimate_shot_angles(
                 scene,
                 out / RUN_FOLDER,
                 steps=settings.steps,
@@ -385,21 +390,19 @@ def _angles(
     backend: Backend,
     reporter: Reporter,
 ) -> tuple[AngleFindings, SurfaceSamples | None]:
-    """Order, sense and zero by what geometry there is; and the pixels with normals if there are any."""
-    sources: list[Evidence] = []
-    if capture.model is None or len(capture.posed) < 2:
-        return combine_evidence(sources, pairing, capture.applied, mosaic=capture.origin == "mosaics"), None
-    with reporter.track("weighing points", 1):
-        evidence, pixels = point_evidence(capture.posed, capture.model, index, pairing)
-    sources.append(evidence)
-    angles = combine_evidence(sources, pairing, capture.applied, mosaic=capture.origin == "mosaics")
-    sure = angles.posterior is not None and max(angles.posterior.probabilities) >= SURE
-    if settings.normals == "points" or (settings.normals == "auto" and sure):
-        return angles, pixels
-    if len(capture.posed) < FEWEST_TO_TRAIN:
-        return angles, pixels
-    pixels = _trained_pixels(capture, out, settings, pairing, index, backend, reporter)
-    sources.append(normal_evidence(pixels, index))
+    """Return order, sense and zero by the available geometry; and the pixels with normals if there are any."""
+    sources: list[OrderEvidence] = []
+    pixels = None
+    trains = settings.normals != "points" and len(capture.posed) >= PoseLimits.fewest_to_train
+    if capture.model is not None and len(capture.posed) >= 2:
+        with reporter.track("weighing points", 1):
+            evidence, pixels = point_evidence(capture.posed, capture.model, index, pairing)
+        sources.append(evidence)
+        if settings.normals == "auto" and evidence.usable:
+            trains = trains and max(posterior(evidence).probabilities) < PoseLimits.sure
+        if trains:
+            pixels = _trained_pixels(capture, out, settings, pairing, index, backend, reporter)
+            sources.append(normal_evidence(pixels, index))
     return combine_evidence(sources, pairing, capture.applied, mosaic=capture.origin == "mosaics"), pixels
 
 
@@ -424,9 +427,9 @@ def _trained_pixels(
         )
     with reporter.track("comparing with normals", len(capture.posed)) as advance:
 
-        def surfaces() -> Iterator[tuple[InspectedView, Surface]]:
+        def surfaces() -> Iterator[tuple[InspectedView, ViewSurface]]:
             for done, view in enumerate(capture.posed):
-                yield view, surface_of(state, scene.view(view.name), backend)
+                yield view, trained_surface(state, scene.view(view.name), backend)
                 advance(done + 1)
 
         return sample_surfaces(surfaces(), pairing)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,57 +10,72 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from polarguide import optics
 from polarguide.capture import checks
+from polarguide.capture.angle_evidence import PAIRINGS, swaps
 from polarguide.capture.checks import MeasuredGains, measured_gains, pair_moments
 from polarguide.capture.view import ANGLES, FULL_CODE, listed
-from polarguide.inspection.angles import PAIRINGS, AngleFindings, swaps
+from polarguide.inspection.angles import AngleFindings
 from polarguide.inspection.capture import POLARIZED, Capture, ViewMeasurements
-from polarguide.inspection.evidence import ZENITH_MARGIN, SurfaceSamples
-from polarguide.inspection.settings import Check, Verdict
+from polarguide.inspection.evidence import EvidenceLimits, SurfaceSamples
+from polarguide.inspection.settings import LCD_TEST, Check, Verdict, first_outcome
 
-PAIR_ERROR = 0.05
-"""Median |I0 + I90 - I45 - I135| / S0 of a view above which its four pictures are inconsistent."""
-UNEQUAL = 0.01
-"""Deviation of the pair ratio from 1 for a warning; real sensors have about 0.02."""
-VERY_UNEQUAL = 0.04
-"""The same for the verdict "wrong"; a picture that is exposed 5 % longer gives 0.025."""
-OTHERWISE = 0.08
-"""Largest difference of the logarithms of the gains of two angles for a warning; angles marked to two degrees leave
-0.07, real sensors 0.04."""
-VERY_OTHERWISE = 0.17
-"""The same for the verdict "wrong". An exposure that differs by a third of a stop gives 0.23."""
-UNSTEADY = 0.01
-"""Deviation of a view's pair ratio from the capture's."""
-SATURATED = 0.05
-"""Share of saturated pixels from which on a view gets a warning."""
-BLOWN = 0.3
-"""Share of saturated pixels from which on a capture is wrong."""
-LITTLE = 0.05
-"""Share of polarized pixels below which a capture gets a warning."""
-ALMOST_NONE = 0.005
-"""Share of polarized pixels below which a capture is wrong."""
-NOISY = 0.03
-"""Noise of one intensity as a share of S0 / 2: three times its DoLP noise is then 0.13."""
 
-PAIRS_TITLE = "Consistency of the four angles"
-ENCODING_TITLE = "Linear encoding"
-EXPOSURE_TITLE = "Equal exposure of the angles"
-NOISE_TITLE = "Noise"
-UNDEREXPOSED = 0.01
-"""99th percentile of the values below which the exposure of a view was too short."""
+class PictureLimits:
+    """Thresholds of the checks.
+
+    Attributes:
+        pair_error: median |I0 + I90 - I45 - I135| / S0 of a view above which its four pictures are inconsistent.
+        unequal: deviation of the pair ratio from 1 for a warning; real sensors have about 0.02.
+        very_unequal: the same for the verdict "wrong"; a picture that is exposed 5 % longer gives 0.025.
+        exposed_unequal: largest difference of the logarithms of the gains of two angles for a warning; angles marked to
+            two degrees leave 0.07, real sensors 0.04.
+        exposed_very_unequal: the same for the verdict "wrong"; a third of a stop gives 0.23.
+        unsteady: deviation of a view's pair ratio from the capture's.
+        saturated: share of saturated pixels from which on a view gets a warning.
+        blown: share of saturated pixels from which on a capture is wrong.
+        little: share of polarized pixels below which a capture gets a warning.
+        almost_none: share of polarized pixels below which a capture is wrong.
+        noisy: noise of one intensity as a share of S0 / 2; three times its DoLP noise is then 0.13.
+        underexposed: 99th percentile of the values below which the exposure of a view was too short.
+        bent: curvature of the response for the verdict "wrong", beside ``checks.BENT``. A gamma of 0.8 has -0.125, of
+            0.73 -0.18; DoLP is then off by as much as the gamma. Smooth areas of a real sensor's pictures have -0.17.
+        sure_bend: standard errors by which a curvature differs from 0 for certain.
+        not_dielectric: share of the pixels with normals, or of all pixels, above which the check warns.
+    """
+
+    pair_error = 0.05
+    unequal = 0.01
+    very_unequal = 0.04
+    exposed_unequal = 0.08
+    exposed_very_unequal = 0.17
+    unsteady = 0.01
+    saturated = 0.05
+    blown = 0.3
+    little = 0.05
+    almost_none = 0.005
+    noisy = 0.03
+    underexposed = 0.01
+    bent = 0.18
+    sure_bend = 4.0
+    not_dielectric = 0.15
 
 
 def find_pairing(capture: Capture) -> int | None:
-    """The pairs of perpendicular pictures by their sums, an index into ``PAIRINGS``; None if they do not decide."""
-    residuals = np.array([view.measures.residuals for view in capture.views])
+    """Return the pairing with the best pair sums, an index into ``PAIRINGS``; None if they do not decide."""
+    residuals = np.array(
+        [checks.measure(view.codes.numpy(), view.usable.numpy()).residuals for view in capture.views]
+    )
     residuals = residuals[residuals.max(axis=1) > 0]
     if len(residuals) == 0:
         return None
     exposed = measured_exposures(capture)
-    if exposed is not None and exposed.pairing is not None and max(exposed.errors) < OTHERWISE / 3:
+    if (
+        exposed is not None
+        and exposed.pairing is not None
+        and max(exposed.errors) < PictureLimits.exposed_unequal / 3
+    ):
         return exposed.pairing  # whatever the exposures are
     medians = np.median(residuals, axis=0)
     best = int(medians.argmin())
@@ -81,22 +97,17 @@ def picture_checks(
     """All checks of this file, in their order on the page."""
     if capture.origin == "stokes":
         computed = "The four pictures were computed from Stokes vectors: their sums agree by construction."
-        checks_of_four = (
-            ("pair_sums", PAIRS_TITLE),
-            ("encoding", ENCODING_TITLE),
-            ("exposure", EXPOSURE_TITLE),
-        )
         return [
-            *(Check(key, title, "n/a", computed) for key, title in checks_of_four),
+            *(Check(key, "n/a", computed) for key in ("pair_sums", "encoding", "exposure")),
             _saturation(capture, measurements),
-            Check("noise", NOISE_TITLE, "n/a", computed),
+            Check("noise", "n/a", computed),
             _polarization(measurements),
         ]
     encoding = _encoding(capture, pairing)
     # A bent response looks like exposures that differ.
     exposed = measured_exposures(capture) if encoding.verdict == "ok" else None
     return [
-        _pairs(capture, measurements, pairing),
+        _pairs(measurements, pairing),
         encoding,
         _exposure(measurements, pairing, exposed),
         _saturation(capture, measurements),
@@ -110,128 +121,98 @@ def light_checks(capture: Capture, measurements: Sequence[ViewMeasurements]) -> 
     return [_saturation(capture, measurements), _brightness(measurements)]
 
 
-def _pairs(capture: Capture, measurements: Sequence[ViewMeasurements], pairing: int | None) -> Check:
-    key = "pair_sums"
-    title = PAIRS_TITLE
+def _majority(views: Sequence[str], measurements: Sequence[ViewMeasurements]) -> Verdict:
+    """Return "wrong" if more than half of the views are concerned, else "warning"."""
+    return "wrong" if 2 * len(views) > len(measurements) else "warning"
+
+
+def _pairs(measurements: Sequence[ViewMeasurements], pairing: int | None) -> Check:
     error = float(np.median([r.sum_error for r in measurements]))
-    figures = {"median_error": error, "pairing": None if pairing is None else list(PAIRINGS[pairing])}
-    if pairing is not None and pairing > 0:
-        return Check(
-            key, title, "wrong",
-            f"The pair sums agree only if {swaps(PAIRINGS[pairing])}.",
-            "Rename the files; once the whole order is decided, --fix does it.", figures=figures,
-        )  # fmt: skip
-    off = tuple(r.view for r in measurements if r.sum_error > PAIR_ERROR)
-    if off:
-        verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) else "warning"
-        return Check(
-            key, title, verdict,
-            f"I0 + I90 and I45 + I135 differ by more than {PAIR_ERROR:.0%} of S0 in {len(off)} views "
+    off = () if pairing else tuple(r.view for r in measurements if r.sum_error > PictureLimits.pair_error)
+    outcome = first_outcome(
+        (
+            pairing,
+            "wrong",
+            f"The pair sums agree only if {swaps(PAIRINGS[pairing or 0])}.",
+            "Rename the files; once the whole order is decided, --fix does it.",
+        ),
+        (not off, "ok", f"I0 + I90 and I45 + I135 differ by {error:.1%} of S0 (median).", ""),
+        (
+            off,
+            _majority(off, measurements),
+            f"I0 + I90 and I45 + I135 differ by more than {PictureLimits.pair_error:.0%} of S0 in {len(off)} views "
             f"({listed(list(off))}).",
             "Check whether something moved or the light changed between the shots, or whether files were exchanged.",
-            off, figures,
-        )  # fmt: skip
-    finding = f"I0 + I90 and I45 + I135 differ by {error:.1%} of S0 (median)."
-    return Check(key, title, "ok", finding, figures=figures)
-
-
-WRONG = 0.18
-"""Curvature of the response, beside ``checks.BENT``: a gamma of 0.8 has -0.125, of 0.73 -0.18; DoLP is then off by as
-much as the gamma. Smooth areas of a real sensor's pictures, whose response is close to linear, have -0.17."""
+        ),
+    )
+    figures = {"median_error": error, "pairing": None if pairing is None else list(PAIRINGS[pairing])}
+    return Check("pair_sums", *outcome, off, figures)
 
 
 def _encoding(capture: Capture, pairing: int | None) -> Check:
-    key = "encoding"
-    title = ENCODING_TITLE
-    slope = checks.curvature([view.measures for view in capture.views])
-    if slope is None or pairing not in (None, 0):
-        why = "too few pixels are polarized" if slope is None else "the pictures are paired wrongly"
-        return Check(key, title, "n/a", f"The curvature of the response cannot be measured: {why}.")
-    bend = response_curvature(capture)
-    figures = {"curvature": slope} if bend is None else {"curvature": bend[0], "curvature_error": bend[1]}
-    slope = slope if bend is None else bend[0]
-    sure = bend is not None and abs(slope) > _SURE_BEND * bend[1]
-    finding = f"Curvature of the response {slope:+.2f}; linear files have 0, sRGB read as linear about -0.6."
-    low, high = (abs(slope) > abs((checks.ENCODED if slope < 0 else checks.DECODED)[k]) for k in (0, 1))
-    low = low or (sure and abs(slope) > checks.BENT)
-    high = high or (sure and abs(slope) > WRONG)
-    if not low:
-        return Check(key, title, "ok", finding, figures=figures)
-    gamma = 1 / (1 - 2 * slope)
-    remedy = (
-        "The files seem display-encoded (gamma): export linear ones, or read them with --transfer srgb; mosaics of a "
-        f"camera with gamma are prepared with --gamma (here about {gamma:.2f})."
-        if slope < 0
-        else "The files seem linear but are decoded (or have another tone curve): try --transfer linear."
+    slopes = [
+        checks.pair_slopes(view.codes.numpy(), view.usable.numpy(), checks.FOUR_PAIRS)
+        for view in capture.views
+    ]
+    found = checks.curvature_of(list(itertools.chain.from_iterable(slopes)))
+    if found is None or pairing not in (None, 0):
+        why = "too few pixels are polarized" if found is None else "the pictures are paired wrongly"
+        return Check("encoding", "n/a", f"The curvature of the response cannot be measured: {why}.")
+    curvature = found.value
+    bend = abs(curvature)
+    sure = bend > PictureLimits.sure_bend * found.error
+    doubtful, certain = np.abs(checks.ENCODED if curvature < 0 else checks.DECODED)
+    finding = (
+        f"Curvature of the response {curvature:+.2f}; linear files have 0, sRGB read as linear about -0.6."
     )
-    return Check(key, title, "wrong" if high else "warning", finding, remedy, figures=figures)
-
-
-_SURE_BEND = 4.0
-_GROUPS = 16
-
-
-def response_curvature(capture: Capture) -> tuple[float, float] | None:
-    """Curvature of the response and its standard error; None where too few pixels are polarized.
-
-    The slope of ``checks.Measures``, with S1/S0 and S2/S0 beside it in the regression: gains that differ, and angles
-    that are off, bend nothing. The error is a jackknife over groups of pixels that lie together.
-    """
-    groups: list[NDArray[np.float64]] = []
-    for view in capture.views:
-        gray = view.intensities().mean(dim=-1).numpy().astype(np.float64)
-        good = view.usable.numpy() & (gray.min(axis=0) > 1 / 256)
-        i0, i45, i90, i135 = gray[:, good]
-        s0 = (i0 + i45 + i90 + i135) / 2
-        x = (i0 - i90) / s0
-        y = (i45 - i135) / s0
-        rows = np.stack([np.ones_like(x), x, y, x * x - y * y, (i0 + i90 - i45 - i135) / s0])
-        groups += [
-            part @ part.T for part in np.array_split(rows, max(2, _GROUPS // len(capture.views)), axis=1)
-        ]
-    total = np.sum(groups, axis=0)
-
-    def slope(moments: NDArray[np.float64]) -> float:
-        return float(np.linalg.lstsq(moments[:4, :4], moments[:4, 4], rcond=None)[0][3])
-
-    count = total[0, 0]
-    if count < 1000 or total[3, 3] / count - (total[0, 3] / count) ** 2 < 0.005**2:
-        return None
-    curvature = slope(total)
-    without = np.array([slope(total - part) for part in groups])
-    error = math.sqrt(float(((without - curvature) ** 2).sum()) * (len(groups) - 1) / len(groups))
-    return curvature, error
+    verdict: Verdict = "wrong" if bend > certain or (sure and bend > PictureLimits.bent) else "warning"
+    outcome = first_outcome(
+        (bend <= doubtful and not (sure and bend > checks.BENT), "ok", finding, ""),
+        (
+            curvature < 0,
+            verdict,
+            finding,
+            "The files seem display-encoded (gamma): export linear ones, or read them with --transfer srgb; mosaics of "
+            f"a camera with gamma are prepared with --gamma (here about {1 / (1 + 2 * bend):.2f}).",
+        ),
+        (
+            True,
+            verdict,
+            finding,
+            "The files seem linear but are decoded (or have another tone curve): try --transfer linear.",
+        ),
+    )
+    return Check("encoding", *outcome, figures={"curvature": curvature, "curvature_error": found.error})
 
 
 def _exposure(
     measurements: Sequence[ViewMeasurements], pairing: int | None, exposed: MeasuredGains | None
 ) -> Check:
-    key = "exposure"
-    title = EXPOSURE_TITLE
-    known = [r for r in measurements if r.pair_ratio is not None]
+    known = {r.view: r.pair_ratio for r in measurements if r.pair_ratio is not None}
     if not known or pairing not in (None, 0):
-        return Check(key, title, "n/a", "The pair sums cannot be compared.")
-    ratio = float(np.median([r.pair_ratio for r in known]))
-    off = tuple(r.view for r in known if abs((r.pair_ratio or ratio) - ratio) > UNSTEADY)
+        return Check("exposure", "n/a", "The pair sums cannot be compared.")
+    ratio = float(np.median(list(known.values())))
+    off = tuple(view for view, of_view in known.items() if abs(of_view - ratio) > PictureLimits.unsteady)
     figures: dict[str, Any] = {"pair_ratio": ratio, "unsteady_views": len(off)}
     finding = f"(I0 + I90) / (I45 + I135) is {ratio:.3f} (median); ideal analyzers have 1."
     verdict: Verdict = "ok"
     remedy = ""
-    if abs(ratio - 1) > UNEQUAL:
-        verdict = "wrong" if abs(ratio - 1) > VERY_UNEQUAL else "warning"
+    if abs(ratio - 1) > PictureLimits.unequal:
+        verdict = "wrong" if abs(ratio - 1) > PictureLimits.very_unequal else "warning"
         finding += f" If only one picture deviates, it does by {2 * abs(ratio - 1):.0%}."
         remedy = (
             "Let prepare estimate the gains (it does by default), or measure them on unpolarized light and give "
             "--calibration. The pair sums do not show which of the four deviates."
         )
-    apart = 0.0 if exposed is None else float(np.ptp(exposed.logs))
-    if exposed is not None and apart > max(OTHERWISE, 3 * max(exposed.errors)):
-        figures["exposures"] = list(np.exp(exposed.logs))
-        wrong = verdict == "wrong" or apart > max(VERY_OTHERWISE, 3 * max(exposed.errors))
-        verdict = "wrong" if wrong else "warning"
-        each = ", ".join(
-            f"{angle}°: {value:.2f}" for angle, value in zip(ANGLES, np.exp(exposed.logs), strict=True)
-        )
+    if exposed is not None and np.ptp(exposed.logs) > max(
+        PictureLimits.exposed_unequal, 3 * max(exposed.errors)
+    ):
+        gains = np.exp(exposed.logs).tolist()
+        figures["exposures"] = gains
+        if verdict != "wrong":
+            wrong = np.ptp(exposed.logs) > max(PictureLimits.exposed_very_unequal, 3 * max(exposed.errors))
+            verdict = "wrong" if wrong else "warning"
+        each = ", ".join(f"{angle}°: {gain:.2f}" for angle, gain in zip(ANGLES, gains, strict=True))
         finding += f" Pixel by pixel, they agree if the angles were exposed by {each}."
         remedy = (
             "Prepare the original files, whose EXIF says the exposure, with --gains auto; or give gains with "
@@ -239,67 +220,70 @@ def _exposure(
         )
     if off:
         verdict = "warning" if verdict == "ok" else verdict
-        finding += f" It differs by more than {UNSTEADY:.0%} in {len(off)} views ({listed(list(off))})."
+        finding += f" It differs by more than {PictureLimits.unsteady:.0%} in {len(off)} views ({listed(list(off))})."
         remedy = remedy or "Look for automatic exposure, flicker, or motion between the shots."
-    return Check(key, title, verdict, finding, remedy, off, figures)
+    return Check("exposure", verdict, finding, remedy, off, figures)
 
 
 def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> Check:
-    key = "saturation"
-    title = "Saturation"
     shares = [r.saturated for r in measurements]
-    lost = [r.saturated + r.invalid for r in measurements]
-    figures = {
-        "saturated": float(np.mean(shares)),
-        "worst": max(shares),
-        "invalid": float(np.mean([r.invalid for r in measurements])),
-        "dark": float(np.mean([r.dark for r in measurements])),
-    }
+    lost = {r.view: r.saturated + r.invalid for r in measurements}
+    invalid = float(np.mean([r.invalid for r in measurements]))
+    dark = float(np.mean([r.dark for r in measurements]))
     largest = max(view.peak for view in capture.views)
-    if capture.bits == 16 and 0 < largest < (FULL_CODE + 1) // 16:
-        return Check(
-            key, title, "wrong", f"No value of the 16-bit files exceeds {largest}.",
-            "The data were not scaled to 16 bits: multiply the values, or run prepare with --bits.", figures=figures,
-        )  # fmt: skip
-    off = tuple(r.view for r, share in zip(measurements, lost, strict=True) if share > SATURATED)
+    unscaled = capture.bits == 16 and 0 < largest < (FULL_CODE + 1) // 16
+    off = () if unscaled else tuple(view for view, share in lost.items() if share > PictureLimits.saturated)
     finding = (
         f"{np.mean(shares):.1%} of the pixels are at full scale, at most {max(shares):.1%} in a view; "
-        f"{figures['invalid']:.1%} are marked invalid, {figures['dark']:.1%} are too dark to be used."
+        f"{invalid:.1%} are marked invalid, {dark:.1%} are too dark to be used."
     )
-    if not off:
-        return Check(key, title, "ok", finding, figures=figures)
-    verdict: Verdict = "wrong" if float(np.mean(lost)) > BLOWN else "warning"
-    return Check(
-        key, title, verdict, f"{finding} Over {SATURATED:.0%} are lost in {len(off)} views ({listed(list(off))}).",
-        "These pixels carry no polarization and are excluded. Invalid ones may have clipped in the camera: expose "
-        "shorter, keep lamps out of the picture.", off, figures,
-    )  # fmt: skip
+    outcome = first_outcome(
+        (
+            unscaled,
+            "wrong",
+            f"No value of the 16-bit files exceeds {largest}.",
+            "The data were not scaled to 16 bits: multiply the values, or run prepare with --bits.",
+        ),
+        (not off, "ok", finding, ""),
+        (
+            off,
+            "wrong" if np.mean(list(lost.values())) > PictureLimits.blown else "warning",
+            f"{finding} Over {PictureLimits.saturated:.0%} are lost in {len(off)} views ({listed(list(off))}).",
+            "These pixels carry no polarization and are excluded. Invalid ones may have clipped in the camera: expose "
+            "shorter, keep lamps out of the picture.",
+        ),
+    )
+    figures = {"saturated": float(np.mean(shares)), "worst": max(shares), "invalid": invalid, "dark": dark}
+    return Check("saturation", *outcome, off, figures)
 
 
 def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
-    key = "noise"
-    title = NOISE_TITLE
-    share, bright = (
-        float(np.median([getattr(r, k) for r in measurements])) for k in ("noise_share", "bright")
+    share = float(np.median([r.noise_share for r in measurements]))
+    bright = float(np.median([r.bright for r in measurements]))
+    off = tuple(
+        r.view
+        for r in measurements
+        if r.noise_share > PictureLimits.noisy or r.bright < PictureLimits.underexposed
     )
-    off = tuple(r.view for r in measurements if r.noise_share > NOISY or r.bright < UNDEREXPOSED)
     finding = (
         f"Noise of one intensity is {share:.2%} of the photograph (median, after averaging down), so that a DoLP "
         f"of {3 * 2**0.5 * share / 2:.3f} is three times its noise; "
         f"the 99th percentile of the values is {bright:.0%} of full scale."
     )
-    figures = {"noise_share": share, "bright": bright}
-    if not off:
-        return Check(key, title, "ok", finding, figures=figures)
-    verdict: Verdict = "wrong" if 2 * len(off) > len(measurements) and bright < UNDEREXPOSED else "warning"
-    return Check(
-        key, title, verdict, f"{finding} Dark or noisy: {len(off)} views ({listed(list(off))}).",
-        "Use a longer exposure at the lowest gain, or average several shots.", off, figures,
-    )  # fmt: skip
+    outcome = first_outcome(
+        (not off, "ok", finding, ""),
+        (
+            off,
+            _majority(off, measurements) if bright < PictureLimits.underexposed else "warning",
+            f"{finding} Dark or noisy: {len(off)} views ({listed(list(off))}).",
+            "Use a longer exposure at the lowest gain, or average several shots.",
+        ),
+    )
+    return Check("noise", *outcome, off, {"noise_share": share, "bright": bright})
 
 
 def with_noise(angles: AngleFindings, measurements: Sequence[ViewMeasurements]) -> AngleFindings:
-    """The findings with noise in the error of the zero, where the check of noise warns.
+    """Return the findings with noise in the error of the zero if the check of noise warns.
 
     There, values are steps of a tone curve or what a compression left of them, which is not independent from pixel to
     pixel. So the error that it makes in the AoLP of one strongly polarized pixel is that of all of them together.
@@ -314,86 +298,80 @@ def with_noise(angles: AngleFindings, measurements: Sequence[ViewMeasurements]) 
 
 
 def _brightness(measurements: Sequence[ViewMeasurements]) -> Check:
-    key = "brightness"
-    title = "Brightness"
     bright = float(np.median([r.bright for r in measurements]))
+    off = tuple(r.view for r in measurements if r.bright < PictureLimits.underexposed)
     finding = f"The 99th percentile of the values is {bright:.0%} of full scale (median view)."
-    off = tuple(r.view for r in measurements if r.bright < UNDEREXPOSED)
-    if not off:
-        return Check(key, title, "ok", finding, figures={"bright": bright})
-    return Check(
-        key, title, "wrong" if 2 * len(off) > len(measurements) else "warning",
-        f"{finding} Dark: {len(off)} views ({listed(list(off))}).", "Use a longer exposure.", off, {"bright": bright},
-    )  # fmt: skip
+    dark = f"{finding} Dark: {len(off)} views ({listed(list(off))})."
+    outcome = first_outcome(
+        (not off, "ok", finding, ""),
+        (off, _majority(off, measurements), dark, "Use a longer exposure."),
+    )
+    return Check("brightness", *outcome, off, {"bright": bright})
 
 
 def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
-    key = "low_dolp"
-    title = "Strength of polarization"
     share = float(np.median([r.polarized for r in measurements]))
-    median = float(np.median([r.dolp[0] for r in measurements]))
-    finding = f"{share:.0%} of the pixels have a DoLP above {POLARIZED:g} and above three times its noise; "
-    finding += f"the median DoLP is {median:.3f}."
-    strongest = float(np.median([r.dolp[1] for r in measurements]))
+    median, strongest = np.median([r.dolp for r in measurements], axis=0).tolist()
     noise = 3 * math.sqrt(2) / 2 * float(np.median([r.noise_share for r in measurements]))
-    figures = {"polarized": share, "median_dolp": median, "p99_dolp": strongest}
-    if share >= LITTLE:
-        return Check(key, title, "ok", finding, figures=figures)
-    if (strongest < POLARIZED or share < ALMOST_NONE) and noise < POLARIZED:
-        return Check(
-            key, title, "wrong",
-            f"No modulation: was the filter reversed, or missing? The four pictures show the same light but for "
+    finding = (
+        f"{share:.0%} of the pixels have a DoLP above {POLARIZED:g} and above three times its noise; "
+        f"the median DoLP is {median:.3f}."
+    )
+    outcome = first_outcome(
+        (share >= PictureLimits.little, "ok", finding, ""),
+        (
+            (strongest < POLARIZED or share < PictureLimits.almost_none) and noise < POLARIZED,
+            "wrong",
+            "No modulation: was the filter reversed, or missing? The four pictures show the same light but for "
             f"noise; 99 % of the pixels (median view) have a DoLP under {strongest:.3f}, and {share:.1%} one above "
             "three times their noise.",
-            "Hold the filter before an LCD screen and turn it: the side that is towards the screen when it goes dark "
-            "must face the scene. If the filter was right: photograph glossy surfaces obliquely (50 to 65 degrees).",
-            figures=figures,
-        )  # fmt: skip
-    return Check(
-        key, title, "wrong" if share < ALMOST_NONE else "warning", finding,
-        "Polarization carries little information here. Photograph surfaces obliquely (50 to 65 degrees), from lower "
-        "views; check that the filter is a linear polarizer, the right way round, and that the exposure was fixed.",
-        figures=figures,
-    )  # fmt: skip
-
-
-NOT_DIELECTRIC = 0.15
-"""Share of the pixels with normals, or of all pixels, above which the check warns."""
+            LCD_TEST,
+        ),
+        (
+            True,
+            "wrong" if share < PictureLimits.almost_none else "warning",
+            finding,
+            "Polarization carries little information here. Photograph surfaces obliquely (50 to 65 degrees), from "
+            "lower views; check that the filter is a linear polarizer, the right way round, and that the exposure was "
+            "fixed.",
+        ),
+    )
+    figures = {"polarized": share, "median_dolp": median, "p99_dolp": strongest}
+    return Check("low_dolp", *outcome, figures=figures)
 
 
 def dielectric_check(
     measurements: Sequence[ViewMeasurements], pixels: SurfaceSamples | None, index: float
 ) -> Check:
     """Check whether large areas are polarized more strongly than a dielectric under unpolarized light can be."""
-    key = "dielectric"
-    title = "Polarization that a dielectric can have"
-    above = float(torch.tensor([r.above_limit for r in measurements]).median())
+    share = float(torch.tensor([r.above_limit for r in measurements]).median())
     limit = float(optics.diffuse_dolp_limit(index))
-    finding = f"{above:.0%} of the pixels (median view) have a DoLP above the diffuse limit ({limit:.2f})."
-    figures: dict[str, Any] = {"above_diffuse_limit": above}
-    remedy = (
-        "Bare metal, sky or its reflection, or a screen? The model assumes dielectrics under unpolarized light: "
-        "exclude such areas with masks, and expect worse normals there."
-    )
+    finding = f"{share:.0%} of the pixels (median view) have a DoLP above the diffuse limit ({limit:.2f}). "
+    figures = {"above_diffuse_limit": share}
     if pixels is None or len(pixels.aolp) == 0:
-        verdict: Verdict = "warning" if above > NOT_DIELECTRIC else "ok"
         finding += (
-            " Without normals, reflections of a smooth dielectric cannot be distinguished from metal or sky."
+            "Without normals, reflections of a smooth dielectric cannot be distinguished from metal or sky."
         )
-        return Check(key, title, verdict, finding, remedy if verdict == "warning" else "", figures=figures)
-    strange = float(exceeds_dielectric(pixels, index).float().mean())
-    figures["unexplained"] = strange
-    finding += (
-        f" {strange:.0%} of pixels with a normal have a DoLP above the maximum of both lobes at their zenith."
+    else:
+        share = float(exceeds_dielectric(pixels, index).float().mean())
+        figures["unexplained"] = share
+        finding += f"{share:.0%} of pixels with a normal have a DoLP above the maximum of both lobes at their zenith."
+    outcome = first_outcome(
+        (share <= PictureLimits.not_dielectric, "ok", finding, ""),
+        (
+            True,
+            "warning",
+            finding,
+            "Bare metal, sky or its reflection, or a screen? The model assumes dielectrics under unpolarized light: "
+            "exclude such areas with masks, and expect worse normals there.",
+        ),
     )
-    if strange <= NOT_DIELECTRIC:
-        return Check(key, title, "ok", finding, figures=figures)
-    return Check(key, title, "warning", finding, remedy, figures=figures)
+    return Check("dielectric", *outcome, figures=figures)
 
 
 def exceeds_dielectric(pixels: SurfaceSamples, index: float) -> torch.Tensor:
-    """Whether the DoLP exceeds that of specular and diffuse light at every zenith within the margin, [N] bool."""
-    steps = torch.linspace(-ZENITH_MARGIN, ZENITH_MARGIN, 7)
+    """Return true where the DoLP exceeds both lobes at every zenith within the margin, [N] bool."""
+    steps = EvidenceLimits.zenith_margin * torch.linspace(-1, 1, 7)
     zenith = (pixels.zenith[:, None] + steps).clamp(0, math.pi / 2)
     most = torch.maximum(optics.specular_dolp(zenith, index), optics.diffuse_dolp(zenith, index)).amax(dim=1)
     return pixels.dolp > most + 3 * pixels.noise

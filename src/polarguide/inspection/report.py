@@ -14,11 +14,9 @@ from polarguide import __version__, optics
 from polarguide.core.files import make_folder, write_text, write_whole
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import to_json
-from polarguide.inspection.angles import AngleFindings
 from polarguide.inspection.capture import InspectedView, ViewMeasurements, quantile
 from polarguide.inspection.inspect import Inspection
-from polarguide.inspection.settings import plain
-from polarguide.inspection.shots import ShotFindings
+from polarguide.inspection.settings import json_value
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
 from polarguide.visualization.layers import AOLP_FULL_DOLP, DOLP_HIGH
@@ -121,7 +119,6 @@ def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
     """
     capture = inspection.capture
     settings = inspection.settings
-    angles = inspection.angles
     layers = LAYERS if capture.four else SHOT_LAYERS
     marked = {name for check in inspection.checks for name in check.views}
     tiles = []
@@ -139,10 +136,6 @@ def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
         title=f"Inspection of {capture.name}",
         summary=f"{len(capture.views)} views of {width} x {height} pixels, {capture.bits} bits; {posed}",
         found=inspection,
-        why=_why(angles),
-        orders=_orders(angles) if isinstance(angles, AngleFindings) else [],
-        shots=_shots(angles) if isinstance(angles, ShotFindings) else [],
-        notes=_notes(angles) if isinstance(angles, AngleFindings) else [],
         layers=layers,
         ramps={layer.ramp: figures.color_gradient(layer.ramp) for layer in layers if layer.ramp},
         wheel=data_uri(figures.angle_wheel(), "aolp", 2 * SIDE),
@@ -158,71 +151,32 @@ def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
     )
 
 
-def _why(angles: AngleFindings | ShotFindings) -> str:
-    """Why nothing was found; empty where something was."""
-    if isinstance(angles, ShotFindings):
-        return angles.why
-    return "" if angles.posterior else "Not decided: this check needs poses and reflecting surfaces."
-
-
-def _orders(angles: AngleFindings) -> list[tuple[str, str, float, str]]:
-    """Files, sense and zero, probability, and log-odds relative to the best (empty: the best)."""
-    if angles.posterior is None:
-        return []
-    return [
-        (
-            ", ".join(f"{angle}°" for angle in row.files),
-            row.order.label,
-            row.probability,
-            "" if k == angles.posterior.best else f"{-row.log_odds:.1f}",
-        )
-        for k, row in enumerate(angles.hypotheses)
-    ]
-
-
-def _notes(angles: AngleFindings) -> list[str]:
-    posterior = angles.posterior
-    zero = "" if posterior is None else f"{posterior.offset:+.2f}° ± {posterior.offset_error:.2f}°"
-    notes = [f"Zero offset beyond the best order: {zero}."] if zero else []
-    return notes + [
-        f"{e.source.capitalize()}{'' if e.usable else ' (not used)'}: {e.note}" for e in angles.sources
-    ]
-
-
-def _shots(findings: ShotFindings) -> list[tuple[str, ...]]:
-    """Rows of the table of angles: what is specified of each picture, and what was found."""
-    rows: list[tuple[str, ...]] = []
-    for judgment, exposure in zip(findings.judgments, findings.stated, strict=True):
-        angle = "without a filter, as it looks" if judgment.unfiltered else f"{judgment.angle:.0f}°"
-        angle = "too little polarization to tell" if judgment.vague else angle
-        numbers = (f"{judgment.spread:.1f}°", f"{judgment.modulation:.2f}", f"{judgment.gain:.2f}")
-        rows.append((judgment.view, exposure.words, angle, *numbers))
-    return [] if findings.why else rows
-
-
 def _figures(measurements: Sequence[ViewMeasurements]) -> list[tuple[str, ...]]:
     """Head and rows of the table of figures; single shots have fewer of them."""
     shots = any(r.exposures for r in measurements)
-    head = ("99 % under", "saturated", "invalid", "dark")
-    more = (
-        "noise",
-        "pair ratio",
-        "sum error",
-        "DoLP median",
-        "DoLP 99 %",
-        "polarized",
-        "above diffuse limit",
-    )
-    rows: list[tuple[str, ...]] = [("view", "pictures", *head) if shots else ("view", *head, *more)]
+    rows = []
     for r in measurements:
-        cells = (f"{r.bright:.3f}", f"{r.saturated:.2%}", f"{r.invalid:.2%}", f"{r.dark:.2%}")
-        if shots:
-            rows.append((r.view, r.exposures or "0, 45, 90, 135", *cells))
-            continue
-        ratio = "n/a" if r.pair_ratio is None else f"{r.pair_ratio:.4f}"
-        further = (ratio, f"{r.sum_error:.2%}", f"{r.dolp[0]:.3f}", f"{r.dolp[1]:.3f}", f"{r.polarized:.1%}")
-        rows.append((r.view, *cells, f"{r.noise_share:.2%}", *further, f"{r.above_limit:.1%}"))
-    return rows
+        row = {
+            "view": r.view,
+            "pictures": r.exposures or "0, 45, 90, 135",
+            "99 % under": f"{r.bright:.3f}",
+            "saturated": f"{r.saturated:.2%}",
+            "invalid": f"{r.invalid:.2%}",
+            "dark": f"{r.dark:.2%}",
+        }
+        if not shots:
+            del row["pictures"]
+            row |= {
+                "noise": f"{r.noise_share:.2%}",
+                "pair ratio": "n/a" if r.pair_ratio is None else f"{r.pair_ratio:.4f}",
+                "sum error": f"{r.sum_error:.2%}",
+                "DoLP median": f"{r.dolp[0]:.3f}",
+                "DoLP 99 %": f"{r.dolp[1]:.3f}",
+                "polarized": f"{r.polarized:.1%}",
+                "above diffuse limit": f"{r.above_limit:.1%}",
+            }
+        rows.append(row)
+    return [tuple(rows[0]), *(tuple(row.values()) for row in rows)]
 
 
 SCHEMA = 2
@@ -233,32 +187,33 @@ RECORD = "inspection.json"
 def inspection_record(inspection: Inspection) -> dict[str, Any]:
     """The findings as plain JSON types; docs/reference/inspection.md describes the keys."""
     capture = inspection.capture
-    record: dict[str, Any] = plain(
-        {
-            "schema": SCHEMA,
-            "program": f"polarguide {__version__}",
-            "scene": {
-                "name": capture.name,
-                "views": len(capture.views),
-                "posed_views": len(capture.posed),
-                "size": list(capture.size),
-                "bits": capture.bits,
-                "digest": capture.digest,
-            },
-            "settings": {
-                "downscale": capture.factor,
-                "transfer": capture.transfer,
-                "refractive_index": inspection.index,
-                "normals": inspection.settings.normals,
-                "steps": inspection.settings.steps,
-            },
-            "verdict": inspection.verdict,
-            "checks": [check.record() for check in inspection.checks],
-            "angles": inspection.angles.record(),
-            "views": [measured.record() for measured in inspection.measurements],
-        }
+    return dict(
+        json_value(
+            {
+                "schema": SCHEMA,
+                "program": f"polarguide {__version__}",
+                "scene": {
+                    "name": capture.name,
+                    "views": len(capture.views),
+                    "posed_views": len(capture.posed),
+                    "size": list(capture.size),
+                    "bits": capture.bits,
+                    "digest": capture.digest,
+                },
+                "settings": {
+                    "downscale": capture.factor,
+                    "transfer": capture.transfer,
+                    "refractive_index": inspection.index,
+                    "normals": inspection.settings.normals,
+                    "steps": inspection.settings.steps,
+                },
+                "verdict": inspection.verdict,
+                "checks": [check.record() for check in inspection.checks],
+                "angles": inspection.angles.record(),
+                "views": [measured.record() for measured in inspection.measurements],
+            }
+        )
     )
-    return record
 
 
 def write_inspection(inspection: Inspection, out: Path, reporter: Reporter = SILENT) -> tuple[Path, Path]:

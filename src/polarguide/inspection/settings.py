@@ -41,6 +41,34 @@ class InspectSettings:
 Verdict = Literal["ok", "warning", "wrong", "n/a", "not verified"]
 ORDER: tuple[Verdict, ...] = ("n/a", "ok", "not verified", "warning", "wrong")
 """From no verdict to the worst."""
+TITLES = {
+    "pair_sums": "Consistency of the four angles",
+    "encoding": "Linear encoding",
+    "exposure": "Equal exposure of the angles",
+    "saturation": "Saturation",
+    "noise": "Noise",
+    "brightness": "Brightness",
+    "low_dolp": "Strength of polarization",
+    "analyzers": "Analyzers of the sensor",
+    "view_exposure": "Equal exposure of the views",
+    "poses": "Pose quality",
+    "focal_lengths": "Focal lengths",
+    "coverage": "Coverage",
+    "angle_order": "Order of the angles",
+    "handedness": "Sense of the angles",
+    "zero_offset": "Zero of the angles",
+    "dielectric": "Polarization that a dielectric can have",
+    "pictures": "Pictures",
+    "agreement": "Agreement of the angles",
+    "modulation": "Filter",
+    "angles": "Angles of the pictures",
+}
+"""Headings of the checks by key."""
+LCD_TEST = (
+    "Hold the filter before an LCD screen and turn it: the side that is towards the screen when it goes dark must face "
+    "the scene. If the filter was right: photograph glossy surfaces obliquely (50 to 65 degrees)."
+)
+"""Advice for pictures without modulation."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +76,7 @@ class Check:
     """The outcome of one check.
 
     Attributes:
-        key: its name in ``inspection.json``.
-        title: its heading for people.
+        key: its name in ``inspection.json``, one of ``TITLES``.
         verdict: "ok"; "warning" where a person should decide; "wrong"; "n/a" where the check cannot be made;
             "not verified" where it cannot be made although training relies on it.
         finding: the result, one or two sentences.
@@ -59,30 +86,42 @@ class Check:
     """
 
     key: str
-    title: str
     verdict: Verdict
     finding: str
     remedy: str = ""
     views: tuple[str, ...] = ()
     figures: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def title(self) -> str:
+        """Heading on the page."""
+        return TITLES[self.key]
+
     def record(self) -> dict[str, Any]:
-        """The check as plain JSON types; numbers that are not finite become null."""
-        record: dict[str, Any] = plain(vars(self))
-        return record
+        """Return the check as JSON types; numbers that are not finite become null."""
+        return dict(json_value({"key": self.key, "title": self.title, **vars(self)}))
+
+
+def first_outcome(*rows: tuple[object, Verdict, str, str]) -> tuple[Verdict, str, str]:
+    """Return verdict, finding and remedy of the first row whose condition holds.
+
+    Args:
+        rows: condition, verdict, finding and remedy of each possible outcome, the most important first.
+    """
+    return next(outcome for condition, *outcome in rows if condition)  # type: ignore[return-value]
 
 
 def worst(checks: Iterable[Check]) -> Verdict:
-    """The worst verdict among the checks; "n/a" if there is none."""
+    """Return the worst verdict among the checks; "n/a" without checks."""
     return max((check.verdict for check in checks), key=ORDER.index, default="n/a")
 
 
-def plain(value: Any) -> Any:
-    """A value as JSON types: floats rounded to six digits, null where they are not finite."""
+def json_value(value: Any) -> Any:
+    """Return a value as JSON types: floats rounded to six digits, null if they are not finite."""
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): json_value(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [json_value(item) for item in value]
     if isinstance(value, float):
         return float(f"{value:.6g}") if math.isfinite(value) else None
     return value

@@ -7,7 +7,7 @@ A short training without the stated angles estimates each picture's angle in clo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,19 @@ from typing import Any
 import numpy as np
 
 from polarguide.capture import Scene
+from polarguide.capture.angle_evidence import (
+    AngleLimits,
+    CommonRotation,
+    angle_difference,
+    common_rotation,
+    tolerance,
+)
 from polarguide.capture.exposures import Exposure, determine_stokes
 from polarguide.capture.picture_sets import SetSamples, chosen_pixels, judge
 from polarguide.capture.view import FULL_CODE, View, listed
 from polarguide.inspection.capture import Capture
 from polarguide.inspection.evidence import short_run
-from polarguide.inspection.settings import Check, Verdict
+from polarguide.inspection.settings import LCD_TEST, Check, Verdict, first_outcome
 from polarguide.raster import Backend
 from polarguide.recipes import recipe_named
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers
@@ -28,29 +35,39 @@ from polarguide.training.recipe import Recipe
 from polarguide.training.settings import StepReport
 
 RECIPE = "polarguide-stokes"
-CERTAIN = 0.6
-"""Modulation (``FittedAngle``), over the median of all pictures, from which one may contradict its stated angle. At
-0.7 a wrong line of the demo (0.67) went unnamed. Nor may one that the scene explains poorly: on four test scenes with
-right angles (two seeds each, 504 pictures) nine would count as wrong, five of them are certain enough, and none of
-these is explained as well as the others.
-"""
-CONTRADICTS = 30.0
-"""Degrees from the stated angle from which on a picture contradicts it, if that is also four times its spread and
-four standard deviations of all differences. The short training is 3 to 7 degrees off (median) on four scenes."""
-ALIKE = 0.8
-"""Length of the mean of (cos 2d, sin 2d), d being differences of angles, from which on they agree with each other."""
-FEWEST = 4
-"""Number of pictures that determine their angle from which on all are judged."""
-SENSE_NEEDS = 0.95
-"""Said angles whose doubled directions have a mean longer than this are too much alike to tell a sense."""
-ZERO_OFF = 4.0
-"""Degrees of a common offset for a warning, if it is also beyond four standard errors."""
-ZERO_WRONG = 8.0
-"""Degrees of a common offset for the verdict "wrong"."""
-REDUNDANT = 4
-"""Known angles of one view from which on they can contradict one another."""
-FEW_ANGLES = 3
-"""Different angles from which on S1 and S2 can be told apart, over the capture."""
+"""Recipe of the short training."""
+
+
+class ShotLimits:
+    """Thresholds of the checks.
+
+    Attributes:
+        certain: share of the median modulation (``FittedAngle``) from which a picture may contradict its stated angle.
+            At 0.7 a wrong line of the demo (0.67) went unnamed.
+        contradicts: smallest difference in degrees that contradicts a stated angle. The short training is 3 to 7
+            degrees off (median) on four scenes.
+        sigmas: standard deviations that a short training may be off by chance.
+        fewest: pictures that determine their angle from which on all are judged.
+        zero_off: degrees of a common offset for a warning.
+        zero_wrong: degrees of a common offset for the verdict "wrong".
+        redundant: known angles of one view from which on they can contradict one another.
+        few_angles: different angles from which on S1 and S2 can be told apart, over the capture.
+    """
+
+    certain = 0.6
+    contradicts = 30.0
+    sigmas = 4.0
+    fewest = 4
+    zero_off = 4.0
+    zero_wrong = 8.0
+    redundant = 4
+    few_angles = 3
+
+
+CHAOS = (
+    "Look for shifted lines in angles.csv, or prepare with --angles unknown: training then finds the angles."
+)
+"""Advice for stated angles that have nothing to do with the pictures."""
 
 
 @dataclass(frozen=True)
@@ -73,10 +90,25 @@ class ShotFindings:
     def telling(self) -> list[tuple[Judgment, float]]:
         """Pictures that determine their angle, with the stated angle of each."""
         rows = zip(self.judgments, self.stated, strict=True)
-        return [(j, s.angle) for j, s in rows if s.angle is not None and not (j.vague or j.unfiltered)]
+        return [(judgment, s.angle) for judgment, s in rows if s.angle is not None and judgment.tells]
+
+    @property
+    def rotation(self) -> CommonRotation:
+        """Sense and zero of the stated angles by the pictures that determine their angle."""
+        if len(self.telling) < ShotLimits.fewest:
+            return CommonRotation()
+        return common_rotation([j.angle for j, _ in self.telling], [angle for _, angle in self.telling])
+
+    @property
+    def undecided(self) -> tuple[Verdict, str]:
+        """Verdict and finding of a check that has too few pictures to compare."""
+        if all(exposure.angle is None for exposure in self.stated):
+            return "n/a", "No angle is stated: training estimates them."
+        count = len(self.telling)
+        return "not verified", f"Only {count} pictures with a stated angle determine it: too few to compare."
 
     def record(self) -> dict[str, Any]:
-        """As plain JSON types."""
+        """Return the findings as JSON types."""
         pictures = [
             {
                 "view": judgment.view,
@@ -87,15 +119,15 @@ class ShotFindings:
                 "gain": judgment.gain,
                 "modulation": judgment.modulation,
                 "filtered": not judgment.unfiltered,
-                "tells": not (judgment.vague or judgment.unfiltered),
+                "tells": judgment.tells,
             }
             for judgment, exposure in zip(self.judgments, self.stated, strict=True)
         ]
         return {"pictures": pictures, "why_not": self.why}
 
 
-def untold(scene: Scene) -> Scene:
-    """The scene as if no angle of a picture through a filter were known."""
+def without_angles(scene: Scene) -> Scene:
+    """Return the scene as if no angle of a picture through a filter were known."""
 
     def blank(view: View) -> View:
         return view.with_exposures(tuple(replace(e, angle=None) if e.filtered else e for e in view.exposures))
@@ -103,7 +135,7 @@ def untold(scene: Scene) -> Scene:
     return replace(scene, views=tuple(blank(view) for view in scene.views))
 
 
-def find_shots(
+def estimate_shot_angles(
     scene: Scene,
     folder: Path,
     *,
@@ -126,7 +158,7 @@ def find_shots(
         return ShotFindings(why="No picture was taken through a filter.", unfiltered=True)
     recipe = recipe_named(RECIPE)
     assert isinstance(recipe, Recipe)
-    blind = untold(scene)
+    blind = without_angles(scene)
     total = math.ceil(steps / recipe.angle_rules.last)
     until = Polarizers(blind, recipe, total).search + 1  # angles are fitted when a step begins
     state = short_run(
@@ -145,9 +177,7 @@ def find_shots(
 
 
 def pictures_check(capture: Capture) -> Check:
-    """Check of the number of pictures, and of the differences of their angles."""
-    key = "pictures"
-    title = "Pictures"
+    """Check the number of pictures, and the differences of their angles."""
     exposures = [exposure for view in capture.views for exposure in view.exposures]
     angles = sorted({exposure.angle for exposure in exposures if exposure.angle is not None})
     unknown = sum(not exposure.known for exposure in exposures)
@@ -156,41 +186,44 @@ def pictures_check(capture: Capture) -> Check:
     gains = [exposure.gain for exposure in exposures]
     figures = {"pictures": len(exposures), "angles": angles, "unknown": unknown, "plain": plain,
                "gains": [min(gains), max(gains)]}  # fmt: skip
-    parts = []
-    if known:
-        parts.append(f"{known} at {len(angles)} known angles ({listed([f'{angle:g}' for angle in angles])})")
-    if unknown:
-        parts.append(f"{unknown} at unknown angles")
-    if plain:
-        parts.append(f"{plain} without a filter")
-    finding = f"{len(exposures)} pictures of {len(capture.views)} views: {', '.join(parts)}; gains "
-    finding += f"{min(gains):.2f} to {max(gains):.2f}."
-    if plain == len(exposures):
-        return Check(
-            key, title, "warning", f"{finding} Ordinary photographs train, without measured polarization.",
+    kinds = {
+        f"{known} at {len(angles)} known angles ({listed([f'{angle:g}' for angle in angles])})": known,
+        f"{unknown} at unknown angles": unknown,
+        f"{plain} without a filter": plain,
+    }
+    finding = (
+        f"{len(exposures)} pictures of {len(capture.views)} views: "
+        f"{', '.join(text for text, count in kinds.items() if count)}; gains {min(gains):.2f} to {max(gains):.2f}."
+    )
+    outcome = first_outcome(
+        (
+            plain == len(exposures),
+            "warning",
+            f"{finding} Ordinary photographs train, without measured polarization.",
             "If a filter was used, note its angles (or --angles unknown) and repeat prepare. If not, nothing is wrong; "
-            "some views through a filter would improve layers and normals.", figures=figures,
-        )  # fmt: skip
-    if not unknown and len(angles) < FEW_ANGLES:
-        return Check(
-            key, title, "warning", finding,
+            "some views through a filter would improve layers and normals.",
+        ),
+        (
+            not unknown and len(angles) < ShotLimits.few_angles,
+            "warning",
+            finding,
             "Turn the filter between shots: with at least three angles, spread over half a turn, no direction of "
-            "the polarization stays unseen.", figures=figures,
-        )  # fmt: skip
-    return Check(key, title, "ok", finding, figures=figures)
+            "the polarization stays unseen.",
+        ),
+        (True, "ok", finding, ""),
+    )
+    return Check("pictures", *outcome, figures=figures)
 
 
 def agreement_checks(capture: Capture) -> list[Check]:
-    """Whether the pictures of a view agree with one another; nothing where no view has more than three known angles."""
-    key = "agreement"
-    title = "Agreement of the angles"
+    """Check whether the pictures of a view agree with one another; empty if no view has four or more known angles."""
     compared = 0
     notes = []
     wrong: list[str] = []
     for view in capture.views:
         places = [k for k, exposure in enumerate(view.exposures) if exposure.angle is not None]
         exposures = tuple(view.exposures[k] for k in places)
-        if len(places) < REDUNDANT or not determine_stokes(exposures):
+        if len(places) < ShotLimits.redundant or not determine_stokes(exposures):
             continue
         files = capture.layout.files(view.name)
         samples = SetSamples(
@@ -209,179 +242,154 @@ def agreement_checks(capture: Capture) -> list[Check]:
             notes += [f"{view.name}: {note.removesuffix(' It is left out.')}" for note in judged.notes]
     if not compared:
         return []
-    figures = {"views": compared, "contradicting": len(wrong)}
-    if not notes:
-        return [Check(key, title, "ok", f"The pictures of {compared} views agree.", figures=figures)]
-    return [
-        Check(
-            key, title, "wrong",
+    outcome = first_outcome(
+        (not notes, "ok", f"The pictures of {compared} views agree.", ""),
+        (
+            notes,
+            "wrong",
             f"In {len(wrong)} of {compared} views, pictures contradict one another. {listed(notes)}",
             "Correct their lines of angles.csv, or write unknown; repeat prepare without pictures that moved.",
-            tuple(wrong), figures,
-        )
-    ]  # fmt: skip
+        ),
+    )
+    figures = {"views": compared, "contradicting": len(wrong)}
+    return [Check("agreement", *outcome, tuple(wrong), figures)]
 
 
 def shot_checks(findings: ShotFindings) -> list[Check]:
-    """Checks of the pictures: filter, sense and zero of the angles, and each angle."""
+    """Check the filter, sense and zero of the angles, and each angle."""
     if findings.why:
-        checks = [("modulation", "Filter"), ("handedness", "Sense of the angles"),
-                ("zero_offset", "Zero of the angles"), ("angles", "Angles of the pictures")]  # fmt: skip
         verdict: Verdict = "n/a" if findings.unfiltered else "not verified"
-        return [Check(key, title, verdict, findings.why) for key, title in checks]
-    sense, offset, error = _common(findings.telling)
+        return [
+            Check(key, verdict, findings.why) for key in ("modulation", "handedness", "zero_offset", "angles")
+        ]
+    rotation = findings.rotation
     return [
         _modulation(findings),
-        _sense(findings, sense),
-        _zero(findings, sense, offset, error),
-        _each(findings, sense, offset),
+        _sense(findings, rotation.sense),
+        _zero(findings, rotation),
+        _each(findings, rotation),
     ]
 
 
-def _common(telling: Sequence[tuple[Judgment, float]]) -> tuple[int | None, float, float]:
-    """Sense (1, or -1 for reversed; None where neither agrees), common offset in degrees, its standard error."""
-    if len(telling) < FEWEST:
-        return None, 0.0, math.inf
-    angles = np.radians([(j.angle, s) for j, s in telling])
-    turns = [np.exp(2j * (angles[:, 0] - sign * angles[:, 1])) for sign in (1, -1)]
-    lengths = [abs(turn.mean()) for turn in turns]
-    alike = abs(np.exp(2j * angles[:, 1]).mean()) > SENSE_NEEDS
-    sense = 1 if lengths[0] >= lengths[1] or alike else -1
-    turn = turns[0 if sense == 1 else 1]
-    if abs(turn.mean()) < ALIKE / 2:
-        return None, 0.0, math.inf
-    # The mean, then once more without those that contradict it.
-    near = turn[np.abs(np.angle(turn / turn.mean())) < math.radians(2 * CONTRADICTS)]
-    offset = float(np.degrees(np.angle(near.mean())) / 2)
-    apart = np.degrees(np.angle(near / near.mean())) / 2
-    return sense, offset, float(1.4826 * np.median(np.abs(apart)) / math.sqrt(len(near)) * 1.25)
-
-
 def _modulation(findings: ShotFindings) -> Check:
-    key = "modulation"
-    title = "Filter"
     count = len(findings.judgments)
     plain = tuple(dict.fromkeys(j.view for j in findings.judgments if j.unfiltered))
     vague = sum(j.vague for j in findings.judgments)
     modulation = float(np.median([j.modulation for j in findings.judgments]))
-    figures = {"pictures": count, "unfiltered": len(plain), "vague": vague, "modulation": modulation}
     finding = f"{count - len(plain) - vague} of {count} pictures tell the angle of their filter."
-    if 2 * len(plain) > count:
-        return Check(
-            key, title, "wrong",
+    outcome = first_outcome(
+        (
+            2 * len(plain) > count,
+            "wrong",
             f"No modulation: was the filter reversed, or missing? {len(plain)} of {count} pictures look as if taken "
             "without one.",
-            "Hold the filter before an LCD screen and turn it: the side that is towards the screen when it goes dark "
-            "must face the scene. If the filter was right: photograph glossy surfaces obliquely (50 to 65 degrees).",
-            plain, figures,
-        )  # fmt: skip
-    if plain:
-        return Check(
-            key, title, "warning", f"{finding} Taken without a filter, as it looks: {listed(list(plain))}.",
-            "If so, write none for them in angles.csv.", plain, figures,
-        )  # fmt: skip
-    if 2 * vague > count:
-        return Check(
-            key, title, "warning", f"{finding} The others show too little polarization for that.",
+            LCD_TEST,
+        ),
+        (
+            plain,
+            "warning",
+            f"{finding} Taken without a filter, as it looks: {listed(list(plain))}.",
+            "If so, write none for them in angles.csv.",
+        ),
+        (
+            2 * vague > count,
+            "warning",
+            f"{finding} The others show too little polarization for that.",
             "Photograph glossy surfaces obliquely (50 to 65 degrees); or train longer with --steps.",
-            figures=figures,
-        )  # fmt: skip
-    return Check(key, title, "ok", finding, figures=figures)
+        ),
+        (True, "ok", finding, ""),
+    )
+    figures = {"pictures": count, "unfiltered": len(plain), "vague": vague, "modulation": modulation}
+    return Check("modulation", *outcome, plain, figures)
 
 
 def _sense(findings: ShotFindings, sense: int | None) -> Check:
-    key = "handedness"
-    title = "Sense of the angles"
-    telling = findings.telling
-    if len(telling) < FEWEST:
-        return Check(key, title, "n/a" if _all_unknown(findings) else "not verified", _too_few(findings))
-    stated = np.radians([angle for _, angle in telling])
-    if abs(np.exp(2j * stated).mean()) > SENSE_NEEDS or abs(np.exp(4j * stated).mean()) > SENSE_NEEDS:
-        return Check(
-            key,
-            title,
-            "not verified",
-            "The stated angles, modulo 90 degrees, differ too little to tell.",
-        )
-    if sense is None:
-        return Check(key, title, "warning", "The pictures agree with neither sense.", _remedy_of_chaos())
-    if sense == -1:
-        return Check(
-            key, title, "wrong", "Clockwise as displayed: the pictures agree only if the angles count the other way.",
-            "Repeat prepare with the other --sense and a new --out.", figures={"counter_clockwise": 0.0},
-        )  # fmt: skip
-    return Check(key, title, "ok", "Counter-clockwise as displayed.", figures={"counter_clockwise": 1.0})
+    if len(findings.telling) < ShotLimits.fewest:
+        return Check("handedness", *findings.undecided)
+    stated = np.radians([angle for _, angle in findings.telling])
+    alike = max(abs(np.exp(1j * times * stated).mean()) for times in (2, 4)) > AngleLimits.same_direction
+    outcome = first_outcome(
+        (alike, "not verified", "The stated angles, modulo 90 degrees, differ too little to tell.", ""),
+        (sense is None, "warning", "The pictures agree with neither sense.", CHAOS),
+        (sense == 1, "ok", "Counter-clockwise as displayed.", ""),
+        (
+            sense == -1,
+            "wrong",
+            "Clockwise as displayed: the pictures agree only if the angles count the other way.",
+            "Repeat prepare with the other --sense and a new --out.",
+        ),
+    )
+    figures = {} if alike or sense is None else {"counter_clockwise": float(sense == 1)}
+    return Check("handedness", *outcome, figures=figures)
 
 
-def _zero(findings: ShotFindings, sense: int | None, offset: float, error: float) -> Check:
-    key = "zero_offset"
-    title = "Zero of the angles"
+def _zero(findings: ShotFindings, rotation: CommonRotation) -> Check:
+    sense, offset, error = rotation
     if sense is None:
-        return Check(key, title, "n/a" if _all_unknown(findings) else "not verified", _too_few(findings))
-    figures = {"offset_degrees": offset, "error_degrees": error}
+        return Check("zero_offset", *findings.undecided)
     finding = f"The zero of the filter lies at {offset:+.1f}° ± {error:.1f}° from where it is stated to lie."
-    if abs(offset) <= max(ZERO_OFF, 4 * error):
-        return Check(key, title, "ok", finding, figures=figures)
-    verdict: Verdict = "wrong" if abs(offset) > max(ZERO_WRONG, 4 * error) else "warning"
-    return Check(
-        key, title, verdict, finding,
-        f"Repeat prepare with --zero changed by {offset:+.0f} degrees and a new --out; this training itself is good "
-        "to a few degrees.", figures=figures,
-    )  # fmt: skip
+    warning, wrong = (
+        abs(offset) > tolerance(floor, error, sigmas=ShotLimits.sigmas)
+        for floor in (ShotLimits.zero_off, ShotLimits.zero_wrong)
+    )
+    outcome = first_outcome(
+        (not warning, "ok", finding, ""),
+        (
+            True,
+            "wrong" if wrong else "warning",
+            finding,
+            f"Repeat prepare with --zero changed by {offset:+.0f} degrees and a new --out; this training itself is "
+            "good to a few degrees.",
+        ),
+    )
+    return Check("zero_offset", *outcome, figures={"offset_degrees": offset, "error_degrees": error})
 
 
-def _each(findings: ShotFindings, sense: int | None, offset: float) -> Check:
-    key = "angles"
-    title = "Angles of the pictures"
+def _each(findings: ShotFindings, rotation: CommonRotation) -> Check:
+    sense, offset, _ = rotation
     unknown = sum(not exposure.known for exposure in findings.stated)
     if sense is None:
-        chaos = len(findings.telling) >= FEWEST
-        if _all_unknown(findings) and (doubtful := sum(j.doubtful for j in findings.judgments)) * 2 > unknown:
-            finding = f"No angle is specified, and {doubtful} of the {unknown} that were found are doubtful."
-            return Check(
-                key, title, "warning", finding, REMEDY, figures={"doubtful": doubtful, "unknown": unknown}
-            )
-        verdict: Verdict = "wrong" if chaos else "ok" if _all_unknown(findings) else "not verified"
-        finding = "The pictures contradict the stated angles." if chaos else _too_few(findings)
-        return Check(key, title, verdict, finding, _remedy_of_chaos() if chaos else "")
-    # Differences are angles modulo 180 degrees, in [-90, 90).
+        verdict, finding = findings.undecided
+        doubtful = sum(j.doubtful for j in findings.judgments)
+        doubts = verdict == "n/a" and 2 * doubtful > unknown
+        outcome = first_outcome(
+            (
+                len(findings.telling) >= ShotLimits.fewest,
+                "wrong",
+                "The pictures contradict the stated angles.",
+                CHAOS,
+            ),
+            (
+                doubts,
+                "warning",
+                f"No angle is specified, and {doubtful} of the {unknown} that were found are doubtful.",
+                REMEDY,
+            ),
+            (True, "ok" if verdict == "n/a" else verdict, finding, ""),
+        )
+        return Check("angles", *outcome, figures={"doubtful": doubtful, "unknown": unknown} if doubts else {})
     rows = [
-        (j, (j.angle - sense * angle - offset + 90.0) % 180.0 - 90.0, angle) for j, angle in findings.telling
+        (j, angle, abs(angle_difference(j.angle, sense * angle + offset))) for j, angle in findings.telling
     ]
-    typical = float(np.median([abs(apart) for _, apart, _ in rows]))
-    certain = CERTAIN * float(np.median([j.modulation for j in findings.judgments]))
+    typical = float(np.median([apart for _, _, apart in rows]))
+    certain = ShotLimits.certain * float(np.median([j.modulation for j in findings.judgments]))
     off = [
         (j, angle)
-        for j, apart, angle in rows
-        if abs(apart) > max(CONTRADICTS, 4 * j.spread, 4 * 1.4826 * typical)
+        for j, angle, apart in rows
+        if apart > tolerance(ShotLimits.contradicts, j.spread, typical, sigmas=ShotLimits.sigmas)
         and j.modulation > certain
         and not j.poorly_explained
     ]
-    figures = {"median_degrees": typical, "compared": len(rows), "unknown": unknown}
+    names = [f"{j.view} ({angle:g}°, looks like {sense * (j.angle - offset) % 180:.0f}°)" for j, angle in off]
     finding = f"{len(rows)} pictures lie {typical:.1f}° from the stated angles (median)."
-    if not off:
-        return Check(key, title, "ok", finding, figures=figures)
-    names = [
-        f"{j.view} ({angle:g}°, looks like {(sense * (j.angle - offset)) % 180:.0f}°)" for j, angle in off
-    ]
-    return Check(
-        key, title, "wrong" if 5 * len(off) > len(rows) else "warning",
-        f"{finding} Contradicting: {listed(names)}.",
-        "Compare them with your notes; correct their lines of angles.csv, or write unknown.",
-        tuple(dict.fromkeys(j.view for j, _ in off)), figures,
-    )  # fmt: skip
-
-
-def _all_unknown(findings: ShotFindings) -> bool:
-    return all(exposure.angle is None for exposure in findings.stated)
-
-
-def _too_few(findings: ShotFindings) -> str:
-    if _all_unknown(findings):
-        return "No angle is stated: training estimates them."
-    count = len(findings.telling)
-    return f"Only {count} pictures with a stated angle determine it: too few to compare."
-
-
-def _remedy_of_chaos() -> str:
-    return "Look for shifted lines in angles.csv, or prepare with --angles unknown: training then finds the angles."
+    outcome = first_outcome(
+        (not off, "ok", finding, ""),
+        (
+            off,
+            "wrong" if 5 * len(off) > len(rows) else "warning",
+            f"{finding} Contradicting: {listed(names)}.",
+            "Compare them with your notes; correct their lines of angles.csv, or write unknown.",
+        ),
+    )
+    figures = {"median_degrees": typical, "compared": len(rows), "unknown": unknown}
+    return Check("angles", *outcome, tuple(dict.fromkeys(j.view for j, _ in off)), figures)

@@ -10,30 +10,36 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from polarguide.capture.angle_evidence import TO_DEVIATION
 from polarguide.capture.colmap.model import ColmapModel
 from polarguide.capture.point_exposures import significant
 from polarguide.capture.view import listed
 from polarguide.inspection.capture import Capture
-from polarguide.inspection.settings import Check, Verdict
+from polarguide.inspection.settings import Check, first_outcome
 
-FEWEST = 50
-"""Points from which on a focal length is estimated."""
-FOCAL_DIFFERS = 0.01
-"""Difference of the logarithm of a focal length for a warning; 1 % turns a ray at 30 degrees by 0.25 degrees."""
-FOCAL_WRONG = 0.05
-"""The same for the verdict "wrong"."""
-TO_DEVIATION = 1.4826
-STEP = 1 / 3
-"""Stops by which cameras set exposures; with a larger error, equal exposures are not confirmed."""
+
+class ViewLimits:
+    """Thresholds of the checks.
+
+    Attributes:
+        fewest: points from which on a focal length is estimated.
+        focal_differs: difference of the logarithm of a focal length for a warning; 1 % turns a ray at 30 degrees by
+            0.25 degrees.
+        focal_wrong: the same for the verdict "wrong".
+        step: stops by which cameras set exposures; with a larger error, equal exposures are not confirmed.
+    """
+
+    fewest = 50
+    focal_differs = 0.01
+    focal_wrong = 0.05
+    step = 1 / 3
 
 
 def view_exposure_check(capture: Capture) -> Check:
     """Check whether the views were exposed and white-balanced alike."""
-    key = "view_exposure"
-    title = "Equal exposure of the views"
     exposures = capture.exposures
     if exposures is None or not np.isfinite(exposures.logs).any():
-        return Check(key, title, "n/a", "No points that views have in common are stored in the model.")
+        return Check("view_exposure", "n/a", "No points that views have in common are stored in the model.")
     logs = exposures.significant / math.log(2)
     known = np.isfinite(logs).all(axis=1)
     size = np.where(known, np.abs(logs).max(axis=1), 0.0)
@@ -47,64 +53,70 @@ def view_exposure_check(capture: Capture) -> Check:
         "unknown": int((~known).sum()),
     }
     precision = f"to {errors[0]:.2f} stops, colors to {errors[1]:.2f}"
-    if not strongest and errors[0] > STEP:
-        finding = (
-            f"The points that views have in common are too few to compare their exposures ({precision})."
+    changes = [f"{names[k]} {logs[k][np.abs(logs[k]).argmax()]:+.2f}" for k in strongest]
+    remedy = "Training and evaluation divide each color of these views by its gain."
+    if capture.keeps_gains:
+        remedy = (
+            "prepare --gains none left them. Prepare without it, and training divides each color of a view by its "
+            "gain."
         )
-        return Check(
-            key, title, "not verified", finding, "Add views between those there are.", figures=figures
-        )
-    if not strongest:
-        finding = f"The points that views have in common are equally bright in all of them ({precision})."
-        return Check(key, title, "ok", finding, figures=figures)
-    told = [f"{names[k]} {logs[k][np.abs(logs[k]).argmax()]:+.2f}" for k in strongest]
-    remedy = (
-        "prepare --gains none left them. Prepare without it, and training divides each color of a view by its gain."
-        if capture.keeps_gains
-        else "Training and evaluation divide each color of these views by its gain."
+    outcome = first_outcome(
+        (
+            strongest,
+            "warning",
+            f"{len(strongest)} of {len(names)} views were exposed or white-balanced otherwise than the mean, by points "
+            f"in common ({precision}). Stops: {listed(changes)}.",
+            f"{remedy} Next time, fix exposure and white balance.",
+        ),
+        (
+            errors[0] > ViewLimits.step,
+            "not verified",
+            f"The points that views have in common are too few to compare their exposures ({precision}).",
+            "Add views between those there are.",
+        ),
+        (
+            True,
+            "ok",
+            f"The points that views have in common are equally bright in all of them ({precision}).",
+            "",
+        ),
     )
-    return Check(
-        key, title, "warning",
-        f"{len(strongest)} of {len(names)} views were exposed or white-balanced otherwise than the mean, by points in "
-        f"common ({precision}). Stops: {listed(told)}.",
-        f"{remedy} Next time, fix exposure and white balance.",
-        tuple(names[k] for k in strongest), figures,
-    )  # fmt: skip
+    return Check("view_exposure", *outcome, tuple(names[k] for k in strongest), figures)
 
 
 def lens_check(capture: Capture) -> Check:
     """Check whether each view alone agrees with the focal length that the model has for it."""
-    key = "focal_lengths"
-    title = "Focal lengths"
     if capture.model is None:
-        return Check(key, title, "n/a", "There are no poses.")
+        return Check("focal_lengths", "n/a", "There are no poses.")
     found = {
         view.name: alone
         for view in capture.posed
         if (alone := _focal_length_alone(capture.model, view.name)) is not None
     }
     if len(found) < 3:
-        why = f"Fewer than 3 views have {FEWEST} points with their places in the pictures."
-        return Check(key, title, "n/a", why)
+        why = f"Fewer than 3 views have {ViewLimits.fewest} points with their places in the pictures."
+        return Check("focal_lengths", "n/a", why)
     names = list(found)
     logs, errors = np.array(list(found.values())).T
-    off = significant(np.abs(logs), errors) & (np.abs(logs) > FOCAL_DIFFERS)
+    off = significant(np.abs(logs), errors) & (np.abs(logs) > ViewLimits.focal_differs)
     usual = float(np.sqrt(np.mean(logs**2)))
-    figures = {"rms": usual, "views": dict(zip(names, (np.exp(logs) - 1).tolist(), strict=True))}
+    order = [int(k) for k in np.argsort(-np.abs(logs)) if off[k]]
+    changes = listed([f"{names[k]} {math.expm1(logs[k]):+.1%}" for k in order])
     finding = (
         f"Where the points hold and a view alone is free, its focal length changes by {usual:.1%} (rms)."
     )
-    if not off.any():
-        return Check(key, title, "ok", finding, figures=figures)
-    order = [int(k) for k in np.argsort(-np.abs(logs)) if off[k]]
-    told = listed([f"{names[k]} {math.expm1(logs[k]):+.1%}" for k in order])
-    verdict: Verdict = "wrong" if np.abs(logs[off]).max() > FOCAL_WRONG else "warning"
-    return Check(
-        key, title, verdict, f"{finding} It contradicts the model in {len(order)} views ({told}).",
-        "Poses are wrong where several cameras were taken for one: a telephone that changed its lens, a zoom, a crop. "
-        "Prepare the original files, whose EXIF tells them apart, or bring a model with a camera for each.",
-        tuple(names[k] for k in order), figures,
-    )  # fmt: skip
+    outcome = first_outcome(
+        (not order, "ok", finding, ""),
+        (
+            order,
+            "wrong" if np.abs(logs[off]).max(initial=0) > ViewLimits.focal_wrong else "warning",
+            f"{finding} It contradicts the model in {len(order)} views ({changes}).",
+            "Poses are wrong where several cameras were taken for one: a telephone that changed its lens, a zoom, a "
+            "crop. Prepare the original files, whose EXIF tells them apart, or bring a model with a camera for each.",
+        ),
+    )
+    figures = {"rms": usual, "views": dict(zip(names, (np.exp(logs) - 1).tolist(), strict=True))}
+    return Check("focal_lengths", *outcome, tuple(names[k] for k in order), figures)
 
 
 def _focal_length_alone(model: ColmapModel, view: str) -> tuple[float, float] | None:
@@ -114,7 +126,7 @@ def _focal_length_alone(model: ColmapModel, view: str) -> tuple[float, float] | 
     distances of the deviation that they have.
     """
     pixels, places = model.correspondences(view)
-    if len(pixels) < FEWEST:
+    if len(pixels) < ViewLimits.fewest:
         return None
     camera = model.camera(view)
     local = places @ camera.rotation.numpy().T + camera.translation.numpy()

@@ -14,12 +14,13 @@ from torch import Tensor
 from trainings import context_of, different, fits_of, run
 
 from polarguide.capture import Scene, View
+from polarguide.capture.angle_evidence import mean_angle
 from polarguide.capture.exposures import FOUR, Exposure, read_table
 from polarguide.capture.variants import select_exposures
 from polarguide.recipes import RECIPES, recipe_named
 from polarguide.runs.reports import report_polarizers
 from polarguide.training.angles.fits import gaussian_training
-from polarguide.training.angles.polarizers import Polarizers, mean_angle
+from polarguide.training.angles.polarizers import Polarizers
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.recipe import Recipe

@@ -209,21 +209,20 @@ def read_stack(
         PolarguideError: one cannot be read, or they differ in size, depth or orientation.
     """
     pictures: list[NDArray[Any]] = []
-    codes: list[int] = []
+    first_code = None
     for path in paths:
         picture, code = _read_shot(path, gains)
-        if pictures:
-            require_alike(path, picture, paths[0], pictures[0])
         pictures.append(picture)
-        codes.append(code)
-        if codes[-1] != codes[0]:
+        first_code = first_code or code
+        require_alike(path, picture, paths[0], pictures[0])
+        if code != first_code:
             raise PolarguideError(
                 path,
-                expected=f"EXIF orientation {codes[0]} like {paths[0].name}",
-                found=str(codes[-1]),
+                expected=f"EXIF orientation {first_code} like {paths[0].name}",
+                found=str(code),
                 remedy="Keep the camera still between the shots of a view, or export all with the same settings.",
             )
-    return stacked(np.stack(pictures), codes[0], lossy=is_lossy(paths[0]), levels=levels)
+    return stacked(np.stack(pictures), code, lossy=is_lossy(paths[0]), levels=levels)
 
 
 def stacked(
@@ -235,16 +234,13 @@ def stacked(
         orientation: EXIF's. lossy: whether they were compressed. levels: as for ``read_stack``.
     """
     full = int(np.iinfo(stack.dtype).max)
-    full = round(_LOSSY_FULL * full) if lossy else full
-    if levels is not None:
-        full = min(full, levels.saturation)
+    limit = round(_LOSSY_FULL * full) if lossy else full
     # By the largest of the three colors, written out: NumPy reduces a last axis of three slowly.
     top = np.maximum(np.maximum(stack[..., 0], stack[..., 1]), stack[..., 2])
-    clipped = np.asarray(top >= full)
-    lit = np.asarray(top.any(axis=0))
-    if levels is not None and levels.white != np.iinfo(stack.dtype).max:
-        stack = rescaled(stack, levels.white)
-    return Shots(stack, orientation, clipped, ~lit)
+    if levels is not None:
+        limit = min(limit, levels.saturation)
+        stack = stack if levels.white == full else rescaled(stack, levels.white)
+    return Shots(stack, orientation, np.asarray(top >= limit), ~top.any(axis=0))
 
 
 def _read_shot(path: Path, gains: tuple[float, float, float]) -> tuple[NDArray[Any], int]:
@@ -300,28 +296,19 @@ def find_single_shots(
             remedy="Leave out the option, or move the table away.",
         )
     if angles is not None and not angles.lower().endswith(".csv"):
-        shots = _all_alike(root, angles, each)
-        return _checked(root, shots), []
+        return _checked(root, _all_alike(root, angles, each)), []
     if angles is not None or table.exists():
         table = Path(angles) if angles is not None else table
-        return _checked(root, _by_table(root, table, read_table(table))), [table]
+        return _checked(root, _by_table(root, table)), [table]
     files = list_files(root, SHOT_SUFFIXES)
-    folders = {} if files else folders_of_angles(root)
-    if folders:
-        shots = [
-            SingleShot(path, stem, angle)
-            for folder, angle in folders.items()
-            for stem, path in index_files(folder, SHOT_SUFFIXES).items()
-        ]
+    shots = [
+        SingleShot(path, stem, angle)
+        for folder, angle in ({} if files else folders_of_angles(root)).items()
+        for stem, path in index_files(folder, SHOT_SUFFIXES).items()
+    ]
+    if shots:
         return _checked(root, shots), []
-    names = angles_of_names([stem_of(path) for path in files])
-    alone = all(name is not None and not name[0] for name in names)
-    named = {
-        path: None
-        if name is None or not (name[0] or alone)
-        else (name[0] or canonical(root.resolve().name), name[1])
-        for path, name in zip(files, names, strict=True)
-    }
+    named = dict(zip(files, views_of_names(root, files), strict=True))
     without = [path.name for path, shot in named.items() if shot is None]
     if without:
         raise PolarguideError(
@@ -332,6 +319,17 @@ def find_single_shots(
         )
     shots = [SingleShot(path, *shot) for path, shot in named.items() if shot is not None]
     return _checked(root, shots), []
+
+
+def views_of_names(folder: Path, files: Sequence[Path]) -> list[tuple[str, Angle] | None]:
+    """Return the view and the angle that the names of files in a folder state; None for a name without them.
+
+    Files named like angles alone are one view, called like the folder, if all of them are named so.
+    """
+    names = angles_of_names([stem_of(path) for path in files])
+    alone = all(name is not None and not name[0] for name in names)
+    own = canonical(folder.resolve().name) if alone else ""
+    return [(name[0] or own, name[1]) if name is not None and (name[0] or alone) else None for name in names]
 
 
 def _all_alike(root: Path, angles: str, each: int) -> list[SingleShot]:
@@ -361,20 +359,36 @@ def _all_alike(root: Path, angles: str, each: int) -> list[SingleShot]:
     ]
 
 
-def _by_table(root: Path, table: Path, lines: Sequence[Line]) -> list[SingleShot]:
-    """The photographs that a table lists: all that there are.
+def listed_pictures(root: Path, table: Path) -> tuple[list[tuple[Line, Path]], list[Path]]:
+    """Return the lines of a table with the picture of each, and the pictures of the folder without a line.
 
     Raises:
-        PolarguideError: one does not exist or is not listed.
+        PolarguideError: the table cannot be read, or names files outside of the folder or of other kinds.
     """
-    base = root.resolve()
+    lines = read_table(table)
+    rows = list(zip(lines, files_of(root, table, lines), strict=True))
+    for line, path in rows:
+        if not path.resolve().is_relative_to(root.resolve()) or path.suffix.lower() not in SHOT_SUFFIXES:
+            raise PolarguideError(
+                f"{table} (line {line.number})",
+                expected=f"a picture in {root} ({', '.join(SHOT_SUFFIXES)})",
+                found=line.file,
+                remedy="Copy or convert the file, or remove the line.",
+            )
+    taken = {path.resolve() for _, path in rows}
+    return rows, [path for path in list_files(root, SHOT_SUFFIXES) if path.resolve() not in taken]
+
+
+def _by_table(root: Path, table: Path) -> list[SingleShot]:
+    """Return the photographs that a table lists.
+
+    Raises:
+        PolarguideError: a photograph does not exist or is not listed.
+    """
+    rows, without = listed_pictures(root, table)
     shots: list[SingleShot] = []
     alone: dict[str, Path] = {}
-    for line, path in zip(lines, files_of(root, table, lines), strict=True):
-        if not path.resolve().is_relative_to(base):
-            raise PolarguideError(
-                table, expected=f"files in {root}", found=line.file, remedy="Copy the file there."
-            )
+    for line, path in rows:
         if not path.is_file():
             raise PolarguideError(
                 table,
@@ -382,26 +396,15 @@ def _by_table(root: Path, table: Path, lines: Sequence[Line]) -> list[SingleShot
                 found="nothing of this name",
                 remedy="Correct the name, or remove the line.",
             )
-        if path.suffix.lower() not in SHOT_SUFFIXES:
-            raise PolarguideError(
-                table,
-                expected=f"names of pictures ({', '.join(SHOT_SUFFIXES)})",
-                found=line.file,
-                remedy="Remove its line from the table, or convert the file to one of these formats.",
-            )
         stem = stem_of(path)
-        if line.view is None and stem in alone:
+        if line.view is None and alone.setdefault(stem, path) is not path:
             raise ambiguous(root, f"one photograph called {stem}", alone[stem], path)
-        if line.view is None:
-            alone[stem] = path
         shots.append(SingleShot(path, line.view or stem, line.angle, line.gain))
-    taken = {shot.path.resolve() for shot in shots}
-    without = [path.name for path in list_files(root, SHOT_SUFFIXES) if path.resolve() not in taken]
     if without:
         raise PolarguideError(
             table,
             expected="a line for every photograph in the folder",
-            found=f"none for {len(without)} ({listed(without)})",
+            found=f"none for {len(without)} ({listed([path.name for path in without])})",
             remedy="Add the lines (angle unknown if it was not noted), or move the photographs away.",
         )
     return shots
@@ -434,8 +437,9 @@ def _checked(root: Path, shots: list[SingleShot]) -> list[SingleShot]:
             raise ambiguous(root, f"one photograph of {shot.view} {at}", first[key], shot.path)
         first[key] = shot.path
 
-    def order(shot: SingleShot) -> tuple[str, bool, float, str]:
-        word = isinstance(shot.angle, str)
-        return shot.view, word, 0.0 if isinstance(shot.angle, str) else shot.angle, shot.path.name
+    return sorted(shots, key=lambda shot: (shot.view, *angle_order(shot.angle), shot.path.name))
 
-    return sorted(shots, key=order)
+
+def angle_order(angle: Angle) -> tuple[bool, float]:
+    """Return the sort key of an angle: numbers first, then words."""
+    return (True, 0.0) if isinstance(angle, str) else (False, angle)

@@ -78,7 +78,8 @@ def fit_angle(
             )
             columns = torch.stack((s0, s1 * cosine + s2 * sine, s2 * cosine - s1 * sine))
         moments = (columns * weights) @ columns.T
-        if not _solvable(moments):
+        spectrum = torch.linalg.eigvalsh(moments)
+        if not torch.isfinite(spectrum).all() or spectrum[0] <= 1e-9 * spectrum[-1].clamp(min=1e-30):
             return None
         solution = torch.linalg.solve(moments, (columns * weights) @ y)
         if mount == "filter":
@@ -106,11 +107,6 @@ def fit_angle(
     return FittedAngle(
         math.degrees(angle) % 180.0, gain, modulation, min(spread, 90.0), min(doubt, 1.0), misfit, crossed
     )
-
-
-def _solvable(moments: Tensor) -> bool:
-    values = torch.linalg.eigvalsh(moments)
-    return bool(torch.isfinite(values).all()) and float(values[0]) > 1e-9 * max(float(values[-1]), 1e-30)
 
 
 def _covariance(columns: Tensor, weights: Tensor, residuals: Tensor, shape: tuple[int, ...]) -> Tensor:

@@ -13,35 +13,37 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
+from polarguide.capture.angle_evidence import TO_DEVIATION, angle_difference, mean_angle, tolerance
 from polarguide.capture.exposures import Exposure
 from polarguide.capture.exposures import found as found_exposure
 from polarguide.capture.view import ANGLES
-from polarguide.training.angles.fit import fit_angle
+from polarguide.training.angles.fit import FittedAngle, fit_angle
 from polarguide.training.recipe import Recipe
 from polarguide.training.rules import AngleRules
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import ANGLE_COLUMNS
 
-TO_DEVIATION = 1.4826
-"""Standard deviation of normal errors over the median of their absolute values."""
 REMEDY = (
     "Note the angle of each shot; or take three or four shots of each view at known angles, from a tripod; or treat "
     "the pictures as ordinary photographs: prepare them with --angles none."
 )
-"""What to do where most angles are doubtful."""
+"""Advice for captures with mostly doubtful angles."""
+UNFITTED = (0.0, 1.0, 0.0, 90.0, 1.0, 0.0, 0.0)
+"""Values of ``FittedAngle`` for a picture without polarization to fit an angle to."""
 Predict = Callable[[View], Tensor]
 """Stokes vectors [3, H, W, 3] that the present state predicts for a view."""
 
 
-@dataclass(frozen=True)
-class Judgment:
+@dataclass(frozen=True, kw_only=True)
+class Judgment(FittedAngle):
     """The training's judgment of a picture's angle.
+
+    ``angle`` is the mean of the fits that tell one, or else of those that guess one. The other values of
+    ``FittedAngle`` are those of the last of these fits.
 
     Attributes:
         view, number: the view, and the place of the picture among its exposures.
         specified: what the capture says. believed: what the training goes by.
-        angle: the mean of the fits that tell one, or else of those that guess one, degrees.
-        gain, modulation, spread, doubt, misfit, misfit_across: those of the last of these, see ``FittedAngle``.
         scatter: scatter of the angles about their mean, degrees; 90 where less than half of the fits have one.
         usual: median of what the telling pictures of the same fit are ``off``: how well the model predicts any.
         unexplained: misfit of the last of all fits over the median of all pictures, times that over the misfit across:
@@ -54,13 +56,6 @@ class Judgment:
     number: int
     specified: Exposure
     believed: Exposure
-    angle: float
-    gain: float
-    modulation: float
-    spread: float
-    doubt: float
-    misfit: float = 0.0
-    misfit_across: float = 0.0
     scatter: float = 0.0
     unexplained: float = 0.0
     usual: float = 0.0
@@ -69,61 +64,59 @@ class Judgment:
 
     @property
     def unfiltered(self) -> bool:
-        """Whether it was taken without a filter, as it looks."""
+        """True if the picture looks as if taken without a filter."""
         return self.modulation + self.doubt < self.rules.weak
 
     @property
     def vague(self) -> bool:
-        """Whether the picture does not tell its angle."""
+        """True if the picture does not determine its angle."""
         return (self.spread > self.rules.vague or self.modulation < self.rules.weak) and not self.unfiltered
 
     @property
     def tells(self) -> bool:
-        """Whether the picture tells its angle."""
+        """True if the picture determines its angle."""
         return not self.vague and not self.unfiltered
 
     @property
     def guesses(self) -> bool:
-        """Whether its angle is worth believing where nothing else is known."""
+        """True if the angle is usable as a best guess."""
         return self.spread <= self.rules.lost and self.modulation >= self.rules.weak
 
     @property
     def unsettled(self) -> bool:
-        """Whether it tells an angle, and the fits do not agree on which."""
+        """True if the picture determines an angle on which the fits disagree."""
         return self.tells and self.scatter > self.rules.disagree
 
     @property
     def poorly_explained(self) -> bool:
-        """Whether it tells an angle, and may well be at another all the same."""
+        """True if the scene explains the picture poorly, so that its determined angle may be wrong."""
         return self.tells and self.unexplained > self.rules.poor
 
     @property
     def off(self) -> float:
         """Degrees from the specified to the fitted angle, in [-90, 90); 0 without a specified angle."""
-        return (
-            0.0 if self.specified.angle is None else (self.angle - self.specified.angle + 90.0) % 180.0 - 90.0
-        )
+        return 0.0 if self.specified.angle is None else angle_difference(self.angle, self.specified.angle)
 
     @property
     def limit(self) -> float:
         """Degrees that a picture has to be ``off`` to contradict its specified angle: more than others are,
         since where all are off, the model is wrong. From 90 on, nothing contradicts.
         """
-        return max(self.rules.contradicts, 3 * self.spread, 3 * TO_DEVIATION * self.usual)
+        return tolerance(self.rules.contradicts, self.spread, self.usual)
 
     @property
     def contradicts(self) -> bool:
-        """Whether the picture contradicts its specified angle, by more than its ``limit``."""
+        """True if the picture contradicts its specified angle by more than its ``limit``."""
         return not (self.unfiltered or self.overruled) and abs(self.off) > self.limit
 
     def resembles(self, other: Judgment) -> bool:
         """Whether it looks as if taken at the specified angle of another picture, as well as it tells."""
-        apart = (self.angle - (other.specified.angle or 0.0) + 90.0) % 180.0 - 90.0
-        return abs(apart) <= max(self.rules.contradicts, 3 * self.spread)
+        apart = angle_difference(self.angle, other.specified.angle or 0.0)
+        return abs(apart) <= tolerance(self.rules.contradicts, self.spread)
 
     @property
     def doubtful(self) -> bool:
-        """Whether the angle that the training goes by may well be wrong."""
+        """True if the angle that the training uses is probably wrong."""
         sought = not self.specified.known and (not self.tells or self.unsettled or self.poorly_explained)
         return sought or self.unfiltered or self.contradicts
 
@@ -175,18 +168,18 @@ class Polarizers:
         self.beliefs = self._beliefs()
 
     def due(self, step: int) -> bool:
-        """Whether angles are to be fitted before a step; False once all fits are made."""
+        """Return true if angles are fitted before a step."""
         return not self.settled and step in self._rounds[self.ended]
 
     @property
     def ended(self) -> int:
-        """Searches of which all fits have been made."""
+        """Number of finished searches."""
         count = 0 if self.table is None else len(self.table)
         return sum(count >= end for end in itertools.accumulate(map(len, self._rounds)))
 
     @property
     def settled(self) -> bool:
-        """Whether all fits have been made."""
+        """True if all fits are done."""
         return self.ended == len(self._rounds)
 
     @property
@@ -224,10 +217,7 @@ class Polarizers:
                 if not view.exposures[k].filtered:
                     continue
                 fitted = fit_angle(intensity, stokes, weight, rays, view.mount)
-                row = [0.0, 1.0, 0.0, 90.0, 1.0, 0.0, 0.0, 0.0]
-                if fitted is not None:
-                    row = [*dataclasses.astuple(fitted), 1.0]
-                rows.append(row)
+                rows.append([*UNFITTED, 0.0] if fitted is None else [*dataclasses.astuple(fitted), 1.0])
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, ANGLE_COLUMNS)
 
     def take(self, table: Tensor) -> set[str]:
@@ -241,11 +231,13 @@ class Polarizers:
         """Specified and assumed angles of each picture; empty before the first fit."""
         if self.table is None:
             return []
-        common = self._common_gain()
-        fits = [self._judged(fit) for fit in self._latest()]
+        common = self._common_gain(self.table[-1])
+        # The fits of the latest search that has any; those of earlier ones are worse.
+        ends = itertools.accumulate(map(len, self._rounds), initial=0)
+        latest = self.table[max(end for end in ends if end < len(self.table)) :]
+        fits = zip(*map(self._judged, latest), strict=True)
         judgments = []
-        for rows, poor in zip(zip(*fits, strict=True), self._unexplained(), strict=True):
-            specified = rows[0].specified
+        for rows, poor in zip(fits, _unexplained(self.table[-1]), strict=True):
             telling = [row for row in rows if row.tells] or [row for row in rows if row.guesses]
             judgment = replace((telling or rows)[-1], unexplained=poor)
             if telling:
@@ -257,7 +249,9 @@ class Polarizers:
             if wrong := [row for row in rows if row.contradicts]:
                 judgment = replace(wrong[-1], unexplained=poor)
             judgments.append(
-                judgment if specified.known else replace(judgment, believed=_belief(judgment, common))
+                judgment
+                if judgment.specified.known
+                else replace(judgment, believed=_belief(judgment, common))
             )
         return [replace(judgment, overruled=self._overruled(judgment, judgments)) for judgment in judgments]
 
@@ -281,8 +275,12 @@ class Polarizers:
     def _judged(self, fit: Tensor) -> list[Judgment]:
         """The judgment of each picture by one fit [P, 8]."""
         rows = [
-            replace(
-                Judgment(view.name, k, view.exposures[k], view.exposures[k], *row[: ANGLE_COLUMNS - 1]),
+            Judgment(
+                *row[:-1],
+                view=view.name,
+                number=k,
+                specified=view.exposures[k],
+                believed=view.exposures[k],
                 rules=self._rules,
             )
             for (view, k), row in zip(self._places, fit.tolist(), strict=True)
@@ -291,27 +289,9 @@ class Polarizers:
         usual = median(offs) if offs else 0.0
         return [replace(row, usual=usual) for row in rows]
 
-    def _latest(self) -> Tensor:
-        """The fits of the latest search that has any; those of earlier ones are worse."""
-        assert self.table is not None
-        ends = itertools.accumulate(map(len, self._rounds), initial=0)
-        return self.table[max(end for end in ends if end < len(self.table)) :]
-
-    def _unexplained(self) -> list[float]:
-        """Of each picture what ``Judgment.unexplained`` says; 0 where there was nothing to go by."""
-        assert self.table is not None
-        misfit, across, counted = self.table[-1, :, -3:].unbind(1)
-        measured = counted > 0
-        middle = misfit[measured].median() if bool(measured.any()) else misfit.new_ones(())
-        relative = misfit**2 / (middle * across).clamp(min=1e-12)
-        values: list[float] = torch.where(measured, relative, torch.zeros_like(relative)).tolist()
-        return values
-
-    def _common_gain(self) -> float | None:
+    def _common_gain(self, fit: Tensor) -> float | None:
         """The gain that others are relative to; None where gains differ as little as those of locked exposures."""
-        assert self.table is not None
-        last = zip(self._places, self.table[-1], strict=True)
-        rows = [row for (view, k), row in last if not view.exposures[k].known]
+        rows = [row for (view, k), row in zip(self._places, fit, strict=True) if not view.exposures[k].known]
         gains = [float(row[1]) for row in rows if row[-1]]
         if len(gains) < self._rules.fewest:
             return None
@@ -320,11 +300,10 @@ class Polarizers:
         return middle if spread > self._rules.locked else None
 
     def _beliefs(self) -> dict[str, tuple[Exposure, ...]]:
-        believed: dict[str, list[Exposure]] = {}
-        views = {view.name: view for view in self._views}
+        judged = [] if self.table is None else self._places
+        believed = {view.name: list(view.exposures) for view, _ in judged}
         for judgment in self.judgments():
-            exposures = believed.setdefault(judgment.view, list(views[judgment.view].exposures))
-            exposures[judgment.number] = judgment.believed
+            believed[judgment.view][judgment.number] = judgment.believed
         return {name: tuple(exposures) for name, exposures in believed.items()}
 
 
@@ -338,6 +317,14 @@ def search_steps(recipe: Recipe, settings: ResolvedSettings) -> int:
     return min(recipe.angle_rules.search_steps, settings.steps) if settings.begin_again else 0
 
 
+def _unexplained(fit: Tensor) -> list[float]:
+    """Return ``Judgment.unexplained`` of each picture by a fit [P, 8]; 0 for unfitted pictures."""
+    misfit, across, counted = fit[:, -3:].unbind(1)
+    middle = misfit[counted > 0].median() if bool(counted.any()) else misfit.new_ones(())
+    values: list[float] = (misfit**2 / (middle * across).clamp(min=1e-12)).tolist()
+    return values
+
+
 def _belief(judgment: Judgment, common: float | None) -> Exposure:
     """The exposure assumed for a picture without a specified angle: a photograph where no angle was fitted."""
     specified = judgment.specified
@@ -347,19 +334,3 @@ def _belief(judgment: Judgment, common: float | None) -> Exposure:
         return specified
     gain = specified.gain if common is None else specified.gain * judgment.gain / common
     return found_exposure(specified, judgment.angle, gain)
-
-
-def mean_angle(angles: Sequence[float], spreads: Sequence[float], least_spread: float) -> tuple[float, float]:
-    """Mean of angles in degrees that count modulo 180, each by one over its spread in degrees, but not
-    more than by one over ``least_spread``, and their scatter.
-
-    The scatter is half the circular standard deviation of the doubled angles, sqrt(-2 log R) with R the length of their
-    mean (Mardia and Jupp, Directional Statistics, 2.3), in degrees.
-    """
-    weights = [1 / max(spread, least_spread) for spread in spreads]
-    doubled = [math.radians(2 * angle) for angle in angles]
-    sine = sum(weight * math.sin(angle) for weight, angle in zip(weights, doubled, strict=True))
-    cosine = sum(weight * math.cos(angle) for weight, angle in zip(weights, doubled, strict=True))
-    length = min(max(math.hypot(sine, cosine) / sum(weights), 1e-6), 1.0)
-    mean = math.degrees(math.atan2(sine, cosine) / 2) % 180.0
-    return mean, min(math.degrees(math.sqrt(-2 * math.log(length))) / 2, 90.0)

@@ -1,0 +1,322 @@
+"""Evidence on polarizer angles, and the judgment whether stated angles are right.
+
+Evidence has two forms.
+
+- **One picture.** A source estimates the angle of one picture with a standard error: from the other pictures of its
+  view (``capture.picture_sets``), or from the Stokes vectors of a trained scene (``training.angles``). ``tolerance``
+  decides whether an estimate contradicts a stated angle. ``common_rotation`` finds a sense and a zero for all of them.
+- **All pictures alike.** A source gives log-likelihoods of all senses and zeros: points seen in several views, or
+  normals of a trained scene (``inspection.evidence``). ``posterior`` and ``combine`` give probabilities of the orders.
+
+Pair sums decide which pictures are perpendicular to each other (three pairings). Within a pairing eight orders remain,
+the symmetries of a square: a picture named L degrees was taken at ``sense * L + zero``, with a sense of +1 or -1 and a
+zero of 0, 45, 90 or 135 degrees. The measured AoLP transforms in the same way.
+
+A log-likelihood summed over pixels would give probabilities like 1 - 1e-300, because neighboring pixels, and one
+surface in several views, share their errors. Evidence is therefore summed within spatial clusters first and tempered by
+the disagreement of the clusters: a well-calibrated log-likelihood ratio L between two hypotheses has a variance of
+twice its mean (exact for a shift of a Gaussian). With the variance V of the clusters, L is replaced by ``t L`` with
+``t = min(1, 2 L / V)``; in terms of the score ``z = L / sqrt(V)`` that is ``2 z^2``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from polarguide.geometry.polarizer import ANGLES
+
+TO_DEVIATION = 1.4826
+"""Standard deviation of normal errors over the median of their absolute values."""
+
+
+class AngleLimits:
+    """Constants of the models.
+
+    Attributes:
+        alike: smallest length of the mean of (cos 2d, sin 2d), with d the differences of angles, that gives a common
+            offset.
+        same_direction: length of the mean of doubled (or fourfold) stated angles above which they do not determine a
+            sense.
+        outlier: degrees from the mean difference beyond which a picture does not contribute to the common offset.
+        failure: prior probability that the model of a source of evidence does not hold (polarized light, ...).
+        cells: cells along the longest side of the box that contains the middle 90 % of the points.
+        least_error: smallest standard error of a zero in degrees; profiles have steps of one degree.
+        window: degrees around the zero of an order in which its maximum is searched.
+        groups: groups of clusters for jackknife errors.
+    """
+
+    alike = 0.4
+    same_direction = 0.95
+    outlier = 30.0
+    failure = 0.01
+    cells = 12
+    least_error = 0.05
+    window = 22
+    groups = 8
+
+
+def angle_difference(angle: Any, other: Any) -> Any:
+    """Return the difference of two polarizer angles in degrees modulo 180, in [-90, 90)."""
+    return (angle - other + 90.0) % 180.0 - 90.0
+
+
+def tolerance(floor: float, error: float, usual: float = 0.0, *, sigmas: float = 3.0) -> float:
+    """Return the largest difference in degrees that does not contradict a stated angle.
+
+    Args:
+        floor: smallest difference that matters, degrees.
+        error: standard error of the estimate, degrees.
+        usual: median of the absolute differences of all pictures. Where all differ, the model is wrong.
+        sigmas: number of standard deviations that count as chance.
+    """
+    return max(floor, sigmas * error, sigmas * TO_DEVIATION * usual)
+
+
+def jackknife_error(estimate: Any, without: Any) -> Any:
+    """Return the standard error of an estimate [...] from the estimates without each of G groups, [G, ...]."""
+    count = len(without)
+    return np.sqrt(((np.asarray(without) - estimate) ** 2).sum(axis=0) * (count - 1) / count)
+
+
+def mean_angle(angles: Sequence[float], spreads: Sequence[float], least_spread: float) -> tuple[float, float]:
+    """Return the weighted mean of angles and their scatter, in degrees modulo 180.
+
+    The scatter is half the circular standard deviation of the doubled angles, sqrt(-2 log R) with R the length of their
+    mean (Mardia and Jupp, Directional Statistics, 2.3).
+
+    Args:
+        angles: angles in degrees.
+        spreads: standard deviations in degrees; the weight of an angle is the inverse of its spread.
+        least_spread: smallest spread that is used for a weight.
+    """
+    weights = [1 / max(spread, least_spread) for spread in spreads]
+    doubled = [math.radians(2 * angle) for angle in angles]
+    sine = sum(weight * math.sin(angle) for weight, angle in zip(weights, doubled, strict=True))
+    cosine = sum(weight * math.cos(angle) for weight, angle in zip(weights, doubled, strict=True))
+    length = min(max(math.hypot(sine, cosine) / sum(weights), 1e-6), 1.0)
+    mean = math.degrees(math.atan2(sine, cosine) / 2) % 180.0
+    return mean, min(math.degrees(math.sqrt(-2 * math.log(length))) / 2, 90.0)
+
+
+class CommonRotation(NamedTuple):
+    """Sense and zero that turn stated angles into estimated ones: ``sense * stated + offset``.
+
+    Attributes:
+        sense: 1, -1 for the opposite sense, or None if neither agrees.
+        offset: offset of the zero in degrees.
+        error: standard error of the offset in degrees.
+    """
+
+    sense: int | None = None
+    offset: float = 0.0
+    error: float = math.inf
+
+
+def common_rotation(estimated: Sequence[float], stated: Sequence[float]) -> CommonRotation:
+    """Return the rotation that explains most of the estimated angles by the stated ones, all in degrees."""
+    found = np.radians(estimated)
+    given = np.radians(stated)
+    turns = {sense: np.exp(2j * (found - sense * given)) for sense in (1, -1)}
+    alike = abs(np.exp(2j * given).mean()) > AngleLimits.same_direction
+    sense = 1 if alike or abs(turns[1].mean()) >= abs(turns[-1].mean()) else -1
+    turn = turns[sense]
+    if abs(turn.mean()) < AngleLimits.alike:
+        return CommonRotation()
+    # The mean, then once more without the outliers.
+    near = turn[np.abs(np.angle(turn / turn.mean())) < math.radians(2 * AngleLimits.outlier)]
+    apart = np.degrees(np.angle(near / near.mean())) / 2
+    error = float(TO_DEVIATION * np.median(np.abs(apart)) / math.sqrt(len(near)) * 1.25)
+    return CommonRotation(sense, float(np.degrees(np.angle(near.mean())) / 2), error)
+
+
+FileOrder = tuple[int, int, int, int]
+"""True angles of the pictures named 0, 45, 90 and 135 degrees."""
+PAIRINGS: tuple[FileOrder, ...] = ((0, 45, 90, 135), (0, 90, 45, 135), (0, 45, 135, 90))
+"""One order for each way to pair the pictures, in the order of ``capture.checks.Measures.residuals``."""
+SENSES = (1, -1)
+"""Rows of an evidence profile."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """One of the eight orders within a pairing.
+
+    Attributes:
+        sense: +1 if the angles increase counter-clockwise as displayed, -1 if clockwise.
+        zero: direction of their zero, degrees counter-clockwise from the image's horizontal.
+    """
+
+    sense: int
+    zero: int
+
+    def files(self, pairing: FileOrder = ANGLES) -> FileOrder:
+        """Return the true angles of the pictures named 0, 45, 90 and 135."""
+        first, second, third, fourth = ((self.sense * angle + self.zero) % 180 for angle in pairing)
+        return first, second, third, fourth
+
+    @property
+    def label(self) -> str:
+        """Sense and zero as text."""
+        return f"{'counter-clockwise' if self.sense > 0 else 'clockwise'}, zero at {self.zero}°"
+
+
+ORDERS: tuple[Order, ...] = tuple(Order(sense, zero) for sense in SENSES for zero in ANGLES)
+"""All eight orders; the first is the identity."""
+IDENTITY = ORDERS[0]
+"""Order of correctly named pictures."""
+
+
+def swaps(files: FileOrder) -> str:
+    """Describe wrong file names: "the picture named 45° was taken at 135°, ..."."""
+    moved = [(name, true) for name, true in zip(ANGLES, files, strict=True) if name != true]
+    return ", ".join(f"the picture named {name}° was taken at {true}°" for name, true in moved) or "nothing"
+
+
+DEGREES = 180
+"""Number of zeros in a profile, one per degree."""
+
+
+@dataclass(frozen=True, eq=False)
+class OrderEvidence:
+    """Log-likelihoods of one source of evidence.
+
+    Attributes:
+        source: name of the source in messages.
+        clusters: [C, 2, 180] for the clusters, the senses +1 and -1, and zeros at 0, 1, ..., 179 degrees.
+        observations: number of pixels or observations.
+        usable: true if the quality suffices.
+        note: a sentence about the quality.
+    """
+
+    source: str
+    clusters: Tensor
+    observations: int
+    usable: bool
+    note: str
+
+
+@dataclass(frozen=True)
+class OrderPosterior:
+    """Posterior probabilities of the orders, and an estimate of the zero.
+
+    Attributes:
+        log_odds: tempered log-likelihood ratio of the best order to each of ``ORDERS``; 0 for the best.
+        probabilities: probabilities of ``ORDERS``, which add up to 1.
+        offset: zero relative to that of the best order, degrees in [-22, 22].
+        offset_error: standard error of the offset, degrees.
+    """
+
+    log_odds: tuple[float, ...]
+    probabilities: tuple[float, ...]
+    offset: float
+    offset_error: float
+
+    @property
+    def best(self) -> int:
+        """Index of the most probable order."""
+        return self.probabilities.index(max(self.probabilities))
+
+    @property
+    def sense_probability(self) -> float:
+        """Probability that the angles count counter-clockwise."""
+        return sum(p for p, order in zip(self.probabilities, ORDERS, strict=True) if order.sense > 0)
+
+
+def posterior(evidence: OrderEvidence) -> OrderPosterior:
+    """Return the posterior probabilities of the eight orders from one source of evidence.
+
+    Each order is evaluated at the best zero within 22 degrees of its own.
+    """
+    clusters = evidence.clusters.double()
+    rows = [SENSES.index(order.sense) for order in ORDERS]
+    total = clusters.sum(dim=0)
+    peaks = [_peak(total[row], order.zero) for row, order in zip(rows, ORDERS, strict=True)]
+    at_best = clusters[:, rows, peaks]
+    best = int(at_best.sum(dim=0).argmax())
+    log_odds = tuple(tempered(at_best[:, best] - at_best[:, k]) for k in range(len(ORDERS)))
+    weights = [math.exp(-value) for value in log_odds]
+    probabilities = tuple(
+        (1 - AngleLimits.failure) * w / sum(weights) + AngleLimits.failure / len(ORDERS) for w in weights
+    )
+    return OrderPosterior(log_odds, probabilities, *_offset(clusters[:, rows[best]], ORDERS[best].zero))
+
+
+def combine(parts: Sequence[OrderPosterior]) -> OrderPosterior:
+    """Combine independent sources: probabilities are multiplied, offsets averaged with weights 1 / error^2.
+
+    Only sources whose best order is the combined best one contribute to the offset.
+    """
+    log_odds = np.sum([part.log_odds for part in parts], axis=0)
+    product = np.prod([part.probabilities for part in parts], axis=0)
+    best = int(product.argmax())
+    agreeing = [part for part in parts if part.best == best] or parts
+    weights = [1 / max(part.offset_error, AngleLimits.least_error) ** 2 for part in agreeing]
+    offset = sum(w * part.offset for w, part in zip(weights, agreeing, strict=True)) / sum(weights)
+    return OrderPosterior(
+        tuple((log_odds - log_odds.min()).tolist()),
+        tuple((product / product.sum()).tolist()),
+        offset,
+        math.sqrt(1 / sum(weights)),
+    )
+
+
+def tempered(ratios: Tensor) -> float:
+    """Return the tempered sum of the clusters' log-likelihood ratios [C]; 0 if it is negative."""
+    total = float(ratios.sum())
+    count = ratios.numel()
+    if total <= 0 or count < 2:
+        return 0.0
+    variance = float(ratios.var()) * count
+    return total * min(1.0, 2 * total / variance) if variance > 0 else total
+
+
+def _peak(profile: Tensor, zero: int) -> int:
+    """Return the position of the maximum of a profile [180] within 22 degrees of ``zero``."""
+    window = (torch.arange(-AngleLimits.window, AngleLimits.window + 1) + zero) % DEGREES
+    return int(window[int(profile[window].argmax())])
+
+
+def _offset(clusters: Tensor, zero: int) -> tuple[float, float]:
+    """Return the best zero minus ``zero`` in degrees, and its standard error from neighboring groups of clusters."""
+    total = clusters.sum(dim=0)
+    estimate = _refined(total, zero)
+    groups = min(AngleLimits.groups, len(clusters))
+    if groups < 2:
+        return estimate, math.inf
+    without = [_refined(total - part.sum(dim=0), zero) for part in clusters.tensor_split(groups)]
+    return estimate, max(float(jackknife_error(estimate, without)), AngleLimits.least_error)
+
+
+def _refined(profile: Tensor, zero: int) -> float:
+    """Return the maximum of a profile relative to ``zero``, refined by a parabola through three degrees."""
+    degree = _peak(profile, zero)
+    before, center, after = profile[[degree - 1, degree, (degree + 1) % DEGREES]].tolist()
+    bend = before - 2 * center + after
+    fraction = 0.5 * (before - after) / bend if bend < 0 else 0.0
+    return float(angle_difference(degree, zero)) + max(-0.5, min(0.5, fraction))
+
+
+def spatial_cells(points: Tensor) -> Tensor:
+    """Return the cell index of each point [N, 3] in a regular grid, [N] int64, from 0 up without gaps."""
+    step = max(1, len(points) // 100_000)
+    low, high = (torch.quantile(points[::step].double(), q, dim=0) for q in (0.05, 0.95))
+    side = float((high - low).max()) / AngleLimits.cells
+    if side <= 0:
+        return torch.zeros(len(points), dtype=torch.int64)
+    # Points far outside share one layer of cells: they are few.
+    numbers = ((points.double() - low) / side).floor().clamp(-1, AngleLimits.cells + 1).long() + 1
+    key = (numbers[:, 0] * (AngleLimits.cells + 3) + numbers[:, 1]) * (AngleLimits.cells + 3) + numbers[:, 2]
+    return torch.unique(key, return_inverse=True)[1]
+
+
+def sum_by_cluster(values: Tensor, numbers: Tensor) -> Tensor:
+    """Return the sums [C, ...] of values [N, ...] over the clusters with indices ``numbers`` [N]."""
+    count = int(numbers.max()) + 1 if len(numbers) else 1
+    return values.new_zeros(count, *values.shape[1:]).index_add_(0, numbers, values)
