@@ -16,7 +16,7 @@ import polarguide
 from polarguide.cli.console import ConsoleReporter, console, print_error, say, use_threads
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, read_file, write_whole
-from polarguide.core.options import SceneOptions, ThreadOptions, check_finite
+from polarguide.core.options import Memory, SceneOptions, ThreadOptions, check_finite
 from polarguide.core.records import option_name
 from polarguide.core.system import StopSignals
 from polarguide.preparation.settings import CalibrationOptions
@@ -124,7 +124,7 @@ def priors(
     views: str = "test",
     threshold: float | None = None,
     downscale: int = 1,
-    memory: float | None = None,
+    memory: Memory | None = None,
     shots: Annotated[ShotOptions, tyro.conf.arg(name="")],
     angles: Annotated[CalibrationOptions, tyro.conf.arg(name="")],
     machine: Annotated[ThreadOptions, tyro.conf.arg(name="")],

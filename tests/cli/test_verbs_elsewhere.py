@@ -15,7 +15,7 @@ from polarguide.api.runs import Run, open_run
 from polarguide.capture import load_scene
 from polarguide.capture.presentation import Crop
 from polarguide.cli.app import run
-from polarguide.cli.runs import render
+from polarguide.cli.runs import render_run
 from polarguide.core.options import ComputeOptions
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.inspection.evidence import short_run, surface_of
@@ -71,7 +71,7 @@ def test_pictures_by_other_light_and_along_a_path(elsewhere: Path, tmp_path: Pat
     layers = "final,reflection,specular,normal,depth,strength"
 
     def shown(device: str, out: Path) -> np.ndarray:
-        render(
+        render_run(
             elsewhere,
             layers=layers,
             environment=light,
@@ -83,7 +83,9 @@ def test_pictures_by_other_light_and_along_a_path(elsewhere: Path, tmp_path: Pat
 
     with OtherDevice():
         there = shown("auto", tmp_path / "there")
-        render(elsewhere, layers="final,depth", rotate_environment=30, path="orbit", frames=2, out=tmp_path)
+        render_run(
+            elsewhere, layers="final,depth", rotate_environment=30, path="orbit", frames=2, out=tmp_path
+        )
     assert len(list(tmp_path.glob("path_*.png"))) == 2
     # Depth's colors jump where nothing is seen, so a few pixels may differ by much.
     assert float((np.abs(there - shown("cpu", tmp_path / "here")) > 2).mean()) < 0.01

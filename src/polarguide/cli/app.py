@@ -2,52 +2,154 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import dataclasses
 import difflib
-import functools
 import importlib.util
 import io
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, NamedTuple, get_args, get_type_hints
 
 import tyro
 
 import polarguide
 from polarguide.cli.console import print_error, warnings_printed
 from polarguide.core.errors import PolarguideError, import_part
-from polarguide.core.options import gibibytes
 from polarguide.core.system import check_variables, interrupts
 
+
+class Verb(NamedTuple):
+    """A verb of the command line: where its function is, and the first paragraph of the function's docstring.
+
+    The list of all verbs shows the summaries without loading a module.
+    """
+
+    module: str
+    function: str
+    summary: str
+
+
 VERBS = {
-    "demo": ("polarguide.cli.runs", "demo"),
-    "calibrate": ("polarguide_shots.verbs", "calibrate"),
-    "scale": ("polarguide_shots.verbs", "scale"),
-    "prepare": ("polarguide.cli.captures", "prepare"),
-    "inspect": ("polarguide.cli.captures", "inspect"),
-    "train": ("polarguide.cli.runs", "train"),
-    "eval": ("polarguide.cli.runs", "evaluate"),
-    "render": ("polarguide.cli.runs", "render"),
-    "view": ("polarguide.cli.runs", "view"),
-    "present": ("polarguide.cli.captures", "present"),
-    "share": ("polarguide.cli.runs", "share"),
-    "export": ("polarguide.cli.runs", "export"),
-    "priors": ("polarguide_shots.verbs", "priors"),
-    "measure": ("polarguide_shots.verbs", "measure"),
-    "compare": ("polarguide_bench.verbs.compare", "compare"),
-    "ablate": ("polarguide_bench.verbs.compare", "ablate"),
-    "batch": ("polarguide_bench.verbs.batch", "batch"),
-    "synth": ("polarguide_synth.verbs", "synth"),
-    "bench": ("polarguide_bench.verbs.compare", "bench"),
-    "tables": ("polarguide_bench.verbs.compare", "tables"),
-    "doctor": ("polarguide.cli.doctor", "doctor"),
+    "demo": Verb(
+        "polarguide.cli.runs",
+        "demo",
+        "Train, evaluate and render the small scene that ships with the program.",
+    ),
+    "calibrate": Verb(
+        "polarguide_shots.verbs",
+        "calibrate",
+        "Calibrate a polarization camera: what each of its polarizers really measures, from shots of "
+        "one before the lens.",
+    ),
+    "scale": Verb(
+        "polarguide_shots.verbs",
+        "scale",
+        "Print a scale of angles for the ring of a polarizing filter: an SVG file in exact millimeters.",
+    ),
+    "prepare": Verb(
+        "polarguide.cli.captures",
+        "prepare_capture",
+        "Convert camera files to a scene folder: raw mosaics, shots through a rotating filter, "
+        "published datasets.",
+    ),
+    "inspect": Verb(
+        "polarguide.cli.captures",
+        "inspect_capture",
+        "Check a capture and its polarizer angles, and write a page and a JSON file.",
+    ),
+    "train": Verb(
+        "polarguide.cli.runs",
+        "train_scene",
+        "Train a recipe on a scene.",
+    ),
+    "eval": Verb(
+        "polarguide.cli.runs",
+        "evaluate_run",
+        "Score a run on its test views and write RUN/metrics.json, and RUN/errors.png, where the errors are.",
+    ),
+    "render": Verb(
+        "polarguide.cli.runs",
+        "render_run",
+        "Render a run's layers to PNG, with a contact sheet beside the ground truth; or along a "
+        "path, as a video.",
+    ),
+    "view": Verb(
+        "polarguide.cli.runs",
+        "view_in_browser",
+        "Look at a run in a browser: its layers from any side, beside the photographs. Ctrl-C ends it.",
+    ),
+    "present": Verb(
+        "polarguide.cli.captures",
+        "present_folder",
+        "Set how a scene or a run is shown and exported: color, up, scale, crop box, credit. Data "
+        "and scores stay.",
+    ),
+    "share": Verb(
+        "polarguide.cli.runs",
+        "share_run",
+        "Write a run as one web page that renders it with its reflections, and needs nothing beside itself.",
+    ),
+    "export": Verb(
+        "polarguide.cli.runs",
+        "export_run",
+        "Write a run as the files of other programs.",
+    ),
+    "priors": Verb(
+        "polarguide_shots.verbs",
+        "priors",
+        "Polarization maps of a shot, many shots or a scene: pictures, numbers and a page.",
+    ),
+    "measure": Verb(
+        "polarguide_shots.verbs",
+        "measure",
+        "A table of many shots for inspection lines: S0, DoLP and AoLP by region, limits, a golden part.",
+    ),
+    "compare": Verb(
+        "polarguide_bench.verbs.compare",
+        "compare",
+        "Train and score several recipes on several scenes, and set tables and a report of them.",
+    ),
+    "ablate": Verb(
+        "polarguide_bench.verbs.compare",
+        "ablate",
+        "Compare a recipe with its ablations: the same with one thing changed, each.",
+    ),
+    "batch": Verb(
+        "polarguide_bench.verbs.batch",
+        "batch",
+        "Prepare, inspect, train, score, share and export every capture of a collection, with one "
+        "page over all.",
+    ),
+    "synth": Verb(
+        "polarguide_synth.verbs",
+        "synth",
+        "Render a polarized scene with ground truth: a preset (figure, kit, car, cup, water, proof, "
+        "...) or a scene file.",
+    ),
+    "bench": Verb(
+        "polarguide_bench.verbs.compare",
+        "bench",
+        "Render the scenes of the benchmark that are missing, then train and score every recipe on "
+        "each scene.",
+    ),
+    "tables": Verb(
+        "polarguide_bench.verbs.compare",
+        "tables",
+        "Join the records of comparisons that were run apart, and set their tables anew.",
+    ),
+    "doctor": Verb(
+        "polarguide.cli.doctor",
+        "doctor",
+        "Print what is installed, what computes here, and what is missing, with the command that "
+        "installs it.",
+    ),
 }
-"""The module and the function of each verb. No module imports torch before a verb is called."""
+"""No module imports torch before a verb is called."""
 DESCRIPTION = (
     "Photographs through a linear polarizer to a 3D Gaussian splatting scene with separated reflections, surface "
     "normals and diffuse color."
@@ -55,34 +157,20 @@ DESCRIPTION = (
 
 
 def function_of(verb: str) -> Callable[..., Any]:
-    """The function behind a verb; its signature and docstring are the verb's options and help."""
-    module, name = VERBS[verb]
-    function: Callable[..., Any] = getattr(import_part(module, verb), name)
+    """Return the function of a verb; its signature and docstring are the verb's options and help."""
+    function: Callable[..., Any] = getattr(import_part(VERBS[verb].module, verb), VERBS[verb].function)
     # Options that several verbs share are the fields of dataclasses, and are called as these are.
     return tyro.conf.configure(tyro.conf.OmitArgPrefixes)(function)
 
 
 def summary_of(verb: str) -> Callable[[], None]:
-    """A function without options that has the first paragraph of a verb's docstring.
-
-    The list of all verbs shows nothing else: their modules are read, and not loaded.
-    """
-    module, name = VERBS[verb]
+    """Return a function without options whose docstring is the summary of a verb."""
 
     def listed() -> None: ...
 
-    listed.__doc__ = _summaries(module).get(name, "(not installed)")
+    installed = importlib.util.find_spec(VERBS[verb].module.partition(".")[0])
+    listed.__doc__ = VERBS[verb].summary if installed else "(not installed)"
     return listed
-
-
-@functools.cache
-def _summaries(module: str) -> dict[str, str]:
-    """First paragraphs of docstrings by function, of a module of verbs."""
-    package, _, _ = module.partition(".")
-    spec = importlib.util.find_spec(module) if importlib.util.find_spec(package) else None
-    source = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
-    functions = [node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)]
-    return {node.name: (ast.get_docstring(node) or "").partition("\n\n")[0] for node in functions}
 
 
 def options_of(function: Callable[..., Any]) -> dict[str, Any]:
@@ -190,8 +278,7 @@ def _call(verb: str | None, arguments: Sequence[str]) -> int:
         _require_place()
         check_variables()
         _refuse_paths(verb, arguments[1:])
-        line = _sizes_as_numbers(arguments[1:])
-        parsed = tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=line)
+        parsed = tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=arguments[1:])
         return parsed if isinstance(parsed, int) else 0
     if arguments and not arguments[0].startswith("-"):
         raise PolarguideError(
@@ -230,40 +317,20 @@ def _refuse_paths(verb: str, line: Sequence[str]) -> None:
     paths = {
         _flag(name) for name, kind in options_of(function_of(verb)).items() if Path in (kind, *get_args(kind))
     }
-    for place, value in _named_values(line):
-        if (not value or "\0" in value) and (place in paths or not place.startswith("--")):
+    for before, word in pairwise(["", *line]):
+        option, assigned, value = word.partition("=")
+        if not word.startswith("--"):
+            option = before if before.startswith("--") else ""
+            value = word
+        elif not assigned:
+            continue
+        if (not value or "\0" in value) and (option in paths or not option):
             raise PolarguideError(
-                place or "the command line",
+                option or "the command line",
                 expected="the name of a file or folder",
                 found="a null byte" if value else "an empty one",
                 remedy="Name it; . is the current folder.",
             )
-
-
-def _sizes_as_numbers(line: Sequence[str]) -> list[str]:
-    """The words with what --memory is given as a number of GiB: 4GB as 3.7252902984619140."""
-    converted = list(line)
-    for place, word in enumerate(line):
-        option, equals, value = word.partition("=")
-        if option == "--memory" and equals:
-            size = gibibytes(value)
-            converted[place] = word if size is None else f"--memory={size!r}"
-        elif place and line[place - 1] == "--memory":
-            size = gibibytes(word)
-            converted[place] = word if size is None else repr(size)
-    return converted
-
-
-def _named_values(line: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """The option that each word is a value of, or an empty text, and the value."""
-    before = ""
-    for word in line:
-        name, equals, value = word.partition("=")
-        if equals and name.startswith("--"):
-            yield name, value
-        elif not word.startswith("--"):
-            yield before if before.startswith("--") else "", word
-        before = word
 
 
 def _flag(name: str) -> str:

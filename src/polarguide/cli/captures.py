@@ -17,7 +17,7 @@ from polarguide.inspection.settings import InspectSettings
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 
 
-def prepare(
+def prepare_capture(
     source: Annotated[Path, tyro.conf.Positional],
     /,
     *,
@@ -54,7 +54,7 @@ def prepare(
 COLORS = {"ok": "green", "warning": "yellow", "wrong": "bold red", "n/a": "dim", "not verified": "magenta"}
 
 
-def inspect(
+def inspect_capture(
     scene: Annotated[Path, tyro.conf.Positional],
     /,
     *,
@@ -150,7 +150,7 @@ def _print_angles(angles: Any) -> None:
         say(f"  {evidence.source}{used}: {evidence.note}")
 
 
-def present(
+def present_folder(
     folder: Annotated[Path, tyro.conf.Positional],
     /,
     *,

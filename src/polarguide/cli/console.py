@@ -118,7 +118,7 @@ class Rate:
         return (now - begin) / steps * max(0, self.total - done)
 
 
-def clock(seconds: float | None) -> str:
+def duration_text(seconds: float | None) -> str:
     """Hours, minutes and seconds."""
     if seconds is None:
         return UNKNOWN_TIME
@@ -150,37 +150,40 @@ class Lines:
 
     def __init__(self, label: str, total: int | None, clock: Callable[[], float] = time.monotonic) -> None:
         self._label = label
-        self.clock = clock
         self._rate = Rate(total, clock)
         self._last = clock()
         self._line = ""
+        self._noted = False
 
     def __call__(
         self, done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
     ) -> None:
         """See ``core.progress.Advance``."""
-        now = self.clock()
+        now = self._rate.clock()
         left = self._rate.left(done, total, seconds)
-        time_left = f", {clock(left)} left" if left else ""
+        time_left = f", {duration_text(left)} left" if left else ""
         of = "" if self._rate.total is None else f"/{self._rate.total}"
         self._line = f"{self._label} {done}{of}{time_left}" + (f"  {note}" if note else "")
+        self._noted = bool(note)
         if now - self._last >= LINE_SECONDS:
             self._last = now
-            self._print()
-
-    def close(self, *, last: bool) -> None:
-        """Print the last state if it stays on a terminal, too."""
-        if last:
-            self._print()
-
-    def _print(self) -> None:
-        if self._line:
             say(self._line)
             self._line = ""
 
+    def close(self) -> None:
+        """Print the last state of work that had a note: its bar would stay on a terminal."""
+        if self._noted and self._line:
+            say(self._line)
+
 
 class ConsoleReporter(Reporter):
-    """Prints what an operation reports. Bars disappear at the end, except those with a note."""
+    """Prints messages, and one display with a bar for each piece of work that is in progress.
+
+    The last bar stays on the terminal if it has a note.
+    """
+
+    def __init__(self) -> None:
+        self._display = bars()
 
     def say(self, text: str) -> None:
         """Print a finding; brackets in it are shown as they are."""
@@ -192,41 +195,33 @@ class ConsoleReporter(Reporter):
 
     @contextlib.contextmanager
     def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
-        """A progress bar, or lines where there is no terminal."""
+        """A progress bar below those that are open already, or lines where there is no terminal."""
         label = printable(label)
         if not console.is_terminal:
-            with lines(label, total) as tell:
-                yield tell
+            lines = Lines(label, total)
+            try:
+                yield lines
+            finally:
+                lines.close()
             return
-        with bars() as progress:
-            task = progress.add_task(label, total=total, note="", left=UNKNOWN_TIME)
-            rate = Rate(total)
+        display = self._display
+        display.start()
+        task = display.add_task(label, total=total, note="", left=UNKNOWN_TIME)
+        rate = Rate(total)
 
-            def advance(
-                done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
-            ) -> None:
-                progress.live.transient = not note
-                left = clock(rate.left(done, total, seconds))
-                progress.update(task, completed=done, total=total, note=note, left=left)
+        def advance(
+            done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
+        ) -> None:
+            left = duration_text(rate.left(done, total, seconds))
+            display.live.transient = not note
+            display.update(task, completed=done, total=total, note=note, left=left)
 
+        try:
             yield advance
-
-
-@contextlib.contextmanager
-def lines(label: str, total: int | None) -> Iterator[Advance]:
-    """Progress as lines; the last one is printed where the work had a note."""
-    printer = Lines(label, total)
-    noted = False
-
-    def advance(done: int, *, total: int | None = None, note: str = "", seconds: float | None = None) -> None:
-        nonlocal noted
-        noted = bool(note)
-        printer(done, total=total, note=note, seconds=seconds)
-
-    try:
-        yield advance
-    finally:
-        printer.close(last=noted)
+        finally:
+            if len(display.tasks) == 1:
+                display.stop()
+            display.remove_task(task)
 
 
 if TYPE_CHECKING:
@@ -235,7 +230,7 @@ if TYPE_CHECKING:
 RunFolder = Annotated[Path, tyro.conf.Positional]
 
 
-def opened(run: Path, compute: ThreadOptions) -> tuple[Run, ConsoleReporter]:
+def open_run_folder(run: Path, compute: ThreadOptions) -> tuple[Run, ConsoleReporter]:
     """The opened run, on the device of the options (the CPU without such an option), and the console."""
     use_threads(compute.threads)
     reporter = ConsoleReporter()

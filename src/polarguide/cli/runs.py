@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 import polarguide
-from polarguide.cli.console import ConsoleReporter, RunFolder, console, opened, say, size_text, warn
+from polarguide.cli.console import ConsoleReporter, RunFolder, console, open_run_folder, say, size_text, warn
 from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.options import (
     EXPORT_PACKAGES,
@@ -34,7 +34,7 @@ from polarguide.core.text import command, printable
 from polarguide.training.settings import TrainSettings
 
 
-def train(
+def train_scene(
     scene: Annotated[Path, tyro.conf.Positional],
     /,
     *,
@@ -83,7 +83,7 @@ _MOST_OBJECTS = 100
 """Lines of the table: a terminal takes minutes to lay out the most that a scene may have."""
 
 
-def evaluate(
+def evaluate_run(
     run: RunFolder,
     /,
     *,
@@ -96,7 +96,7 @@ def evaluate(
         run: Run folder.
         speed: Measure frames a second; --speed makes sense only while nothing else runs.
     """
-    trained, reporter = opened(run, compute)
+    trained, reporter = open_run_folder(run, compute)
     record = trained.evaluate(speed=speed, reporter=reporter)
     title = (
         f"{trained.configuration.recipe} on {trained.scene.name}: mean of {len(record['views'])} test views"
@@ -165,7 +165,7 @@ FRAMES = 120
 LAYERS = "final,base,reflection,specular,diffuse,strength,roughness,metalness,normal,depth,dolp,aolp"
 
 
-def render(
+def render_run(
     run: RunFolder,
     /,
     *,
@@ -240,7 +240,7 @@ def render(
     if layers is None:
         layers = "final" if path else LAYERS
     names = [name.strip() for name in layers.split(",") if name.strip()]
-    trained, reporter = opened(run, compute)
+    trained, reporter = open_run_folder(run, compute)
     trained.relight(environment, rotate_environment, reporter=reporter)
     if path:
         trained.write_film(
@@ -283,9 +283,9 @@ def demo(
     say(f"scene: {scene} (50 views of glossy objects, four polarizer angles each)")
     settings = TrainSettings(steps, seed)
     session = SessionOptions(threads=machine.threads)
-    train(scene, out=out, settings=settings, session=session, resume=(out / "run.json").exists())
-    evaluate(out, compute=ComputeOptions(machine.threads))
-    render(out)
+    train_scene(scene, out=out, settings=settings, session=session, resume=(out / "run.json").exists())
+    evaluate_run(out, compute=ComputeOptions(machine.threads))
+    render_run(out)
     picture = _first_picture(out)
     say(f"look at {picture}: {FIRST_VIEW}, which training has not seen, and its layers")
     say(
@@ -309,7 +309,7 @@ def _first_picture(out: Path) -> Path:
     return path
 
 
-def view(
+def view_in_browser(
     run: RunFolder,
     /,
     *,
@@ -336,12 +336,12 @@ def view(
             "they reflect, are for other viewers (SuperSplat).",
         )
     require_package("viser", "the viewer")
-    trained, reporter = opened(run, compute)
-    other = None if beside is None else opened(beside, compute)[0]
+    trained, reporter = open_run_folder(run, compute)
+    other = None if beside is None else open_run_folder(beside, compute)[0]
     trained.view(host=host, port=port, visitors=visitors, reporter=reporter, beside=other)
 
 
-def share(
+def share_run(
     run: RunFolder,
     /,
     *,
@@ -358,12 +358,12 @@ def share(
         title: Heading of the page; the scene's name by default.
         caption: Text below it; the recipe and its steps by default.
     """
-    trained, reporter = opened(run, machine)
+    trained, reporter = open_run_folder(run, machine)
     path = trained.share(out, title=title, caption=caption, reporter=reporter)
     say(f"page: {path} ({size_text(path.stat().st_size)})")
 
 
-def export(
+def export_run(
     run: RunFolder,
     /,
     *,
@@ -396,7 +396,7 @@ def export(
     """
     for package in EXPORT_PACKAGES.get(format, ()):
         require_package(package, f"--format {format}")
-    trained, reporter = opened(run, machine)
+    trained, reporter = open_run_folder(run, machine)
     for path in trained.export(
         format,
         out,

@@ -11,7 +11,9 @@ import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
+
+from tyro.constructors import PrimitiveConstructorSpec
 
 from polarguide.core.errors import PolarguideError
 
@@ -128,13 +130,30 @@ _BINARY = {"k": 1 << 10, "m": 1 << 20, "g": 1 << 30, "t": 1 << 40}
 _SIZE = re.compile(r"(?P<count>\d+(\.\d*)?|\.\d+) ?(?P<unit>[kmgt])(?P<binary>i?)b?", re.IGNORECASE)
 
 
-def gibibytes(text: str) -> float | None:
-    """A size such as 4GB, 600MB or 3.5GiB in GiB; None for other texts, and for a number without a unit."""
+def gibibytes(text: str) -> float:
+    """Return a size such as 4GB, 600MB or 3.5GiB in GiB; a number without a unit is GiB already.
+
+    Raises:
+        ValueError: the text is not a size.
+    """
     match = _SIZE.fullmatch(text.strip())
     if match is None:
-        return None
+        return float(text)
     units = _BINARY if match["binary"] else _UNITS
     return float(match["count"]) * units[match["unit"].lower()] / _BINARY["g"]
+
+
+Memory = Annotated[
+    float,
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="SIZE",
+        instance_from_str=lambda words: gibibytes(words[0]),
+        is_instance=lambda value: isinstance(value, int | float),
+        str_from_instance=lambda value: [f"{value}GiB"],
+    ),
+]
+"""Memory in GiB; the command line reads sizes such as 4GB."""
 
 
 def index_of(specified: float | None, scene: float | None = None) -> float:
@@ -157,7 +176,7 @@ class SceneOptions:
 
     downscale: int = 1
     transfer: Transfer = "linear"
-    memory: float | None = None
+    memory: Memory | None = None
     split: Split = "directions"
 
     def __post_init__(self) -> None:

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 import polarguide
-from polarguide.cli.console import say, use_threads
+from polarguide.cli.console import ConsoleReporter, say, use_threads
 from polarguide.core.errors import PolarguideError
 from polarguide.core.text import whole_number
 from polarguide.training.settings import Background, Materials, TrainSettings
 from polarguide_bench.options import BenchOptions, CompareOptions, LayoutName
-from polarguide_bench.verbs.console import JobReporter
 
 if TYPE_CHECKING:
     from polarguide_bench.results import Results
@@ -67,7 +66,7 @@ def compare(
         settings=replace(settings, steps=common),
         options=options,
         steps_of=steps_of,
-        reporter=JobReporter(),
+        reporter=ConsoleReporter(),
     )
     print_results(results, out)
 
@@ -148,7 +147,7 @@ def ablate(
         reference=reference,
         settings=replace(settings, steps=steps),
         options=options,
-        reporter=JobReporter(),
+        reporter=ConsoleReporter(),
     )
     print_results(results, out)
 
@@ -169,7 +168,7 @@ def bench(
     """
     use_threads(options.threads)
     run_bench = importlib.import_module("polarguide_bench.bench").run_bench
-    results = run_bench(out, options, reporter=JobReporter())
+    results = run_bench(out, options, reporter=ConsoleReporter())
     if results is None:
         say(f"scenes: {out / 'scenes'}")
     else:
