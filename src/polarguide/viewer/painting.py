@@ -23,14 +23,10 @@ from polarguide.geometry.vectors import dot, unit
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import splats
 from polarguide.training.metals.observations import shares
-from polarguide.viewer.messages import Accepts, choice, number, push
+from polarguide.viewer.panel import BRUSH, OFF, Panel
 from polarguide.viewer.presenting import Clicks
 from polarguide.visualization.figures import Picture
 
-OFF, SURFACE, BRUSH = TOOLS = ("off", "surface", "brush")
-NOTHING, DIELECTRIC, METAL = KINDS = ("not painted", "dielectric", "metal")
-SIZE = (0.5, 20.0)
-REACH = (0.5, 30.0)
 ASK = "Click on a surface"
 TINTS = np.array([(0, 0, 0), (40, 120, 255), (255, 190, 0), (0, 200, 120)], np.float32)
 """Colors of nothing, dielectrics, metals, and dielectrics with an index of their own."""
@@ -197,38 +193,6 @@ def kinds_of(
     return torch.tensor(named, dtype=torch.uint8)[weights.argmax(dim=1).cpu()]
 
 
-class PaintingControls:
-    """The controls of one session.
-
-    Attributes:
-        accepts: what a browser may set each control to, as of ``Panel``.
-
-    Args:
-        gui: viser's handle of the session's controls. kinds: of materials by name, with their numbers.
-    """
-
-    def __init__(self, gui: Any, kinds: Mapping[str, int]) -> None:
-        with gui.add_folder("Materials", expand_by_default=False):
-            hint = "A click paints a surface that hangs together, or what is in a disc"
-            self.tool = gui.add_dropdown("Paint", TOOLS, initial_value=OFF, hint=hint)
-            self.kind = gui.add_dropdown("As", tuple(kinds), initial_value=METAL)
-            self.size = gui.add_slider("Size", *SIZE, 0.5, 1.0, hint="Of the disc, in percent of the height")
-            hint = "How unlike neighbors a surface goes on over"
-            self.reach = gui.add_slider("Reach", *REACH, 0.5, 4.0, hint=hint)
-            self.undo = gui.add_button("Undo")
-            hint = "polarguide train --resume then goes on with them"
-            self.save = gui.add_button("Save materials to the run", hint=hint)
-        controls: list[tuple[Any, Accepts]] = [
-            (self.tool, choice(TOOLS)),
-            (self.kind, choice(tuple(kinds))),
-            (self.size, number(*SIZE)),
-            (self.reach, number(*REACH)),
-            (self.undo, push),
-            (self.save, push),
-        ]
-        self.accepts = {control._impl.uuid: accepts for control, accepts in controls}
-
-
 @dataclass(frozen=True, eq=False)
 class Paintable:
     """What a viewer needs to let its visitors paint.
@@ -247,33 +211,20 @@ class Painting:
     """One session's painting. Callbacks only record; the rendering thread calls ``act``.
 
     Args:
-        client: viser's handle. controls: controls of its panel. paintable: what can be painted.
-        changed: called when there is something to do. noted: with a note for the visitor.
-        caught: makes callbacks whose faults cost only this browser. busy: whether another tool takes clicks.
+        client: viser's handle. panel: controls of the session. paintable: what can be painted.
+        busy: whether another tool takes clicks.
     """
 
-    def __init__(
-        self,
-        client: Any,
-        controls: PaintingControls,
-        paintable: Paintable,
-        *,
-        changed: Callable[[], None],
-        noted: Callable[[str], None],
-        caught: Callable[[Callable[[], None]], Callable[[Any], None]],
-        busy: Callable[[], bool],
-    ) -> None:
-        self._controls = controls
+    def __init__(self, client: Any, panel: Panel, paintable: Paintable, *, busy: Callable[[], bool]) -> None:
+        self._panel = panel
         self._paintable = paintable
-        self._changed = changed
-        self._noted = noted
         self._busy = busy
         self._materials: Materials | None = None
-        self._clicks = Clicks(client, caught, self._click)
+        self._clicks = Clicks(client, panel, self._click)
         self._todo: list[Callable[[Materials, Camera], str]] = []
-        controls.tool.on_update(caught(self._tool_chosen))
-        controls.undo.on_click(caught(lambda: self._later(lambda painted, _: self._undone(painted))))
-        controls.save.on_click(caught(lambda: self._later(lambda painted, _: paintable.save(painted))))
+        panel.listen("tool", self._tool_chosen)
+        panel.listen("undo", lambda: self._later(self._undone))
+        panel.listen("save_materials", lambda: self._later(lambda painted, _: paintable.save(painted)))
 
     @property
     def waits(self) -> bool:
@@ -291,7 +242,7 @@ class Painting:
         for each in todo:
             if self._materials is None:
                 self._materials = self._paintable.materials()
-            self._noted(each(self._materials, camera))
+            self._panel.show_note(each(self._materials, camera))
 
     def tinted(self, picture: Picture, camera: Camera) -> Picture:
         """A picture with what is painted in it."""
@@ -305,24 +256,24 @@ class Painting:
     def _later(self, do: Callable[[Materials, Camera], str]) -> None:
         if not self._todo:
             self._todo.append(do)
-            self._changed()
+            self._panel.changed()
 
     @staticmethod
-    def _undone(materials: Materials) -> str:
+    def _undone(materials: Materials, _: Camera) -> str:
         return "Undone" if materials.undo() else "Nothing is left to undo"
 
     def _tool_chosen(self) -> None:
-        paints = self._controls.tool.value != OFF
+        paints = self._panel["tool"].value != OFF
         self._clicks.want(paints)
-        self._noted(ASK if paints else "")
+        self._panel.show_note(ASK if paints else "")
 
     def _click(self, place: Sequence[float]) -> None:
-        tool = self._controls.tool.value
-        kind = self._controls.kind.value
+        tool = self._panel["tool"].value
+        kind = self._panel["kind"].value
         if tool == OFF or self._busy():
             return
-        size = float(self._controls.size.value)
-        reach = float(self._controls.reach.value)
+        size = float(self._panel["size"].value)
+        reach = float(self._panel["reach"].value)
         number = self._paintable.kinds[kind]
         at = (float(place[0]), float(place[1]))
 

@@ -42,8 +42,8 @@ from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.viewer.cameras import Photograph, photographs
 from polarguide.viewer.guard import Gate, guarded
 from polarguide.viewer.messages import Accepts, checked
-from polarguide.viewer.painting import KINDS, Materials, Paintable, kinds_of
-from polarguide.viewer.panel import NOTHING, PanelOptions
+from polarguide.viewer.painting import Materials, Paintable, kinds_of
+from polarguide.viewer.panel import KINDS, NOTHING, PanelOptions
 from polarguide.viewer.scenery import Scenery, run_scenery, training_scenery
 from polarguide.viewer.session import Session
 

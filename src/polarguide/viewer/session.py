@@ -131,7 +131,6 @@ class Session:
     ) -> None:
         self._client = client
         self._photographs = photographs
-        self._drop = drop
         self._scene_frame = scene_frame
         self._wake = wake
         self._lock = threading.Lock()
@@ -146,37 +145,41 @@ class Session:
         self._size = first.width, first.height
         self._keyframes = Keyframes(self._size)
         upright = client.camera.image_width < client.camera.image_height  # as phones are held
-        self.panel = Panel(client.gui, options, lambda: self._caught(self._changed)(None), folded=upright)
+        self.panel = panel = Panel(client.gui, options, self._changed, drop, folded=upright)
         self._save = save
         self._presenting = Presenting(
             client,
-            self.panel.presenting,
+            panel,
             options.presentation,
             gray_world=gray_world,
             save=self._save_presentation,
             distance=scene_frame.distance,
-            changed=self._changed,
-            noted=lambda: self.panel.show_note(self._presenting.note),
-            caught=self._caught,
         )
         self._painting = None
-        if paintable is not None and self.panel.painting is not None:
-            self._painting = Painting(
-                client,
-                self.panel.painting,
-                paintable,
-                changed=self._changed,
-                noted=self.panel.show_note,
-                caught=self._caught,
-                busy=lambda: self._presenting.picks,
-            )
+        if paintable is not None and options.kinds:
+            self._painting = Painting(client, panel, paintable, busy=lambda: self._presenting.picks)
         self._frusta = Frusta(
             client.scene,
             list(photographs.values()),
             scene_frame,
-            lambda name: self._caught(lambda: self.go(name))(None),
+            lambda name: panel.caught(lambda: self.go(name))(None),
         )
-        self._connect()
+        client.camera.on_update(panel.caught(self._moved))
+        callbacks = {
+            "view": lambda: self._selected(panel["view"].value),
+            "step": lambda: self._step(1 if panel["step"].value == "next" else -1),
+            "frusta": lambda: self._frusta.show(panel["frusta"].value),
+            "pause": self._wake,
+            "screenshot": self._request_screenshot,
+            "add_keyframe": self._add_keyframe,
+            "remove_keyframe": self._remove_keyframe,
+            "seconds": self._show_count,
+            "play": self._play,
+            "save_path": self._save_path,
+        }
+        for name, act in callbacks.items():
+            panel.listen(name, act)
+        panel.caught(self._changed)(None)  # the box that was saved
 
     @property
     def client_id(self) -> int:
@@ -186,34 +189,7 @@ class Session:
     @property
     def paused(self) -> bool:
         """Whether this session pauses the training."""
-        return bool(self.panel.pause.value)
-
-    def _connect(self) -> None:
-        panel = self.panel
-        self._client.camera.on_update(self._caught(self._moved))
-        panel.view.on_update(self._caught(lambda: self._selected(panel.view.value)))
-        panel.step.on_click(self._caught(lambda: self._step(1 if panel.step.value == "next" else -1)))
-        panel.frusta.on_update(self._caught(lambda: self._frusta.show(panel.frusta.value)))
-        panel.box.on_update(self._caught(self._changed))
-        panel.pause.on_update(self._caught(self._wake))
-        panel.screenshot.on_click(self._caught(self._request_screenshot))
-        panel.add_keyframe.on_click(self._caught(self._add_keyframe))
-        panel.remove_keyframe.on_click(self._caught(self._remove_keyframe))
-        panel.seconds.on_update(self._caught(self._show_count))
-        panel.play.on_click(self._caught(self._play))
-        panel.save_path.on_click(self._caught(self._save_path))
-        self._caught(self._changed)(None)  # the box that was saved
-
-    def _caught(self, act: Callable[[], None]) -> Callable[[Any], None]:
-        """A callback whose errors close this browser's connection and affect no other."""
-
-        def called(_: Any) -> None:
-            try:
-                act()
-            except Exception as error:
-                self._drop(error)
-
-        return called
+        return bool(self.panel["pause"].value)
 
     def _soon_again(self, what: str) -> bool:
         """Whether the same was requested less than ``BETWEEN_FILES`` ago; such a request is ignored."""
@@ -228,7 +204,7 @@ class Session:
         with self._lock:
             self.pacing.mark_changed(time.monotonic())
         crop = self.panel.crop(self._presenting.chosen.up_axis)
-        self._frusta.show_box(crop if self.panel.box.value else None)
+        self._frusta.show_box(crop if self.panel["box"].value else None)
         self._wake()
 
     def _save_presentation(self) -> str:
@@ -238,7 +214,7 @@ class Session:
         chosen = msgspec.structs.replace(
             chosen,
             crop=self.panel.crop(chosen.up_axis),
-            exposure=float(self.panel.exposure.value) or None,
+            exposure=float(self.panel["exposure"].value) or None,
         )
         if self._save is not None:
             return self._save(chosen)
@@ -257,7 +233,7 @@ class Session:
                 pose = None
             if pose is not self._view_pose:
                 self._view_pose = pose
-                self.panel.view.value = FREE_VIEW if pose is None else pose.view.name
+                self.panel["view"].value = FREE_VIEW if pose is None else pose.view.name
                 if pose is None:
                     self._presenting.turn_upright()
         self._wake()
@@ -270,7 +246,7 @@ class Session:
             pose = move_to_view(self._client, view, self._scene_frame, time.monotonic())
             self._view_pose = self._last_pose = pose
             self.pacing.mark_changed(time.monotonic())
-        self.panel.view.value = name
+        self.panel["view"].value = name
         self._wake()
 
     def _selected(self, name: str) -> None:
@@ -298,23 +274,23 @@ class Session:
 
     def _show_count(self) -> None:
         count = len(self._keyframes.cameras)
-        seconds = max(0, count - 1) * float(self.panel.seconds.value)
-        self.panel.keyframes.value = f"{count}" + (f", {seconds:g} s" if count > 1 else "")
+        seconds = max(0, count - 1) * float(self.panel["seconds"].value)
+        self.panel["keyframes"].value = f"{count}" + (f", {seconds:g} s" if count > 1 else "")
 
     def _save_path(self) -> None:
         if self._keyframes.cameras and not self._soon_again("path"):
-            text = self._keyframes.to_json(float(self.panel.seconds.value))
+            text = self._keyframes.to_json(float(self.panel["seconds"].value))
             self._client.send_file_download(PATH_FILE, text.encode(), save_immediately=True)
 
     def _play(self) -> None:
         if self._soon_again("play"):
             return
-        path = self._keyframes.path(float(self.panel.seconds.value))
+        path = self._keyframes.path(float(self.panel["seconds"].value))
         if len(path) > 1:
             with self._lock:
                 self._view_pose = self._last_pose = None
                 self._playing = time.monotonic(), path
-            self.panel.view.value = FREE_VIEW
+            self.panel["view"].value = FREE_VIEW
             self._wake()
 
     def _camera(self, frame_size: tuple[int, int]) -> Camera:
