@@ -19,8 +19,6 @@ from polarguide.core.system import process_is_alive
 from polarguide.core.text import canonical
 
 LARGEST_FILE = 1 << 31
-_MASK = os.umask(0)  # what rights new files do not get; it can only be asked for by setting it
-os.umask(_MASK)
 
 
 @contextlib.contextmanager
@@ -38,10 +36,12 @@ def atomic(path: Path) -> Iterator[Path]:
     temporary = _temporary(path)
     with writing(path):
         try:
+            temporary.touch(exist_ok=False)
+            rights = temporary.stat().st_mode
             yield temporary
             with open(temporary, "rb") as file:
                 os.fsync(file.fileno())
-            os.chmod(temporary, 0o666 & ~_MASK)  # some libraries write for the owner alone
+            temporary.chmod(rights)  # some libraries replace the file by one for the owner alone
             os.replace(temporary, path)
             _sync_folder(path.parent)
         finally:
@@ -159,19 +159,14 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        # ``shutil.copytree`` raises one error with a list of all.
+        several = isinstance(error, shutil.Error) and isinstance(error.args[0], list)
         raise PolarguideError(
             path,
             expected="to write this file",
-            found=_reason(error),
+            found=str(error.args[0][0][-1]) if several else error.strerror or str(error),
             remedy="Make room or give rights, and repeat the command: it goes on where it stopped.",
         ) from error
-
-
-def _reason(error: OSError) -> str:
-    """The text of an operating system error; for a copied folder that of its first file."""
-    if isinstance(error, shutil.Error) and isinstance(error.args[0], list):
-        return str(error.args[0][0][-1])
-    return error.strerror or str(error)
 
 
 def stored(path: Path) -> Path:
@@ -282,32 +277,25 @@ def read_rows(path: Path, remedy: str) -> list[tuple[int, list[str]]]:
         PolarguideError: the file cannot be read, or is no CSV file; ``remedy`` is for messages.
     """
     data = read_file(path, largest=_LARGEST_TABLE, remedy=remedy)
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise _no_csv(path, error, remedy) from None
-    head = text.partition("\n")[0]
-    delimiter = ";" if head.count(";") > head.count(",") else ","
-    reader = csv.reader(
-        io.StringIO(text, newline=""), strict=True, skipinitialspace=True, delimiter=delimiter
-    )
     rows: list[tuple[int, list[str]]] = []
     line = 0  # where the last row ended
     try:
+        text = data.decode("utf-8-sig")
+        head = text.partition("\n")[0]
+        delimiter = ";" if head.count(";") > head.count(",") else ","
+        reader = csv.reader(
+            io.StringIO(text, newline=""), strict=True, skipinitialspace=True, delimiter=delimiter
+        )
         for row in reader:
+            if any("\0" in cell for cell in row):
+                raise csv.Error("a null character")
             line = reader.line_num
             rows.append((line, [cell.strip() for cell in row]))
-    except csv.Error as error:
-        raise _no_csv(f"{path} (line {line + 1})", error, remedy) from None
-    null = next((number for number, row in rows if any("\0" in cell for cell in row)), None)
-    if null is not None:
-        raise _no_csv(f"{path} (line {null})", "a null character", remedy)
+    except (UnicodeDecodeError, csv.Error) as error:
+        where = path if isinstance(error, UnicodeDecodeError) else f"{path} (line {line + 1})"
+        found = f"something else ({error})"
+        raise PolarguideError(where, expected="CSV text in UTF-8", found=found, remedy=remedy) from None
     return [(number, row) for number, row in rows if any(row)]
-
-
-def _no_csv(where: object, found: object, remedy: str) -> PolarguideError:
-    found = f"something else ({found})"
-    return PolarguideError(where, expected="CSV text in UTF-8", found=found, remedy=remedy)
 
 
 def _sync_folder(folder: Path) -> None:

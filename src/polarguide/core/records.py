@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -17,14 +17,16 @@ from polarguide.core.files import read_file
 
 T = TypeVar("T")
 CORRECT = "Correct or remove the file."
-_WORDS = {
-    "array": "a list", "bool": "true or false", "float": "a number", "int": "a whole number", "null": "null",
-    "object": "a JSON object {...}", "str": "text",
+_OBJECT = "a JSON object {...}"
+_NAMES = {
+    "BoolType": "true or false", "FloatType": "a number", "IntType": "a whole number", "NoneType": "null",
+    "StrType": "text", "ListType": "a list", "TupleType": "a list", "VarTupleType": "a list",
 }  # fmt: skip
+"""Names of types by class of ``msgspec.inspect``; all others are JSON objects."""
+_LARGEST_INTEGER = 1 << 63
 _DEEPEST = 50
 LARGEST_RECORD = 1 << 26
 """Bytes of a JSON file; what they decode to takes some twenty times as much."""
-_STEP = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
 
 
 def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
@@ -61,11 +63,10 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
     except PolarguideError as error:  # of a type's own check
         place = f"{where} ({error.where})"
         raise PolarguideError(place, expected=error.expected, found=error.found, remedy=remedy) from None
-    except msgspec.ValidationError as error:
-        field, expected, found = _fault(str(error), value, kind)
-        raise PolarguideError(
-            f"{where} ({field})" if field else where, expected=expected, found=found, remedy=remedy
-        ) from None
+    except msgspec.ValidationError:
+        path, expected, found = _fault(value, kind)
+        place = f"{where} ({path})" if path else where
+        raise PolarguideError(place, expected=expected, found=found, remedy=remedy) from None
     except (ValueError, RecursionError, OverflowError) as error:
         raise PolarguideError(
             where, expected="a JSON file", found=f"broken JSON ({error})", remedy=remedy
@@ -144,12 +145,11 @@ def check_options(options: Any, name: Callable[[str], str] = option_name) -> Non
     for field, value in values.items():
         _require_finite(value, name(field), remedy)
     try:
-        msgspec.convert(values, type(options), dec_hook=lambda kind, value: kind(value))
-    except msgspec.ValidationError as error:
-        field, expected, found = _fault(str(error), values, type(options))
-        raise PolarguideError(
-            name(field.partition("[")[0]), expected=expected, found=found, remedy=remedy
-        ) from None
+        _convert(values, type(options))
+    except msgspec.ValidationError:
+        path, expected, found = _fault(values, type(options))
+        field = path.partition("[")[0]
+        raise PolarguideError(name(field), expected=expected, found=found, remedy=remedy) from None
 
 
 def to_json(content: Any) -> bytes:
@@ -160,35 +160,79 @@ def to_json(content: Any) -> bytes:
         return (json.dumps(content, indent=1) + "\n").encode()
 
 
-def _fault(message: str, value: Any, kind: Any) -> tuple[str, str, str]:
-    """Field, what was expected there and what was found, from a message of msgspec's."""
-    what, _, path = message.partition(" - at `$")
-    what, _, got = what.partition(", got ")
-    path = path.rstrip("`")
-    form: Any = msgspec.inspect.type_info(kind)
-    for name, index in _STEP.findall(path):
-        value = _at(value, name, index)
-        form = _form_at(form, name, index)
-    field = path.lstrip(".")
-    expected = _plain(what.removeprefix("Expected "))
-    value_found = shortened(value)
-    if value is _UNKNOWN:
-        value_found = _plain(got) or "another"
-    if what.startswith("Object contains unknown field"):
-        fields = [field for kind in _kinds(form) for field in getattr(kind, "fields", ())]
-        expected = f"only {', '.join(field.encode_name for field in fields)}"
-        value_found = what.partition("`")[2].rstrip("`")
-    elif what.startswith("Object missing required field"):
-        expected = f"the field {what.partition('`')[2].rstrip('`')}"
-        value_found = f"only {', '.join(value)}" if isinstance(value, dict) and value else "none"
-    elif what.startswith("Number out of range"):
-        expected = "a number of usual size"
-    elif what.startswith("Invalid enum value"):
-        *others, last = (str(choice) for kind in _kinds(form) for choice in getattr(kind, "values", ()))
-        expected = f"{', '.join(others)} or {last}" if others else last
-    elif _limits(form) and not got:
-        expected = _limits(form)
-    return field, expected, value_found
+def _convert(value: Any, kind: Any) -> Any:
+    return msgspec.convert(value, kind, dec_hook=lambda custom, part: custom(part))
+
+
+def _fault(value: Any, kind: Any, path: str = "") -> tuple[str, str, str]:
+    """Return the path of the part of a value that does not fit a type, the expected type, and the part."""
+    for step, part, part_kind in _parts(value, kind):
+        try:
+            _convert(part, part_kind)
+        except msgspec.ValidationError:
+            return _fault(part, part_kind, path + step)
+    form = msgspec.inspect.type_info(kind)
+    options = getattr(form, "types", (form,))
+    expected, found = _mismatched_fields(value, options) or (_described(value, options), shortened(value))
+    return path.lstrip("."), expected, found
+
+
+def _parts(value: Any, kind: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the parts of a value: the step to each, the part, and its type."""
+    origin = get_origin(kind)
+    arguments = get_args(kind)
+    if origin in (Annotated, Union, UnionType):
+        for option in arguments[:1] if origin is Annotated else arguments:
+            yield from _parts(value, option)
+    elif origin in (list, tuple) and isinstance(value, list | tuple):
+        kinds = [arguments[0]] * len(value) if origin is list or arguments[-1] is ... else arguments
+        for number, (item, item_kind) in enumerate(zip(value, kinds, strict=False)):
+            yield f"[{number}]", item, item_kind
+    elif origin is dict and isinstance(value, dict):
+        yield from ((f".{key}", item, arguments[1]) for key, item in value.items())
+    elif isinstance(value, dict):
+        fields = getattr(msgspec.inspect.type_info(kind), "fields", ())
+        hints = get_type_hints(kind, include_extras=True) if fields else {}
+        for field in fields:
+            if field.encode_name in value:
+                yield f".{field.encode_name}", value[field.encode_name], hints[field.name]
+
+
+def _mismatched_fields(value: Any, options: Any) -> tuple[str, str] | None:
+    """Return the expected and the found fields of a JSON object; None: its fields have the right names."""
+    for option in options:
+        fields = {field.encode_name: field.required for field in getattr(option, "fields", ())}
+        if fields and isinstance(value, dict):
+            missing = [name for name, required in fields.items() if required and name not in value]
+            closed = getattr(option, "forbid_unknown_fields", False)
+            unknown = [name for name in value if closed and name not in fields]
+            if missing:
+                return f"the field {missing[0]}", f"only {', '.join(value)}" if value else "none"
+            if unknown:
+                return f"only {', '.join(fields)}", unknown[0]
+    return None
+
+
+def _described(value: Any, options: Any) -> str:
+    """Return the expected types of a value as text, or their limits if it has one of the types."""
+    names = []
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if number and _LARGEST_INTEGER <= abs(value) < math.inf:
+        return "a number of usual size"
+    for option in options:
+        if number and _limits(option):
+            return _limits(option)
+        name = _NAMES.get(type(option).__name__, _OBJECT)
+        if hasattr(option, "values"):
+            name = ", ".join(map(str, option.values))
+            name = " or ".join(name.rsplit(", ", 1))
+        elif hasattr(option, "item_types"):
+            name += f" of length {len(option.item_types)}"
+        for limit, sign in (("min_length", ">="), ("max_length", "<=")):
+            if getattr(option, limit, None) is not None:
+                name += f" of length {sign} {getattr(option, limit)}"
+        names.append(name)
+    return " or ".join(names)
 
 
 def shortened(value: Any, most: int = 100) -> str:
@@ -208,60 +252,15 @@ def first_difference(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
     return name, a, b
 
 
-_UNKNOWN = object()
-
-
-def _at(value: Any, name: str, index: str) -> Any:
-    """The value one step further; msgspec does not say at which key of a mapping a mistake is."""
-    if name and isinstance(value, dict):
-        return value.get(name, _UNKNOWN)
-    if index.isdigit() and isinstance(value, list | tuple):
-        return value[int(index)]
-    return _UNKNOWN
-
-
-def _form_at(form: Any, name: str, index: str) -> Any:
-    """The type one step further, None where it is not known."""
-    for option in _kinds(form):
-        if name:
-            for field in getattr(option, "fields", ()):
-                if field.encode_name == name:
-                    return field.type
-        elif hasattr(option, "item_type"):
-            return option.item_type
-        elif hasattr(option, "item_types") and index.isdigit():
-            return option.item_types[int(index)]
-        elif hasattr(option, "value_type"):
-            return option.value_type
-    return None
-
-
-def _kinds(form: Any) -> Any:
-    """The types that a value may have, of one or of a union."""
-    return getattr(form, "types", (form,))
-
-
-def _limits(form: Any) -> str:
-    """The range of a number as text; empty without a range."""
-    for option in _kinds(form):
-        least, above, most, below = (getattr(option, name, None) for name in ("ge", "gt", "le", "lt"))
-        if least is not None and most is not None:
-            return f"{least:.10g} to {most:.10g}"
-        texts = (
-            (least, "{:.10g} or more"), (above, "above {:.10g}"), (most, "up to {:.10g}"), (below, "below {:.10g}"),
-        )  # fmt: skip
-        if any(limit is not None for limit, _ in texts):
-            return " and ".join(text.format(limit) for limit, text in texts if limit is not None)
-    return ""
-
-
-def _plain(text: str) -> str:
-    """msgspec's names of types as text: `float | null` -> a number or null."""
-
-    def words(match: re.Match[str]) -> str:
-        return " or ".join(_WORDS.get(word, word) for word in match[1].split(" | "))
-
-    return re.sub(r"`([^`]*)`", words, text)
+def _limits(option: Any) -> str:
+    """Return the range of a number as text; empty without a range."""
+    least, above, most, below = (getattr(option, name, None) for name in ("ge", "gt", "le", "lt"))
+    if least is not None and most is not None:
+        return f"{least:.10g} to {most:.10g}"
+    texts = (
+        (least, "{:.10g} or more"), (above, "above {:.10g}"), (most, "up to {:.10g}"), (below, "below {:.10g}"),
+    )  # fmt: skip
+    return " and ".join(text.format(limit) for limit, text in texts if limit is not None)
 
 
 def _require_finite(value: Any, where: object, remedy: str, path: str = "") -> None:

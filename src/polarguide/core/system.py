@@ -296,16 +296,12 @@ def machine_busy_seconds() -> float:
 
 def process_is_alive(pid: int) -> bool:
     """Whether a process runs; a zombie, which has ended and waits to be asked about, does not."""
-    if os.name != "posix":  # there, signal 0 would end it
-        return True
     try:
-        os.kill(pid, 0)
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except (ProcessLookupError, OverflowError):  # the latter of a number that no process has
+        return psutil.Process(pid).status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
+    except psutil.NoSuchProcess:
         return False
-    except (OSError, IndexError):  # not ours to signal, or a system without /proc
+    except psutil.AccessDenied:
         return True
-    return state not in "ZX"
 
 
 def process_rank() -> int:
@@ -320,42 +316,40 @@ def process_count() -> int:
     Raises:
         PolarguideError: the variables that torchrun sets hold something else.
     """
-    counts = {name: os.environ.get(name, default) for name, default in (("WORLD_SIZE", "1"), ("RANK", "0"))}
-    for name, text in counts.items():
-        if not _is_count(text):
-            raise _no_rank(name, f"a whole number up to {MOST_PROCESSES}", repr(text))
-    world, rank = (int(text) for text in counts.values())
-    if not rank < max(1, world) <= MOST_PROCESSES:
-        raise _no_rank(
-            "RANK", f"one of up to {MOST_PROCESSES} processes, counted from 0", f"{rank} of {world}"
-        )
+    world_text = os.environ.get("WORLD_SIZE", "1")
+    rank_text = os.environ.get("RANK", "0")
+    for name, text in (("WORLD_SIZE", world_text), ("RANK", rank_text)):
+        _require_variable(name, _is_count(text), f"a whole number up to {MOST_PROCESSES}", repr(text))
+    world = max(1, int(world_text))
+    rank = int(rank_text)
+    _require_variable(
+        "RANK",
+        rank < world <= MOST_PROCESSES,
+        f"one of up to {MOST_PROCESSES} processes, counted from 0",
+        f"{rank} of {world}",
+    )
     if world > 1:
-        _require_meeting_place()
-    return max(1, world)
+        local, host, port = (
+            os.environ.get(name, "") for name in ("LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
+        )
+        _require_variable(
+            "LOCAL_RANK", _is_count(local), "the number of this process on its machine", repr(local)
+        )
+        _require_variable("MASTER_ADDR", bool(host), "the machine of the first process", "none")
+        right_port = _is_count(port) and 0 < int(port) < 65536
+        _require_variable("MASTER_PORT", right_port, "a port from 1 to 65535", repr(port))
+    return world
 
 
-def _require_meeting_place() -> None:
-    """Check what several processes need to find each other.
-
-    Raises:
-        PolarguideError: the variables that torchrun sets hold something else.
-    """
-    local, host, port = (os.environ.get(name, "") for name in ("LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT"))
-    if not _is_count(local):
-        raise _no_rank("LOCAL_RANK", "the number of this process on its machine", repr(local))
-    if not host:
-        raise _no_rank("MASTER_ADDR", "the machine of the first process", "none")
-    if not (_is_count(port) and 0 < int(port) < 65536):
-        raise _no_rank("MASTER_PORT", "a port from 1 to 65535", repr(port))
+def _require_variable(name: str, right: bool, expected: str, found: str) -> None:
+    """Raise PolarguideError unless a variable that torchrun sets is right."""
+    if not right:
+        remedy = "Unset WORLD_SIZE and RANK, or start the training with torchrun."
+        raise PolarguideError(name, expected=expected, found=found[:100], remedy=remedy)
 
 
 def _is_count(text: str) -> bool:
     return text.isascii() and text.isdigit() and len(text) < 10
-
-
-def _no_rank(name: str, expected: str, found: str) -> PolarguideError:
-    remedy = "Unset WORLD_SIZE and RANK, or start the training with torchrun."
-    return PolarguideError(name, expected=expected, found=found[:100], remedy=remedy)
 
 
 _SIZE = re.compile(r"[0-9]{1,18}(KB|Kb|kb|MB|Mb|mb)?")
@@ -370,17 +364,16 @@ def check_variables() -> None:
         PolarguideError: the kernels would start more threads than any machine has, or OpenCV would end the process.
     """
     threads = os.environ.get("POLARGUIDE_THREADS", "").strip()
+    wrong = {}
     if threads.isdecimal() and len(threads) < 1000 and int(threads) > MOST_THREADS:
-        raise _wrong("POLARGUIDE_THREADS", f"a number up to {MOST_THREADS}", threads)
+        wrong["POLARGUIDE_THREADS"] = f"a number up to {MOST_THREADS}"
     for name, text in os.environ.items():
         if _SIZES.fullmatch(name) and not _SIZE.fullmatch(text):
-            raise _wrong(name, "a whole number", text)
-
-
-def _wrong(name: str, expected: str, found: str) -> PolarguideError:
-    return PolarguideError(
-        f"the variable {name}",
-        expected=expected,
-        found=repr(found[:100]),
-        remedy=f"Correct it, or unset {name}.",
-    )
+            wrong[name] = "a whole number"
+    for name, expected in wrong.items():
+        raise PolarguideError(
+            f"the variable {name}",
+            expected=expected,
+            found=repr(os.environ[name][:100]),
+            remedy=f"Correct it, or unset {name}.",
+        )
