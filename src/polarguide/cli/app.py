@@ -191,8 +191,10 @@ def run(arguments: Sequence[str]) -> int:
     ):  # names of files may have bytes that are no text, or that it cannot say
         if isinstance(stream, io.TextIOWrapper):
             # In the C locale Python takes names of files for ASCII, and terminals show UTF-8 all the same.
-            encoding = "utf-8" if sys.getfilesystemencoding() == "ascii" else None
-            stream.reconfigure(encoding=encoding, errors="backslashreplace")
+            stream.reconfigure(
+                encoding="utf-8" if sys.getfilesystemencoding() == "ascii" else None,
+                errors="backslashreplace",
+            )
     try:
         with warnings_printed():
             status = _call(verb, arguments)

@@ -131,14 +131,13 @@ def bars() -> Progress:
 
     Step, total and time left are always shown; label and note share what room is left, and are cut.
     """
-    label = Column(no_wrap=True, overflow="ellipsis", max_width=26)
-    note = Column(no_wrap=True, overflow="ellipsis", ratio=1)
+    cut = {"no_wrap": True, "overflow": "ellipsis"}
     return Progress(
-        TextColumn("{task.description}", markup=False, table_column=label),
+        TextColumn("{task.description}", markup=False, table_column=Column(max_width=26, **cut)),
         BarColumn(bar_width=10),
         MofNCompleteColumn(table_column=Column(no_wrap=True)),
         TextColumn("{task.fields[left]}", style="progress.remaining", table_column=Column(no_wrap=True)),
-        TextColumn("{task.fields[note]}", markup=False, table_column=note),
+        TextColumn("{task.fields[note]}", markup=False, table_column=Column(ratio=1, **cut)),
         console=console,
         transient=True,
         expand=True,
@@ -234,5 +233,6 @@ def open_run_folder(run: Path, compute: ThreadOptions) -> tuple[Run, ConsoleRepo
     """The opened run, on the device of the options (the CPU without such an option), and the console."""
     use_threads(compute.threads)
     reporter = ConsoleReporter()
-    device = compute.device if isinstance(compute, ComputeOptions) else "cpu"
-    return polarguide.open_run(run, device=device, reporter=reporter), reporter
+    return polarguide.open_run(
+        run, device=compute.device if isinstance(compute, ComputeOptions) else "cpu", reporter=reporter
+    ), reporter

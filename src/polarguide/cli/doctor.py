@@ -181,24 +181,28 @@ def _print(report: dict[str, Any]) -> None:
     torch = report["torch"]
     machine = report["machine"]
     table = Table("", Column(overflow="fold"), box=None, show_header=False, pad_edge=False)
-    table.add_row("polarguide", f"{report['polarguide']['version']}  {report['polarguide']['folder']}")
-    table.add_row("Python", f"{report['python']['version']}  {report['python']['executable']}")
-    table.add_row("system", f"{machine['system']}, {machine['cores']} cores")
-    table.add_row("free memory", f"{machine['free_memory_gib']} GiB")
-    table.add_row("free disk", f"{machine['free_disk_gib']} GiB in this folder")
+    rows = {
+        "polarguide": f"{report['polarguide']['version']}  {report['polarguide']['folder']}",
+        "Python": f"{report['python']['version']}  {report['python']['executable']}",
+        "system": f"{machine['system']}, {machine['cores']} cores",
+        "free memory": f"{machine['free_memory_gib']} GiB",
+        "free disk": f"{machine['free_disk_gib']} GiB in this folder",
+    }
     if "error" not in kernels:
-        table.add_row("kernels", f"{kernels['instruction_set']}, threads: {kernels['threads']}")
+        rows["kernels"] = f"{kernels['instruction_set']}, threads: {kernels['threads']}"
     if "error" not in torch:
-        gpus = ", ".join(f"{each['name']} ({each['memory_gib']} GiB)" for each in torch["gpus"]) or "none"
-        table.add_row("PyTorch", f"{torch['version']}, threads: {torch['threads']}")
-        table.add_row("GPU", gpus)
-    others = [f"{name} {version}" for name, version in report["packages"].items() if version]
-    table.add_row("packages", ", ".join(others))
+        rows["PyTorch"] = f"{torch['version']}, threads: {torch['threads']}"
+        gpus = [f"{each['name']} ({each['memory_gib']} GiB)" for each in torch["gpus"]]
+        rows["GPU"] = ", ".join(gpus) or "none"
+    rows["packages"] = ", ".join(
+        f"{name} {version}" for name, version in report["packages"].items() if version
+    )
     for name, extra in report["extras"].items():
         state = extra["command"] or ", ".join(f"{each} {v}" for each, v in extra["installed"].items())
-        table.add_row(
-            f"extra {name}", f"{'missing' if extra['missing'] else 'installed'} ({extra['use']}): {state}"
-        )
+        installed = "missing" if extra["missing"] else "installed"
+        rows[f"extra {name}"] = f"{installed} ({extra['use']}): {state}"
+    for row in rows.items():
+        table.add_row(*row)
     console.print(table, markup=False, soft_wrap=False)
     for note in report["notes"]:
         say(note)

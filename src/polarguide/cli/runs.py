@@ -103,7 +103,7 @@ def evaluate_run(
     )
     print_scores(record, title)
     health = trained.health
-    for warning in () if health is None else health.warnings:
+    for warning in health.warnings if health else ():
         warn(warning)
     say(f"polarization: {trained.polarization}")
     say("health: not recorded, the training was not checked" if health is None else health.summary)
@@ -281,9 +281,13 @@ def demo(
     """
     scene = polarguide.demo_scene()
     say(f"scene: {scene} (50 views of glossy objects, four polarizer angles each)")
-    settings = TrainSettings(steps, seed)
-    session = SessionOptions(threads=machine.threads)
-    train_scene(scene, out=out, settings=settings, session=session, resume=(out / "run.json").exists())
+    train_scene(
+        scene,
+        out=out,
+        settings=TrainSettings(steps, seed),
+        session=SessionOptions(threads=machine.threads),
+        resume=(out / "run.json").exists(),
+    )
     evaluate_run(out, compute=ComputeOptions(machine.threads))
     render_run(out)
     picture = _first_picture(out)

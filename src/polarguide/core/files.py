@@ -187,8 +187,9 @@ def require_folder(path: Path, *, expected: str, remedy: str) -> None:
         PolarguideError: there is a file of this name, or nothing.
     """
     if not path.is_dir():
-        found = "a file" if path.exists() else "nothing"
-        raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
+        raise PolarguideError(
+            path, expected=expected, found="a file" if path.exists() else "nothing", remedy=remedy
+        )
 
 
 def require_file(path: Path, *, expected: str, remedy: str) -> None:
@@ -282,9 +283,11 @@ def read_rows(path: Path, remedy: str) -> list[tuple[int, list[str]]]:
     try:
         text = data.decode("utf-8-sig")
         head = text.partition("\n")[0]
-        delimiter = ";" if head.count(";") > head.count(",") else ","
         reader = csv.reader(
-            io.StringIO(text, newline=""), strict=True, skipinitialspace=True, delimiter=delimiter
+            io.StringIO(text, newline=""),
+            strict=True,
+            skipinitialspace=True,
+            delimiter=";" if head.count(";") > head.count(",") else ",",
         )
         for row in reader:
             if any("\0" in cell for cell in row):
@@ -293,8 +296,9 @@ def read_rows(path: Path, remedy: str) -> list[tuple[int, list[str]]]:
             rows.append((line, [cell.strip() for cell in row]))
     except (UnicodeDecodeError, csv.Error) as error:
         where = path if isinstance(error, UnicodeDecodeError) else f"{path} (line {line + 1})"
-        found = f"something else ({error})"
-        raise PolarguideError(where, expected="CSV text in UTF-8", found=found, remedy=remedy) from None
+        raise PolarguideError(
+            where, expected="CSV text in UTF-8", found=f"something else ({error})", remedy=remedy
+        ) from None
     return [(number, row) for number, row in rows if any(row)]
 
 

@@ -73,8 +73,7 @@ def check_count(name: str, value: int, minimum: int = 1, most: int = MOST) -> No
         PolarguideError: the value is not a whole number, or less than ``minimum`` or more than ``most``.
     """
     if not isinstance(value, numbers.Integral) or isinstance(value, bool):
-        remedy = "Round it."
-        raise PolarguideError(name, expected="a whole number", found=repr(value), remedy=remedy)
+        raise PolarguideError(name, expected="a whole number", found=repr(value), remedy="Round it.")
     if not minimum <= value <= most:
         expected, change = (f"up to {most}", "smaller") if value > most else (f"{minimum} or more", "larger")
         raise PolarguideError(name, expected=expected, found=str(value), remedy=f"Give a {change} number.")
@@ -88,8 +87,12 @@ def check_finite(name: str, value: float, least: float = -math.inf, most: float 
     """
     if not (math.isfinite(value) and least <= value <= most):
         whole = math.isinf(least) and math.isinf(most)
-        expected = "a finite number" if whole else f"{least:g} to {most:g}"
-        raise PolarguideError(name, expected=expected, found=str(value), remedy="Correct the number.")
+        raise PolarguideError(
+            name,
+            expected="a finite number" if whole else f"{least:g} to {most:g}",
+            found=str(value),
+            remedy="Correct the number.",
+        )
 
 
 def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
@@ -100,8 +103,9 @@ def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
     """
     allowed = list(choices)
     if value not in allowed:
-        expected = "one of " + ", ".join(allowed)
-        raise PolarguideError(name, expected=expected, found=value, remedy="Correct the name.")
+        raise PolarguideError(
+            name, expected="one of " + ", ".join(allowed), found=value, remedy="Correct the name."
+        )
 
 
 def picture_size(size: str) -> tuple[int, int]:

@@ -85,8 +85,9 @@ def parse(data: bytes, where: object, *, remedy: str = CORRECT) -> Any:
         value = json.loads(data, object_pairs_hook=_each_once)
         _require_shallow(value)
     except (ValueError, RecursionError) as error:
-        found = f"broken JSON ({error})"
-        raise PolarguideError(where, expected="a JSON file", found=found, remedy=remedy) from None
+        raise PolarguideError(
+            where, expected="a JSON file", found=f"broken JSON ({error})", remedy=remedy
+        ) from None
     return value
 
 

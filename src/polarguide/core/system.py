@@ -344,8 +344,12 @@ def process_count() -> int:
 def _require_variable(name: str, right: bool, expected: str, found: str) -> None:
     """Raise PolarguideError unless a variable that torchrun sets is right."""
     if not right:
-        remedy = "Unset WORLD_SIZE and RANK, or start the training with torchrun."
-        raise PolarguideError(name, expected=expected, found=found[:100], remedy=remedy)
+        raise PolarguideError(
+            name,
+            expected=expected,
+            found=found[:100],
+            remedy="Unset WORLD_SIZE and RANK, or start the training with torchrun.",
+        )
 
 
 def _is_count(text: str) -> bool:

@@ -67,8 +67,7 @@ def letterbox(photograph: Camera, frame_size: tuple[int, int]) -> Letterbox:
     """The placement of a photograph in a window of ``frame_size``, width and height."""
     scale = min(frame_size[0] / photograph.width, frame_size[1] / photograph.height)
     left = 0.5 * (frame_size[0] - scale * photograph.width)
-    top = 0.5 * (frame_size[1] - scale * photograph.height)
-    return Letterbox(scale, left, top, frame_size)
+    return Letterbox(scale, left, 0.5 * (frame_size[1] - scale * photograph.height), frame_size)
 
 
 def drawn_camera(camera: Camera, view: View | None) -> Camera:

@@ -267,8 +267,7 @@ class Painter:
     ) -> SurfacePoint | None:
         """The surface at a place of the picture that ``paint`` draws, in shares of its width and height."""
         camera = drawn_camera(camera, view)
-        plain = Appearance(layer="depth", crop=appearance.crop)
-        result = self._result(scenery, camera, plain)
+        result = self._result(scenery, camera, Appearance(layer="depth", crop=appearance.crop))
         return surface_at(result, camera, place[0] * camera.width, place[1] * camera.height)
 
     def _result(self, scenery: Scenery, camera: Camera, appearance: Appearance) -> RenderResult:
@@ -277,11 +276,13 @@ class Painter:
         strength = 1.0 if appearance.layer in POLARIZED else appearance.strength
         within = None if crop is None else lambda means: crop.inside(means, self.around)
         if appearance.turn % 360:
-            presented = Presentation(up_axis=appearance.up_axis)
-            turn = presented.upright(self.around).turn(appearance.turn)
-        surface = appearance.layer in ("normal", "depth")
+            turn = Presentation(up_axis=appearance.up_axis).upright(self.around).turn(appearance.turn)
         result = scenery.render(
-            camera, depth=appearance.layer == "depth", surface=surface, within=within, turn=turn
+            camera,
+            depth=appearance.layer == "depth",
+            surface=appearance.layer in ("normal", "depth"),
+            within=within,
+            turn=turn,
         )
         if result.specular is None or result.diffuse is None or strength == 1.0:
             return result
@@ -315,6 +316,7 @@ class Painter:
 def _exposed(radiance: Tensor, appearance: Appearance) -> Tensor:
     """Radiance [H, W, 3] as bright and in the color that is wanted, linear."""
     white = appearance.white_balance
-    chart = appearance.chart
-    exposure = appearance.exposure
-    return colored(radiance, Presentation(white_balance=white, chart=chart, exposure=exposure).color)
+    return colored(
+        radiance,
+        Presentation(white_balance=white, chart=appearance.chart, exposure=appearance.exposure).color,
+    )

@@ -139,8 +139,7 @@ def _write(sheet: Image.Image, text: str, x: int, y: int, width: int, larger: fl
     text = text.encode("ascii", "replace").decode()
     length = max(1.0, ImageFont.load_default(FONT_SIZE * larger).getlength(text))
     size = larger * max(SMALLEST_FONT_SIZE, FONT_SIZE * min(1.0, width / length))
-    font = ImageFont.load_default(size)
-    ImageDraw.Draw(sheet).text((x + width / 2, y), text, INK, font, anchor="mm")
+    ImageDraw.Draw(sheet).text((x + width / 2, y), text, INK, ImageFont.load_default(size), anchor="mm")
 
 
 COLOR_MAPS = {
@@ -269,8 +268,7 @@ def angle_wheel(scale: float = 1.0) -> Picture:
     angle = np.arctan2(center_y - y, x - center_x)
     distance = np.hypot(center_y - y, x - center_x)
     inside = (distance <= radius) & (y <= center_y)
-    colors = aolp_to_rgb(torch.from_numpy(angle), torch.from_numpy(distance / radius))
-    drawn[inside] = colors[inside]
+    drawn[inside] = aolp_to_rgb(torch.from_numpy(angle), torch.from_numpy(distance / radius))[inside]
     image = Image.fromarray(drawn)
     font = ImageFont.load_default(max(14 * scale, SMALLEST_FONT_SIZE))
     for degrees, anchor in ((0, "lm"), (45, "lb"), (90, "mb"), (135, "rb"), (180, "rm")):

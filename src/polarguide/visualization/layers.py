@@ -123,8 +123,7 @@ def depth_range(depth: Tensor, mask: Tensor) -> Depths:
         return 1.0, 2.0
     values = values[:: max(1, values.numel() // _SAMPLES)]
     near = max(float(values.quantile(0.02)), 1e-6)
-    far = float(values.quantile(0.98))
-    return near, max(far, 1.001 * near)
+    return near, max(float(values.quantile(0.98)), 1.001 * near)
 
 
 def true_depths(view: View) -> Tensor | None:

@@ -50,8 +50,11 @@ def page(package: str, name: str, *, script: str = "", more: str = "", **values:
         more: what else may run, beside the script; further directives after a semicolon.
         values: what the template names; ``title`` at least.
     """
-    policy = content_policy(script, more=more)
-    return templates(package).get_template(name).render(policy=policy, script=script, **values)
+    return (
+        templates(package)
+        .get_template(name)
+        .render(policy=content_policy(script, more=more), script=script, **values)
+    )
 
 
 def script_json(data: Any) -> str:

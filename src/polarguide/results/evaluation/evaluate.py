@@ -71,8 +71,7 @@ class ErrorSheet:
     """
 
     def __init__(self, views: int) -> None:
-        step = max(1, math.ceil(views / MOST_VIEWS))
-        self._chosen = range(0, views, step)
+        self._chosen = range(0, views, max(1, math.ceil(views / MOST_VIEWS)))
         self._added = 0
         self._rows: list[tuple[str, dict[str, Picture]]] = []
         # Measured (None: not known) and predicted Stokes vectors, and where they count: scales depend on all views.

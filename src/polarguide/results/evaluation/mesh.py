@@ -79,8 +79,7 @@ def surface_scores(surface: Surface, views: Sequence[View]) -> dict[str, float]:
     points = [true_points(view, finer) for view in views]
     front, whole = (np.concatenate(parts) for parts in zip(*points, strict=True))
     inside = ((surface.vertices > low - reach) & (surface.vertices < high + reach)).all(axis=1)
-    used = inside | judged(surface.vertices, views, reach)
-    samples, areas = _sampled(surface, used, SPACING * diagonal)
+    samples, areas = _sampled(surface, inside | judged(surface.vertices, views, reach), SPACING * diagonal)
     counted = judged(samples, views, reach)
     judged_area = float(areas[counted].sum())
     scores: dict[str, float] = {}

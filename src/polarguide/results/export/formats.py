@@ -124,8 +124,9 @@ def export(
     check_choice("fields", fields, get_args(PlyFields))
     check_choice("axes", axes, get_args(Axes))
     if fields != "release" and format != "ply":
-        expected = "release, but for --format ply"
-        raise PolarguideError("fields", expected=expected, found=fields, remedy="Leave it out.")
+        raise PolarguideError(
+            "fields", expected="release, but for --format ply", found=fields, remedy="Leave it out."
+        )
     # Formats without Gaussians print no number of them.
     heard = SILENT if format in ("environment", "cameras") else reporter
     presented = Presented(run, axes=axes, masked=model.masked, reporter=heard)
@@ -153,13 +154,12 @@ def _ply(
     with temporary_folder(path.with_suffix(".whole")) as folder:
         whole = folder / path.name
         model = run.model
-        color = presented.presentation.color
         write_run_ply(
             whole,
             model.state,
             model.shading,
             presented.centers,
-            color=color,
+            color=presented.presentation.color,
             linear=linear,
             own_fields=own_fields,
         )
@@ -246,8 +246,7 @@ def _charted(
 ) -> Charted:
     view = presented.surface_view(run)
     with temporary_folder(folder / kind) as parts:
-        inside = presented.subject.inside
-        return charted_subject(run, view, inside, options, resolution, parts, reporter)
+        return charted_subject(run, view, presented.subject.inside, options, resolution, parts, reporter)
 
 
 def _textured(

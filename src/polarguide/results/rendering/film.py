@@ -140,9 +140,12 @@ def _turntable(run: OpenedRun, cameras: list[Camera], frames: int) -> list[Camer
     center = inner.median(dim=0).values
     radius = float((inner - center).norm(dim=1).quantile(FILLED))
     lens = cameras[0]
-    narrow = min(lens.width / lens.fx, lens.height / lens.fy) / 2
-    distance = radius / math.sin(math.atan(narrow))
-    return orbit(cameras, frames, around=replace(run.frame, center=center), distance=distance)
+    return orbit(
+        cameras,
+        frames,
+        around=replace(run.frame, center=center),
+        distance=radius / math.sin(math.atan(min(lens.width / lens.fx, lens.height / lens.fy) / 2)),
+    )
 
 
 def write_film(
@@ -183,10 +186,13 @@ def write_film(
             remedy="Give all the same width and height.",
         )
     width, height = sizes[0]
-    remedy = "Give the cameras of the path a smaller width and height."
-    require_memory(Path(path), RENDERED * width * height, f"pictures of {width}x{height}", remedy=remedy)
-    named = out.suffix.lower() == ".mp4" and len(names) > 1
-    pictures = _pictures(run, names, cameras, reporter, named=named)
+    require_memory(
+        Path(path),
+        RENDERED * width * height,
+        f"pictures of {width}x{height}",
+        remedy="Give the cameras of the path a smaller width and height.",
+    )
+    pictures = _pictures(run, names, cameras, reporter, named=out.suffix.lower() == ".mp4" and len(names) > 1)
     if size is not None:  # a width that the layers do not share evenly ends with black columns
         rest = size[0] % len(names)
         pictures = (np.pad(picture, ((0, 0), (0, rest), (0, 0))) for picture in pictures)

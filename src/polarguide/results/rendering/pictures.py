@@ -136,8 +136,9 @@ def write_pictures(
                     missing.add(name)
                 elif format == "png" and transparent:
                     rendered = _unblended(result)
-                    exposed = name == "reflection"
-                    whole = layer_picture(rendered, name, view.camera, depths, exposed=exposed, color=color)
+                    whole = layer_picture(
+                        rendered, name, view.camera, depths, exposed=name == "reflection", color=color
+                    )
                     assert whole is not None
                     alpha = (result.alpha.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
                     figures.write_png(folder / f"{view.name}_{name}.png", whole, alpha, about)

@@ -132,8 +132,7 @@ def resolving_normals(
         normal = run.result(view.name, depth=False).to("cpu").normal
         assert normal is not None
         return guide_normals(view.camera.to_camera(normal), rays, Priors.minimum_normal)[0], "by_run"
-    upward = torch.tensor([0.0, -0.5, -1.0]).expand_as(rays)
-    guess = torch.nn.functional.normalize(upward, dim=-1)
+    guess = torch.nn.functional.normalize(torch.tensor([0.0, -0.5, -1.0]).expand_as(rays), dim=-1)
     chosen = optics.disambiguate(
         optics.physical_candidates(luminance, rays, index), guess, rays, azimuth_weight=0.0
     ).normal

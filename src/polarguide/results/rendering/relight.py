@@ -142,16 +142,14 @@ def texels_of(picture: Tensor, cubemap: RadianceCubemap, around: SceneFrame, res
         1, 6 * resolution, resolution, 2
     )
     sampled = grid_sample(wide, places, mode="bilinear", padding_mode="border", align_corners=False)
-    light = sampled[0].movedim(0, -1).reshape(6, resolution, resolution, 3)
-    return cubemap.raw(light).float()
+    return cubemap.raw(sampled[0].movedim(0, -1).reshape(6, resolution, resolution, 3)).float()
 
 
 @torch.no_grad()
 def turned_cubemap(texels: Tensor, turn: Tensor, resolution: int) -> Tensor:
     """Raw texels [6, R, R, C] after turning what they show by a rotation [3, 3] of the world."""
     directions = (texel_directions(resolution).double() @ turn).reshape(-1, 3)
-    sampled = cubemap_lookup(texels, directions.to(texels))
-    return sampled.reshape(6, resolution, resolution, -1)
+    return cubemap_lookup(texels, directions.to(texels)).reshape(6, resolution, resolution, -1)
 
 
 def write_exr(path: Path, picture: Tensor, attributes: Mapping[str, str] = {}) -> None:
