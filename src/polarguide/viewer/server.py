@@ -41,7 +41,7 @@ from polarguide.shading.model import ShadingModel
 from polarguide.training.angles.trainer import AngleTrainer
 from polarguide.viewer.cameras import Photograph, photographs
 from polarguide.viewer.guard import Gate, guarded
-from polarguide.viewer.messages import Accepts, checked
+from polarguide.viewer.messages import Accepts, checked_message
 from polarguide.viewer.painting import Materials, Paintable, kinds_of
 from polarguide.viewer.panel import KINDS, NOTHING, PanelOptions
 from polarguide.viewer.scenery import Scenery, run_scenery, training_scenery
@@ -129,7 +129,7 @@ class Viewer:
         reach = float(around.center.abs().max()) + REACH * around.distance
         gate = Gate(host, visitors.allow_host, visitors.allow_origin)
         with contextlib.ExitStack() as stack:
-            with guarded(gate, lambda raw: checked(raw, self._control, reach)):
+            with guarded(gate, lambda raw: checked_message(raw, self._control, reach)):
                 self._server = _listening(viser, host, port, title)
                 stack.callback(self.close)
             stack.pop_all()
