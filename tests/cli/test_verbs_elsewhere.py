@@ -13,7 +13,7 @@ from other_device import BACKEND, OtherDevice, unfused_adam
 
 from polarguide.api.runs import Run, open_run
 from polarguide.capture import load_scene
-from polarguide.capture.presentation import Crop
+from polarguide.capture.presentation import Crop, Presentation
 from polarguide.cli.app import run
 from polarguide.cli.runs import render_run
 from polarguide.core.options import ComputeOptions
@@ -113,7 +113,7 @@ def test_the_inspection_trains_there_and_compares_here(
 def test_the_viewer_draws_what_lies_there(elsewhere: Path) -> None:
     crop = Crop((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     chosen = [
-        Appearance(layer, exposure=0.5, strength=0.5, turn=30.0, crop=crop)
+        Appearance(layer, strength=0.5, turn=30.0, presentation=Presentation(exposure=0.5, crop=crop))
         for layer in ("final", "specular", "normal", "depth", "error")
     ]
 

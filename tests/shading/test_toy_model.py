@@ -13,7 +13,7 @@ from plugins import install
 from torch import Tensor
 
 from polarguide.capture import Scene
-from polarguide.capture.presentation import Crop
+from polarguide.capture.presentation import Crop, Presentation
 from polarguide.gaussians.ply import read_ply
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.raster import choose_backend
@@ -139,7 +139,9 @@ def test_it_is_viewed(trained: Trainer) -> None:
     painter, shown, camera = Painter(scene_frame(cameras)), training_scenery(running), cameras[0]
     pictures = {layer: painter.paint(shown, camera, Appearance(layer=layer)) for layer in LAYERS}
     assert {layer for layer, found in pictures.items() if found is not None} == set(trained.shading.layers)
-    stronger = Appearance(strength=2.0, turn=30.0, crop=Crop((-9, -9, -9), (9, 9, 9)))
+    stronger = Appearance(
+        strength=2.0, turn=30.0, presentation=Presentation(crop=Crop((-9, -9, -9), (9, 9, 9)))
+    )
     found, plain = painter.paint(shown, camera, stronger), pictures["final"]
     assert found.mean() > plain.mean() + 1
 

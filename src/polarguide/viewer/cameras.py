@@ -39,35 +39,21 @@ def free_camera(
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, rotation, -rotation @ center)
 
 
-@dataclass(frozen=True)
-class Letterbox:
-    """The placement of a photograph in a window of another aspect ratio: as large as possible, centered.
+def letterboxed(photograph: Picture, frame_size: tuple[int, int]) -> Picture:
+    """Return a photograph in a window of another aspect ratio: as large as possible, centered, on gray.
 
-    Attributes:
-        scale: window pixels per pixel of the photograph. left, top: its corner in window pixels.
-        frame_size: width and height of the window.
+    Args:
+        photograph: uint8 [h, w, 3]. frame_size: width and height of the window in pixels.
     """
-
-    scale: float
-    left: float
-    top: float
-    frame_size: tuple[int, int]
-
-    def apply(self, picture: Picture) -> Picture:
-        """A picture of the photograph's size, resampled into the window with gray borders."""
-        matrix = np.array([[self.scale, 0, self.left], [0, self.scale, self.top]])
-        # The origin of warpAffine is the center of the corner pixel, that of our cameras its corner.
-        matrix[:, 2] += 0.5 * self.scale - 0.5
-        blend = cv2.INTER_LINEAR if self.scale >= 1 else cv2.INTER_AREA
-        placed = cv2.warpAffine(picture, matrix, self.frame_size, flags=blend, borderValue=(64, 64, 64))
-        return np.ascontiguousarray(placed, dtype=np.uint8)
-
-
-def letterbox(photograph: Camera, frame_size: tuple[int, int]) -> Letterbox:
-    """The placement of a photograph in a window of ``frame_size``, width and height."""
-    scale = min(frame_size[0] / photograph.width, frame_size[1] / photograph.height)
-    left = 0.5 * (frame_size[0] - scale * photograph.width)
-    return Letterbox(scale, left, 0.5 * (frame_size[1] - scale * photograph.height), frame_size)
+    height, width = photograph.shape[:2]
+    scale = min(frame_size[0] / width, frame_size[1] / height)
+    left = 0.5 * (frame_size[0] - scale * width)
+    top = 0.5 * (frame_size[1] - scale * height)
+    # The origin of warpAffine is the center of the corner pixel, that of our cameras its corner.
+    matrix = np.array([[scale, 0, left + 0.5 * scale - 0.5], [0, scale, top + 0.5 * scale - 0.5]])
+    blend = cv2.INTER_LINEAR if scale >= 1 else cv2.INTER_AREA
+    placed = cv2.warpAffine(photograph, matrix, frame_size, flags=blend, borderValue=(64, 64, 64))
+    return np.ascontiguousarray(placed, dtype=np.uint8)
 
 
 def drawn_camera(camera: Camera, view: View | None) -> Camera:
@@ -75,13 +61,6 @@ def drawn_camera(camera: Camera, view: View | None) -> Camera:
     if view is None:
         return camera
     return view.camera.extended(camera.width, camera.height)
-
-
-def window_fov(photograph: Camera, aspect: float) -> float:
-    """Vertical field of view in radians with which a window of ``aspect`` (width / height) contains a photograph."""
-    high = 0.5 * photograph.height / photograph.fy
-    wide = 0.5 * photograph.width / photograph.fx
-    return 2 * math.atan(max(high, wide / aspect))
 
 
 ARRIVAL = 5.0  # seconds within which a browser has to report a pose
@@ -129,8 +108,10 @@ def move_to_view(client: Any, view: View, scene_frame: SceneFrame, now: float) -
     # The orbit center lies on the optical axis, at the distance of the scene's center.
     ahead = target.rotation[2]
     distance = max(float((scene_frame.center - center) @ ahead), 0.1 * scene_frame.distance)
+    high = 0.5 * target.height / target.fy
+    wide = 0.5 * target.width / target.fx
     with client.atomic():
-        camera.fov = window_fov(target, camera.aspect)
+        camera.fov = 2 * math.atan(max(high, wide / camera.aspect))
         camera.up_direction = (-target.rotation[1]).numpy()
         camera.position = center.numpy()
         camera.look_at = (center + distance * ahead).numpy()

@@ -7,13 +7,14 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import msgspec
+
 from polarguide.capture.presentation import STOPS, Crop, Presentation, Vector
 from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
-from polarguide.viewer.scenery import MEASURED, Appearance
+from polarguide.viewer.scenery import MEASURED, UNCHANGED, Appearance
 
 FREE_VIEW = "(free)"
 STEPS = ("previous", "next")
-NOTHING = Presentation()
 # Ranges of the controls.
 SIDES = {"left_right": "Left, right", "down_up": "Down, up", "front_back": "Front, back"}
 """Labels of the sliders of the crop box by control."""
@@ -52,7 +53,7 @@ class PanelOptions:
     turns: bool
     views: Sequence[str]
     trains: bool
-    presentation: Presentation = NOTHING
+    presentation: Presentation = UNCHANGED
     saves: bool = False
     kinds: Mapping[str, int] = field(default_factory=dict)
 
@@ -251,18 +252,22 @@ class Panel:
         high = tuple(max(side[1], side[0] + 1) / 100 for side in (left_right, down_up, front_back))
         return Crop(low, (high[0], high[1], high[2]), up_axis)
 
-    def appearance(self, chosen: Presentation = NOTHING) -> Appearance:
+    def presentation(self, chosen: Presentation) -> Presentation:
+        """A presentation with the exposure and the crop box of the panel."""
+        crop = self.crop(chosen.up_axis)
+        exposure = float(self["exposure"].value) or None
+        return msgspec.structs.replace(
+            chosen, exposure=exposure, crop=crop, whole=chosen.whole and crop is None
+        )
+
+    def appearance(self, chosen: Presentation) -> Appearance:
         """The current choice of the user, with the white and the up axis that were chosen."""
         return Appearance(
             layer=self["layer"].value,
-            exposure=float(self["exposure"].value),
             strength=float(self["strength"].value),
             turn=float(self["turn"].value),
-            crop=self.crop(chosen.up_axis),
-            white_balance=chosen.white_balance,
-            chart=chosen.chart,
-            up_axis=chosen.up_axis,
             wipe=float(self["wipe"].value) / 100,
+            presentation=self.presentation(chosen),
         )
 
 

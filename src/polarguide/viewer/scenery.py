@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import View
-from polarguide.capture.presentation import Chart, Crop, Presentation, Vector, colored
+from polarguide.capture.presentation import Presentation, colored
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame
@@ -21,7 +21,7 @@ from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
 from polarguide.shading.result import POLARIZED, RenderResult
 from polarguide.training.angles.trainer import AngleTrainer
-from polarguide.viewer.cameras import drawn_camera, letterbox
+from polarguide.viewer.cameras import drawn_camera, letterboxed
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
 from polarguide.visualization.layers import (
@@ -145,30 +145,28 @@ LEGEND = 0.25, 128, 512
 """Width of the key to a layer's colors: as a share of the picture, and at least and at most in pixels."""
 
 
+UNCHANGED = Presentation()
+"""The presentation that changes nothing."""
+
+
 @dataclass(frozen=True)
 class Appearance:
     """A visitor's choices.
 
     Attributes:
         layer: a name in ``LAYERS``, ``POLARIZED`` or ``MEASURED``.
-        exposure: stops by which radiance is brightened.
         strength: factor on the specular layer; predicted polarization is that of the layers as they were learned.
         turn: degrees of the far environment, counter-clockwise seen from above.
-        crop: what is shown of the scene; None: all.
         wipe: share of the picture's width, from the left, that shows the run beside in place of the layer; without one
             what was measured (``BESIDE``), at a photograph's pose.
-        white_balance, chart: as of ``Presentation``. up_axis: the axis of turning; None: as the cameras say.
+        presentation: color, exposure, up axis and crop box; without a crop box all of the scene is shown.
     """
 
     layer: str = "final"
-    exposure: float = 0.0
     strength: float = 1.0
     turn: float = 0.0
-    crop: Crop | None = None
-    white_balance: Vector | None = None
-    chart: Chart | None = None
-    up_axis: Vector | None = None
     wipe: float = 0.0
+    presentation: Presentation = UNCHANGED
 
 
 class Painter:
@@ -203,17 +201,14 @@ class Painter:
         Returns:
             uint8 [H, W, 3] of the camera's size; None where there is no such layer.
         """
-        layer = appearance.layer
-        if layer in MEASURED and (view is None or (layer in OF_POLARIZATION and not view.is_determined)):
-            return None
-        if view is not None and layer in MEASURED:
-            place = letterbox(view.camera, (camera.width, camera.height))
-            return self._with_scale(place.apply(self._measured(scenery, view, appearance)), layer)
-        camera = drawn_camera(camera, view)
-        picture = self._modeled(scenery, camera, appearance, settled=settled)
-        if picture is not None and appearance.wipe > 0:
-            picture = self._wiped(picture, scenery, camera, view, appearance)
-        return None if picture is None else self._with_scale(picture, layer)
+        if appearance.layer in MEASURED:
+            picture = self._measured(scenery, view, appearance, (camera.width, camera.height))
+        else:
+            camera = drawn_camera(camera, view)
+            picture = self._modeled(scenery, camera, appearance, settled=settled)
+            if picture is not None and appearance.wipe > 0:
+                picture = self._wiped(picture, scenery, camera, view, appearance)
+        return None if picture is None else self._with_scale(picture, appearance.layer)
 
     def _modeled(
         self, scenery: Scenery, camera: Camera, appearance: Appearance, *, settled: bool
@@ -229,13 +224,12 @@ class Painter:
     ) -> Picture:
         """A picture of a layer with the other run, or what was measured, to the left; as it is where there is none."""
         other = BESIDE.get(appearance.layer)
+        left = None
         if self._beside is not None:
             left = self._modeled(self._beside, camera, appearance, settled=False)
-        elif view is None or other is None or (other in OF_POLARIZATION and not view.is_determined):
-            left = None
-        else:
-            place = letterbox(view.camera, (picture.shape[1], picture.shape[0]))
-            left = place.apply(self._measured(scenery, view, replace(appearance, layer=other)))
+        elif other is not None:
+            measured = replace(appearance, layer=other)
+            left = self._measured(scenery, view, measured, (camera.width, camera.height))
         if left is None:
             return picture
         column = round(min(appearance.wipe, 1.0) * picture.shape[1])
@@ -267,16 +261,16 @@ class Painter:
     ) -> SurfacePoint | None:
         """The surface at a place of the picture that ``paint`` draws, in shares of its width and height."""
         camera = drawn_camera(camera, view)
-        result = self._result(scenery, camera, Appearance(layer="depth", crop=appearance.crop))
+        result = self._result(scenery, camera, replace(appearance, layer="depth", strength=1.0, turn=0.0))
         return surface_at(result, camera, place[0] * camera.width, place[1] * camera.height)
 
     def _result(self, scenery: Scenery, camera: Camera, appearance: Appearance) -> RenderResult:
-        crop = appearance.crop
+        crop = appearance.presentation.crop
         turn = None
         strength = 1.0 if appearance.layer in POLARIZED else appearance.strength
         within = None if crop is None else lambda means: crop.inside(means, self.around)
         if appearance.turn % 360:
-            turn = Presentation(up_axis=appearance.up_axis).upright(self.around).turn(appearance.turn)
+            turn = appearance.presentation.upright(self.around).turn(appearance.turn)
         result = scenery.render(
             camera,
             depth=appearance.layer == "depth",
@@ -297,26 +291,24 @@ class Painter:
         if values is None:
             return None
         if layer in RADIANCE:
-            return figures.radiance_to_rgb(_exposed(values, appearance))
+            return figures.radiance_to_rgb(colored(values, appearance.presentation.color))
         if layer == "depth" and (settled or self._depths is None):
             self._depths = depth_range(values, result.alpha > 0.5)
         return layer_picture(result, layer, camera, self._depths)
 
-    def _measured(self, scenery: Scenery, view: View, appearance: Appearance) -> Picture:
-        """A picture of the photograph's size."""
-        brighter = 2.0**appearance.exposure
-        if appearance.layer == "photograph":
-            return figures.radiance_to_rgb(_exposed(view.photograph(), appearance))
-        if appearance.layer == "error":
+    def _measured(
+        self, scenery: Scenery, view: View | None, appearance: Appearance, frame_size: tuple[int, int]
+    ) -> Picture | None:
+        """A picture of what was measured at a photograph's pose, in a window; None where it is not known."""
+        layer = appearance.layer
+        if view is None or (layer in OF_POLARIZATION and not view.is_determined):
+            return None
+        if layer == "photograph":
+            picture = figures.radiance_to_rgb(colored(view.photograph(), appearance.presentation.color))
+        elif layer == "error":
+            brighter = 2.0 ** (appearance.presentation.exposure or 0.0)
             final = self._result(scenery, view.camera, appearance).final
-            return figures.error_to_rgb(final * brighter, view.photograph() * brighter)
-        return polarization_picture(OF_POLARIZATION[appearance.layer], view.stokes())
-
-
-def _exposed(radiance: Tensor, appearance: Appearance) -> Tensor:
-    """Radiance [H, W, 3] as bright and in the color that is wanted, linear."""
-    white = appearance.white_balance
-    return colored(
-        radiance,
-        Presentation(white_balance=white, chart=appearance.chart, exposure=appearance.exposure).color,
-    )
+            picture = figures.error_to_rgb(final * brighter, view.photograph() * brighter)
+        else:
+            picture = polarization_picture(OF_POLARIZATION[layer], view.stokes())
+        return letterboxed(picture, frame_size)

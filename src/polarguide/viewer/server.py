@@ -43,8 +43,8 @@ from polarguide.viewer.cameras import Photograph, photographs
 from polarguide.viewer.guard import Gate, guarded
 from polarguide.viewer.messages import Accepts, checked_message
 from polarguide.viewer.painting import Materials, Paintable, kinds_of
-from polarguide.viewer.panel import KINDS, NOTHING, PanelOptions
-from polarguide.viewer.scenery import Scenery, run_scenery, training_scenery
+from polarguide.viewer.panel import KINDS, PanelOptions
+from polarguide.viewer.scenery import UNCHANGED, Scenery, run_scenery, training_scenery
 from polarguide.viewer.session import Session
 
 REFRESH = 1.0  # least seconds between two pictures of a training,
@@ -94,7 +94,7 @@ class Viewer:
         host: str = LOOPBACK[0],
         port: int = 8080,
         visitors: VisitorOptions = VisitorOptions(),
-        presentation: Presentation = NOTHING,
+        presentation: Presentation = UNCHANGED,
         save: Callable[[Presentation], str] | None = None,
         paintable: Paintable | None = None,
         title: str = "polarguide",

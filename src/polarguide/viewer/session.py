@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from polarguide.capture.presentation import PRESENTATION_FILE, Presentation, Vector
@@ -210,12 +209,7 @@ class Session:
     def _save_presentation(self) -> str:
         if self._soon_again("presentation"):
             return "Saved just now"
-        chosen = self._presenting.chosen
-        chosen = msgspec.structs.replace(
-            chosen,
-            crop=self.panel.crop(chosen.up_axis),
-            exposure=float(self.panel["exposure"].value) or None,
-        )
+        chosen = self.panel.presentation(self._presenting.chosen)
         if self._save is not None:
             return self._save(chosen)
         content = to_json(chosen.to_record())
