@@ -217,5 +217,5 @@ def present_folder(
     )
     if scene is not None:
         say(f"the scene of {folder} is {scene}")
-    for line in presenting.described(presented):
+    for line in presenting.presentation_lines(presented):
         say(line)

@@ -117,7 +117,6 @@ class Viewer:
         self._options = PanelOptions(
             layers_of(shading), turns, tuple(photographs), trains, presentation, saves, kinds
         )
-        self._gray: Vector | None = None
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         self._wake = threading.Event()
@@ -157,7 +156,7 @@ class Viewer:
                 self._scene_frame,
                 self._options,
                 self._wake.set,
-                gray_world=self._gray_world,
+                gray_world=lambda: self._gray,
                 save=None if self._save is None else self._saved,
                 paintable=self._paintable,
                 drop=drop,
@@ -171,13 +170,11 @@ class Viewer:
             self._sessions[client.client_id] = session
         self._wake.set()
 
-    def _gray_world(self) -> Vector:
-        """Gains of the photographs' mean, computed on first use."""
-        if self._gray is None:
-            photographs = self._photographs.values()
-            views = [p.view for p in photographs if not p.held_out] or [p.view for p in photographs]
-            self._gray = gray_world(views)
-        return self._gray
+    @functools.cached_property
+    def _gray(self) -> Vector:
+        """Gains of the photographs' mean."""
+        photographs = self._photographs.values()
+        return gray_world([p.view for p in photographs if not p.held_out] or [p.view for p in photographs])
 
     def _saved(self, presentation: Presentation) -> str:
         """Save, so that browsers which come later begin with it."""
@@ -225,15 +222,7 @@ class Viewer:
         deadline = time.monotonic() + timeout
         while True:
             self._wake.clear()
-            due = self._due()
-            if due is not None:
-                session, kind = due
-                began = time.monotonic()
-                try:
-                    session.draw(self._current(), kind)
-                except Exception as error:  # in what one browser asked for
-                    self._drop(session.client_id, error)
-                self._cost = time.monotonic() - began
+            if self._draw_next():
                 return True
             left = deadline - time.monotonic()
             if left <= 0:
@@ -241,18 +230,22 @@ class Viewer:
             # Sharp pictures after a rest and paths that are played become due without an event.
             self._wake.wait(min(left, TICK if self._sessions else 1.0))
 
-    def _due(self) -> tuple[Session, str] | None:
+    def _draw_next(self) -> bool:
+        """Render the picture that has been due for longest; returns whether one was due."""
         with self._lock:
             sessions = sorted(self._sessions.values(), key=lambda session: session.pacing.last_frame)
         for session in sessions:
+            began = time.monotonic()
             try:
                 kind = session.due()
-            except Exception as error:
+                if kind is None:
+                    continue
+                session.draw(self._current(), kind)
+            except Exception as error:  # in what one browser asked for
                 self._drop(session.client_id, error)
-                continue
-            if kind is not None:
-                return session, kind
-        return None
+            self._cost = time.monotonic() - began
+            return True
+        return False
 
     def refresh(self) -> None:
         """Render a changed scene anew, but rarely enough not to slow a training down."""

@@ -27,7 +27,7 @@ from polarguide.viewer.painting import Paintable, Painting
 from polarguide.viewer.panel import FREE_VIEW, Panel, PanelOptions
 from polarguide.viewer.presenting import Presenting
 from polarguide.viewer.scenery import Painter, Scenery
-from polarguide.visualization.figures import Picture, png_bytes
+from polarguide.visualization.figures import png_bytes
 
 REST = 0.25  # seconds without a change after which a sharp picture is rendered
 BUDGET = 0.1  # seconds per picture while the camera moves
@@ -338,7 +338,13 @@ class Session:
             drawn = drawn_camera(viewpoint, view)
             self._painting.act(drawn)
             picture = self._painting.tinted(picture, drawn)
-        self._send(picture, frame_size, sharp=sharp)
+        image = picture
+        if image is None:
+            image = np.full((frame_size[1], frame_size[0], 3), 64, dtype=np.uint8)
+        coding: dict[str, Any] = (
+            {"format": "png"} if sharp else {"format": "jpeg", "jpeg_quality": JPEG_QUALITY}
+        )
+        self._client.scene.set_background_image(image, **coding)
         self._frusta.hide_near(None if view else viewpoint.center.numpy())
         if screenshot and picture is not None:
             self._client.send_file_download(PICTURE_FILE, png_bytes(picture), save_immediately=True)
@@ -347,11 +353,3 @@ class Session:
             self.pacing.end_frame(version, kind, now - began, now)
         note = f"{frame_size[0]} x {frame_size[1]} in {1000 * (now - began):.0f} ms"
         self.panel.show_status(scenery.status, NO_LAYER if picture is None else note)
-
-    def _send(self, picture: Picture | None, frame_size: tuple[int, int], *, sharp: bool) -> None:
-        if picture is None:
-            picture = np.full((frame_size[1], frame_size[0], 3), 64, dtype=np.uint8)
-        if sharp:
-            self._client.scene.set_background_image(picture, format="png")
-        else:
-            self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)

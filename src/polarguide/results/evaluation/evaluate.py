@@ -384,13 +384,10 @@ def _speed(run: ScoredRun, *, normals: bool = True, depth: bool = False) -> floa
     return frames_per_second(draw, run.scene.test_views)
 
 
-def _device(device: torch.device) -> str:
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else _native.simd()
-    return f"{device} ({name}, {_native.thread_count()} threads)"
-
-
 def _provenance(run: ScoredRun) -> dict[str, Any]:
     configuration = run.configuration
+    device = run.model.device
+    processor = torch.cuda.get_device_name(device) if device.type == "cuda" else _native.simd()
     return {
         "recipe": configuration.recipe,
         "seed": configuration.settings.seed,
@@ -401,7 +398,7 @@ def _provenance(run: ScoredRun) -> dict[str, Any]:
             "torch": torch.__version__,
             "python": platform.python_version(),
         },
-        "device": _device(run.model.device),
+        "device": f"{device} ({processor}, {_native.thread_count()} threads)",
         "downscale": configuration.downscale,
         "scene_hash": run.scene.digest,
         "scene": run.scene.name,

@@ -31,7 +31,7 @@ from polarguide.core.files import require_folder
 from polarguide.core.options import DeviceName, PathLike
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import decode
-from polarguide.core.text import command, decimal
+from polarguide.core.text import command, decimals
 from polarguide.results.rendering.chart import chart_of
 from polarguide.results.rendering.picking import gains_of, gray_world, photograph_color, surface_at
 from polarguide.runs.folder import CONFIGURATION
@@ -88,32 +88,28 @@ def present(
     Raises:
         PolarguideError: no such folder, or a value that cannot be read; nothing is written then.
     """
-    place = _Place(Path(folder), device, reporter)
+    place = _PresentedFolder(Path(folder), device, reporter)
     if scene is not None:
         place.move_scene(scene)
     own = read_presentation(place.folder)
     changes: dict[str, Any] = {}
-    if white_balance is not None:
-        changes["white_balance"] = None if white_balance == "none" else _white_balance(white_balance, place)
-    if chart is not None:
-        changes["chart"] = None if chart == "none" else _chart(chart, place)
-    if exposure is not None:
-        wanted = "stops such as 0.5, or none"
-        changes["exposure"] = (
-            None if exposure == "none" else _require_numbers(exposure, 1, "exposure", wanted)[0]
-        )
-    if up_axis is not None:
-        changes["up_axis"] = None if up_axis == "none" else _up_axis(up_axis, place)
+    parsers = {
+        "white_balance": (_white_balance, white_balance),
+        "chart": (_chart, chart),
+        "exposure": (_exposure, exposure),
+        "up_axis": (_up_axis, up_axis),
+    }
+    for name, (parse, text) in parsers.items():
+        if text is not None:
+            changes[name] = None if text == "none" else parse(text, place)
     if points or distance is not None or meters_per_unit is not None:
         changes["meters_per_unit"] = _scale(points, distance, meters_per_unit, place)
     if crop is not None:
         up = changes["up_axis"] if "up_axis" in changes else place.shown(own).up_axis
         changes["crop"] = None if crop in ("none", "all") else _crop(crop, up)
         changes["whole"] = crop == "all"
-    texts = {"title": title, "author": author, "license": license, "provenance": provenance}
-    changes |= {
-        name: "" if (text := texts[name]) == "none" else text for name in CREDITS if texts[name] is not None
-    }
+    credits = {"title": title, "author": author, "license": license, "provenance": provenance}
+    changes |= {name: "" if text == "none" else text for name, text in credits.items() if text is not None}
     place.refuse_inherited(_removed(changes))
     unchanged = {name: value for name, value in own.to_record().items() if name not in _replaced(changes)}
     record = {**unchanged, **{name: msgspec.to_builtins(value) for name, value in changes.items()}}
@@ -123,7 +119,7 @@ def present(
     return place.shown(decoded)
 
 
-class _Place:
+class _PresentedFolder:
     """A scene's or a run's folder, read as far as needed."""
 
     def __init__(self, folder: Path, device: DeviceName, reporter: Reporter) -> None:
@@ -186,8 +182,8 @@ class _Place:
     def pixel(self, text: str) -> tuple[str, float, float] | None:
         """A view and a place in it, if the text is VIEW,X,Y."""
         name, *numbers = text.rsplit(",", 2)
-        places = _numbers(",".join(numbers))
-        if len(places) != 2 or (_numbers(name) and name not in find_layout(self._scene_folder).names):
+        places = decimals(",".join(numbers))
+        if len(places) != 2 or (decimals(name) and name not in find_layout(self._scene_folder).names):
             return None
         return name, places[0], places[1]
 
@@ -224,13 +220,13 @@ class _Place:
         pixel = self.pixel(text)
         if pixel is not None:
             return self.surface(*pixel, "points")[0]
-        numbers = _numbers(text)
+        numbers = decimals(text)
         if len(numbers) == 3:
             return torch.tensor(numbers, dtype=torch.float64)
         return read_model(self._scene_folder).camera(text).center
 
 
-def _white_balance(text: str, place: _Place) -> Vector | None:
+def _white_balance(text: str, place: _PresentedFolder) -> Vector | None:
     if text == "gray":
         return gray_world(place.scene.train_views)
     if (pixel := place.pixel(text)) is not None:
@@ -254,10 +250,10 @@ def _removed(changes: dict[str, Any]) -> list[str]:
     return [name for name in changes if changes[name] in NOTHING and name not in _replaced(changes)]
 
 
-def _chart(text: str, place: _Place) -> Chart:
+def _chart(text: str, place: _PresentedFolder) -> Chart:
     expected = "none, VIEW and the four corners X,Y,X,Y,X,Y,X,Y, or a folder with a chart"
     name, *numbers = text.rsplit(",", 8)
-    corners = _numbers(",".join(numbers))
+    corners = decimals(",".join(numbers))
     if len(corners) == 8:
         return chart_of(place.scene.view(name), corners)
     other = read_presentation(Path(text)).chart if Path(text).is_dir() else None
@@ -266,7 +262,11 @@ def _chart(text: str, place: _Place) -> Chart:
     return other
 
 
-def _up_axis(text: str, place: _Place) -> Vector | None:
+def _exposure(text: str, place: _PresentedFolder) -> float:
+    return _require_numbers(text, 1, "exposure", "stops such as 0.5, or none")[0]
+
+
+def _up_axis(text: str, place: _PresentedFolder) -> Vector | None:
     if (axis := AXES.get(text.removeprefix("-").removeprefix("+").lower())) is not None:
         sign = -1.0 if text.startswith("-") else 1.0
         return sign * axis[0], sign * axis[1], sign * axis[2]
@@ -282,7 +282,7 @@ def _up_axis(text: str, place: _Place) -> Vector | None:
 
 
 def _scale(
-    points: Sequence[str], distance: str | None, meters_per_unit: str | None, place: _Place
+    points: Sequence[str], distance: str | None, meters_per_unit: str | None, place: _PresentedFolder
 ) -> float | None:
     if meters_per_unit is not None:
         if points or distance is not None:
@@ -306,21 +306,13 @@ def _crop(text: str, up: Vector | None) -> dict[str, Any]:
     return {"low": (left, down, front), "high": (right, above, back), "up": up}
 
 
-def _numbers(text: str) -> list[float]:
-    """Numbers separated by commas; an empty list where the text is something else."""
-    try:
-        return [decimal(part) for part in text.split(",")]
-    except ValueError:
-        return []
-
-
-def _require_numbers(text: str, count: int, where: str, expected: str) -> list[float]:
+def _require_numbers(text: str, count: int, where: str, expected: str) -> tuple[float, ...]:
     """So many numbers separated by commas.
 
     Raises:
         PolarguideError: the text is something else.
     """
-    numbers = _numbers(text)
+    numbers = decimals(text)
     if len(numbers) != count:
         raise _wrong(where, expected, text)
     return numbers
@@ -330,7 +322,7 @@ def _wrong(where: str, expected: str, found: str) -> PolarguideError:
     return PolarguideError(where, expected=expected, found=found, remedy="Correct the value.")
 
 
-def described(presentation: Presentation) -> list[str]:
+def presentation_lines(presentation: Presentation) -> list[str]:
     """The fields that are set, a line each; "nothing is set" for an empty presentation."""
     chart = presentation.chart
     exposure = presentation.exposure

@@ -89,7 +89,8 @@ def subject_of(run: OpenedRun, *, masked: bool = False) -> Subject:
         return Subject(_in_masks(run), "what most of the scene's masks show")
     if presentation.whole:
         return Subject(None, "everything")
-    return Subject(_looked_at([*run.poses.values()]), "what most of the cameras have in their pictures")
+    everywhere = [(camera, None) for camera in run.poses.values()]
+    return Subject(_by_majority(everywhere), "what most of the cameras have in their pictures")
 
 
 def part_shown(run: OpenedRun, reporter: Reporter) -> Within:
@@ -109,25 +110,25 @@ def part_shown(run: OpenedRun, reporter: Reporter) -> Within:
 
 
 def _in_masks(run: OpenedRun) -> Inside:
-    masks = [(view.camera, view.mask.cpu()) for view in run.scene.views if view.mask is not None]
+    return _by_majority([(view.camera, view.mask.cpu()) for view in run.scene.views if view.mask is not None])
+
+
+def _by_majority(views: Sequence[tuple[Camera, Tensor | None]]) -> Inside:
+    """A place is inside if more views vote for it than against it.
+
+    Args:
+        views: cameras, and masks [H, W] bool. A view votes against places outside its mask, and abstains outside its
+            picture; without a mask it votes against places outside its picture.
+    """
 
     def inside(places: NDArray[Any]) -> NDArray[np.bool_]:
         points = torch.from_numpy(places)
         votes = torch.zeros(len(points))
-        for camera, mask in masks:
+        for camera, mask in views:
             pixel, _, in_picture = seen_at(points - camera.center, camera)
-            votes += in_picture * torch.where(mask[pixel], 1.0, -1.0)
+            votes += torch.where(in_picture if mask is None else mask[pixel], 1.0, -1.0) * (
+                1.0 if mask is None else in_picture
+            )
         return np.asarray((votes > 0).numpy())
-
-    return inside
-
-
-def _looked_at(cameras: Sequence[Camera]) -> Inside:
-    def inside(places: NDArray[Any]) -> NDArray[np.bool_]:
-        points = torch.from_numpy(places)
-        count = torch.zeros(len(points))
-        for camera in cameras:
-            count += seen_at(points - camera.center, camera)[2]
-        return np.asarray((2 * count > len(cameras)).numpy())
 
     return inside
