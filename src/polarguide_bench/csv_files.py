@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pandas as pd
 
-from polarguide.core.text import plain
+from polarguide.core.text import csv_value
 from polarguide.results.evaluation.table import METAL_SHARE, METRICS
 
 
 def csv_text(frame: pd.DataFrame) -> str:
     """A frame in full precision, with the numbers that pages show; nothing in it is a formula to a spreadsheet."""
-    return in_shown_units(frame).map(plain).to_csv(index=False, lineterminator="\n")
+    return in_shown_units(frame).map(csv_value).to_csv(index=False, lineterminator="\n")
 
 
 def in_shown_units(frame: pd.DataFrame) -> pd.DataFrame:

@@ -19,7 +19,7 @@ from polarguide.capture.presentation import (
     read_presentation,
     write_presentation,
 )
-from polarguide.results.rendering.picking import gains_of, gray_world, surface_at
+from polarguide.results.rendering.picking import gray_world_gains, surface_at, white_balance_gains
 from polarguide.shading.result import LAYERS
 from polarguide.viewer.messages import Refused, checked_message
 from polarguide.viewer.panel import PanelOptions
@@ -48,7 +48,7 @@ class Visit:
             AROUND,
             options,
             lambda: None,
-            gray_world=lambda: gray_world(views),
+            gray_world=lambda: gray_world_gains(views),
             save=save,
         )
         self.session.go("v0")
@@ -107,7 +107,7 @@ def test_a_picked_white_is_gray_in_the_picture_and_no_click_is_asked_for_any_mor
     place = places(visit)[0]
     before = visit.draw()
     (found,) = visit.pick("white", place)
-    gains = gains_of(found.color)
+    gains = white_balance_gains(found.color)
     assert visit.chosen.white_balance == gains
     gray = found.color * torch.tensor(gains)
     torch.testing.assert_close(gray, gray[1].expand(3))

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from polarguide.cli.console import ConsoleReporter, console, say, use_threads
+from polarguide.cli.console import ConsoleReporter, console, say, set_threads
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import ComputeOptions, ThreadOptions
 from polarguide.core.text import command
@@ -35,7 +35,7 @@ def prepare_capture(
             ordinary photographs, or a dataset.
         out: Scene folder to write.
     """
-    use_threads(compute.threads)
+    set_threads(compute.threads)
     preparation = importlib.import_module("polarguide.preparation.prepare")
     with_angles = replace(settings, calibration=angles.read(), analyzers=angles.analyzers())
     prepared = preparation.prepare_scene(source, out, with_angles, ConsoleReporter())
@@ -82,7 +82,7 @@ def inspect_capture(
             found="both",
             remedy="Prepare the mosaics anew with --calibration, and fix that scene.",
         )
-    use_threads(compute.threads)
+    set_threads(compute.threads)
     reporter = ConsoleReporter()
     inspection = importlib.import_module("polarguide.inspection.inspect")
     folder = inspection.inspection_folder(scene, out)
@@ -195,7 +195,7 @@ def present_folder(
         provenance: Where, when and with what it was captured, or its number in an inventory.
         scene: Where the scene of a run lies now, if it was moved or is on another machine.
     """
-    use_threads(compute.threads)
+    set_threads(compute.threads)
     presenting = importlib.import_module("polarguide.results.rendering.present")
     presented = presenting.present(
         folder,

@@ -71,7 +71,7 @@ def warnings_printed() -> Iterator[None]:
         yield
 
 
-def use_threads(threads: int) -> None:
+def set_threads(threads: int) -> None:
     """Let our kernels, torch and OpenCV use this many threads; 0 leaves their defaults."""
     if threads:
         importlib.import_module("polarguide.raster").use_threads(threads)
@@ -231,7 +231,7 @@ RunFolder = Annotated[Path, tyro.conf.Positional]
 
 def open_run_folder(run: Path, compute: ThreadOptions) -> tuple[Run, ConsoleReporter]:
     """The opened run, on the device of the options (the CPU without such an option), and the console."""
-    use_threads(compute.threads)
+    set_threads(compute.threads)
     reporter = ConsoleReporter()
     return polarguide.open_run(
         run, device=compute.device if isinstance(compute, ComputeOptions) else "cpu", reporter=reporter

@@ -242,14 +242,14 @@ def shortened(value: Any, most: int = 100) -> str:
     return text if len(text) <= most else text[:most] + "..."
 
 
-def first_difference(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
+def first_differing_value(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
     """Where two records differ first, as ``recipe_data.metal_rules.begin``, and both values (None: not recorded)."""
     if isinstance(a, dict) and isinstance(b, dict):
         key = next(key for key in {**a, **b} if a.get(key) != b.get(key))
-        return first_difference(f"{name}.{key}", a.get(key), b.get(key))
+        return first_differing_value(f"{name}.{key}", a.get(key), b.get(key))
     if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
         place = next(place for place, (x, y) in enumerate(zip(a, b, strict=True)) if x != y)
-        return first_difference(f"{name}.{place}", a[place], b[place])
+        return first_differing_value(f"{name}.{place}", a[place], b[place])
     return name, a, b
 
 

@@ -11,7 +11,7 @@ import re
 import signal
 import socket
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
@@ -119,60 +119,40 @@ def sigterm_kept() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def exclusive_lock(path: Path) -> Iterator[None]:
-    """Hold a lock on a file. Child processes inherit it, and keep it if this process is killed.
-
-    Raises:
-        BlockingIOError: another process holds it.
-        OSError: the file cannot be opened, or is a link: what the link leads to is not ours to open.
-    """
-    fcntl = _posix("fcntl")
-    handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
-    with open(handle, "w") as file:
-        if fcntl is not None:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            os.set_inheritable(file.fileno(), True)
-        yield
-
-
-def hold_folder(folder: Path) -> Callable[[], None]:
-    """Lock a folder itself, without a file in it; returns what lets it go. Does nothing where folders have no locks.
-
-    Raises:
-        BlockingIOError: another process holds it.
-    """
-    fcntl = _posix("fcntl")
-    if fcntl is None:
-        return lambda: None
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(handle)
-        raise
-    except OSError:  # a disk of the network without locks
-        pass
-    return lambda: os.close(handle)
-
-
-@contextlib.contextmanager
 def only_writer(lock: Path, *, expected: str, found: str) -> Iterator[None]:
-    """Hold the lock of a folder.
+    """Hold the lock of a folder: a file in it, or the folder itself, on systems that have locks of folders.
+
+    Child processes inherit the lock of a file, and hold it if this process is killed.
 
     Raises:
         PolarguideError: another process holds it; ``expected`` and ``found`` say so.
+        OSError: the file cannot be opened, or is a link, which may lead to a file of somebody else.
     """
-    with contextlib.ExitStack() as stack:
+    fcntl = _posix("fcntl")
+    is_folder = lock.is_dir()
+    if fcntl is None and is_folder:
+        yield
+        return
+    created = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+    handle = os.open(lock, os.O_RDONLY if is_folder else created, 0o666)
+    try:
         try:
-            stack.enter_context(exclusive_lock(lock))
+            if fcntl is not None:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise PolarguideError(
-                lock.parent,
+                lock if is_folder else lock.parent,
                 expected=expected,
                 found=found,
                 remedy="Wait until the other command has ended, or choose another folder with --out.",
             ) from None
+        except OSError:
+            if not is_folder:  # a disk of the network may have no locks of folders
+                raise
+        os.set_inheritable(handle, not is_folder)
         yield
+    finally:
+        os.close(handle)
 
 
 def peak_memory_mib() -> float | None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from polarguide.capture.presentation import Presentation, Vector, shown_length
 from polarguide.core.errors import PolarguideError
-from polarguide.results.rendering.picking import SurfacePoint, gains_of
+from polarguide.results.rendering.picking import SurfacePoint, white_balance_gains
 from polarguide.viewer.panel import AS_PHOTOGRAPHED, GRAY_WORLD, OF_CAMERAS, OF_CHART, PICKED, Panel
 
 LINE_COLOR = (255, 80, 40)
@@ -163,7 +163,7 @@ class Presenting:
 
     def _white_found(self, color: Tensor) -> None:
         try:
-            self._picked_white = gains_of(color)
+            self._picked_white = white_balance_gains(color)
         except PolarguideError as error:
             self._panel.show_note(f"Expected {error.expected}")
             return

@@ -32,7 +32,7 @@ from polarguide.core.options import LOOPBACK, VisitorOptions
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import network_address
 from polarguide.geometry.scene_frame import scene_frame
-from polarguide.results.rendering.picking import gray_world
+from polarguide.results.rendering.picking import gray_world_gains
 from polarguide.runs.model import layers_of
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.painted import FOLDER, read_painted, write_painted
@@ -174,7 +174,9 @@ class Viewer:
     def _gray(self) -> Vector:
         """Gains of the photographs' mean."""
         photographs = self._photographs.values()
-        return gray_world([p.view for p in photographs if not p.held_out] or [p.view for p in photographs])
+        return gray_world_gains(
+            [p.view for p in photographs if not p.held_out] or [p.view for p in photographs]
+        )
 
     def _saved(self, presentation: Presentation) -> str:
         """Save, so that browsers which come later begin with it."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import tyro
 
-from polarguide.cli.console import ConsoleReporter, say, use_threads
+from polarguide.cli.console import ConsoleReporter, say, set_threads
 from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.files import read_rows, stored
 from polarguide.core.options import EXPORT_PACKAGES, SceneOptions, check_finite
@@ -58,7 +58,7 @@ def batch(
         watch: Look for new captures every so many seconds, until Ctrl-C, as at a capture station. A capture begins once
             nothing in its folder has changed from one look to the next.
     """
-    use_threads(settings.threads)
+    set_threads(settings.threads)
     for kind in settings.formats:
         for package in EXPORT_PACKAGES.get(kind, ()):
             require_package(package, f"--formats {kind}")

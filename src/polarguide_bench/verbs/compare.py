@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 import polarguide
-from polarguide.cli.console import ConsoleReporter, say, use_threads
+from polarguide.cli.console import ConsoleReporter, say, set_threads
 from polarguide.core.errors import PolarguideError
 from polarguide.core.text import whole_number
 from polarguide.training.settings import Background, Materials, TrainSettings
@@ -57,7 +57,7 @@ def compare(
         steps: Optimizer steps of every run, without it 5,000, and RECIPE=STEPS for each recipe that takes its own
             number: 5000 gnerp=10000.
     """
-    use_threads(options.threads)
+    set_threads(options.threads)
     common, steps_of = chosen_steps(steps)
     results = polarguide.compare(
         scenes,
@@ -138,7 +138,7 @@ def ablate(
         only: Names of the ablations to take, such as without-normals; all if none is given.
         reference: Recipes to add as first rows, such as 3dgs-dr.
     """
-    use_threads(options.threads)
+    set_threads(options.threads)
     results = polarguide.ablate(
         scenes,
         base,
@@ -166,7 +166,7 @@ def bench(
     Args:
         out: Output folder.
     """
-    use_threads(options.threads)
+    set_threads(options.threads)
     run_bench = importlib.import_module("polarguide_bench.bench").run_bench
     results = run_bench(out, options, reporter=ConsoleReporter())
     if results is None:

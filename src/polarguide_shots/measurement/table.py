@@ -31,7 +31,7 @@ from polarguide.core.files import (
     write_whole,
     writing,
 )
-from polarguide.core.records import decode, first_difference, read_record, shortened, to_json
+from polarguide.core.records import decode, first_differing_value, read_record, shortened, to_json
 from polarguide.core.system import only_writer
 from polarguide.core.text import csv_lines
 from polarguide_shots.measurement.fields import FORMAT, KEYS, Status, Value
@@ -325,7 +325,7 @@ def _holds_measurements(path: Path) -> bool:
 
 
 def _other_settings(path: Path, before: dict[str, Any], now: dict[str, Any]) -> PolarguideError:
-    name, was, is_now = first_difference("", before, now)
+    name, was, is_now = first_differing_value("", before, now)
     return PolarguideError(
         f"{path} ({name[1:]})",
         expected=shortened(was, 200),

@@ -129,7 +129,7 @@ SMALLEST_PIECE = 0.01
 """Pieces with fewer faces than this share of the largest piece are dropped."""
 
 
-def surface_of(box: Box, field: Tensor, weight: Tensor) -> Surface:
+def zero_surface(box: Box, field: Tensor, weight: Tensor) -> Surface:
     """The zero set where enough views looked, without small loose pieces (marching cubes, Lewiner et al. 2003).
 
     Args:
@@ -234,7 +234,7 @@ def fused_surface(
     ]
     box = box_around(points, around.center, around.distance, resolution)
     field, weight = fuse(box, ((camera, samples.depth, samples.mask) for camera, samples in views))
-    return surface_of(box, field, weight), views, box
+    return zero_surface(box, field, weight), views, box
 
 
 def _some(points: Tensor, count: int) -> Tensor:

@@ -99,7 +99,7 @@ def _patch(picture: Tensor, row: int, column: int) -> Tensor:
     return picture[top : row + PATCH + 1, left : column + PATCH + 1]
 
 
-def gains_of(color: Tensor) -> Vector:
+def white_balance_gains(color: Tensor) -> Vector:
     """Gains that make a linear color [3] gray and leave green as it is, as cameras state their white balance.
 
     Raises:
@@ -125,7 +125,7 @@ def gains_of(color: Tensor) -> Vector:
     return gains[0], 1.0, gains[2]
 
 
-def gray_world(views: Iterable[View]) -> Vector:
+def gray_world_gains(views: Iterable[View]) -> Vector:
     """Gains after which the photographs' mean is gray (Buchsbaum 1980), over valid pixels; green stays.
 
     Raises:
@@ -139,4 +139,4 @@ def gray_world(views: Iterable[View]) -> Vector:
         count += int(valid.sum())
     mean = total / max(count, 1)
     # The gains do not depend on how bright the pictures are: black around an object changes nothing.
-    return gains_of(0.5 * mean / max(float(mean.max()), 1e-12))
+    return white_balance_gains(0.5 * mean / max(float(mean.max()), 1e-12))

@@ -58,7 +58,7 @@ UNITS = {
 """What the numbers of each layer mean."""
 
 
-def select_views(scene: Scene, choice: str) -> tuple[View, ...]:
+def views_named(scene: Scene, choice: str) -> tuple[View, ...]:
     """The views of a choice: ``test``, ``train``, ``all``, or names separated by commas.
 
     Raises:
@@ -113,7 +113,7 @@ def write_pictures(
     if out is None:
         require_inside(run.folder, folder)
     names = checked_layers(list(run.layers if layers is None else layers))
-    chosen = select_views(run.scene, views)
+    chosen = views_named(run.scene, views)
     make_folder(folder)
     rows: list[tuple[str, dict[str, Picture]]] = []
     missing: set[str] = set()

@@ -33,7 +33,12 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import decode
 from polarguide.core.text import command, decimals
 from polarguide.results.rendering.chart import chart_of
-from polarguide.results.rendering.picking import gains_of, gray_world, photograph_color, surface_at
+from polarguide.results.rendering.picking import (
+    gray_world_gains,
+    photograph_color,
+    surface_at,
+    white_balance_gains,
+)
 from polarguide.runs.folder import CONFIGURATION
 from polarguide.runs.opened import OpenedRun
 
@@ -228,10 +233,10 @@ class _PresentedFolder:
 
 def _white_balance(text: str, place: _PresentedFolder) -> Vector | None:
     if text == "gray":
-        return gray_world(place.scene.train_views)
+        return gray_world_gains(place.scene.train_views)
     if (pixel := place.pixel(text)) is not None:
         name, x, y = pixel
-        return gains_of(photograph_color(place.scene.view(name), x, y))
+        return white_balance_gains(photograph_color(place.scene.view(name), x, y))
     expected = "none, gray, three gains such as 1.9,1,1.6, or VIEW,X,Y"
     red, green, blue = _require_numbers(text, 3, "white_balance", expected)
     return red, green, blue

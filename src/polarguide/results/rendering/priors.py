@@ -13,7 +13,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder
 from polarguide.core.options import PathLike, check_finite, index_of
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.results.rendering.pictures import CONTACT_SHEET, SHEET_VIEWS, select_views
+from polarguide.results.rendering.pictures import CONTACT_SHEET, SHEET_VIEWS, views_named
 from polarguide.runs.opened import OpenedRun
 from polarguide.training.priors import facing_chromatic, guide_normals
 from polarguide.training.recipe import Priors
@@ -62,7 +62,7 @@ def write_priors(
             found=str(scene.downscale),
             remedy="Give the same factor.",
         )
-    chosen = select_views(scene, views)
+    chosen = views_named(scene, views)
     for view in chosen:
         if not view.is_determined:
             raise view.undetermined("polarization at every pixel")

@@ -58,7 +58,7 @@ def relight(
     around = run.frame
     if panorama is not None:
         picture = in_camera(read_panorama(Path(panorama)), run.presentation.color)
-        texels = texels_of(picture, cubemap, around, RELIT_RESOLUTION)
+        texels = cubemap_of_panorama(picture, cubemap, around, RELIT_RESOLUTION)
         light[cubemap.name] = texels.to(light[cubemap.name].device)
     light[cubemap.name] = turned_cubemap(light[cubemap.name].detach(), around.turn(degrees), RELIT_RESOLUTION)
     if run.model.shading.local_note:
@@ -129,7 +129,9 @@ def panorama(texels: Tensor, cubemap: RadianceCubemap, around: SceneFrame, heigh
 
 
 @torch.no_grad()
-def texels_of(picture: Tensor, cubemap: RadianceCubemap, around: SceneFrame, resolution: int) -> Tensor:
+def cubemap_of_panorama(
+    picture: Tensor, cubemap: RadianceCubemap, around: SceneFrame, resolution: int
+) -> Tensor:
     """Raw texels [6, R, R, 3] of a panorama [H, W, 3] of radiance, as far as raw values can hold it."""
     directions = texel_directions(resolution).double() @ around.panorama_axes()
     x, y, z = directions.unbind(-1)
