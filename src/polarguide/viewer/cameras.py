@@ -124,38 +124,24 @@ FRAMES_PER_SECOND = 30
 MOST_KEYFRAMES = 50
 
 
-class Keyframes:
-    """Keyframes in the order in which they were added, and the smooth path through them.
+def keyframe(camera: Camera, frame_size: tuple[int, int]) -> Camera:
+    """Return a camera with pictures of ``frame_size``, width and height; its vertical field of view is kept."""
+    width, height = frame_size
+    focal = camera.fy * height / camera.height
+    return replace(camera, width=width, height=height, fx=focal, fy=focal, cx=0.5 * width, cy=0.5 * height)
 
-    Args:
-        frame_size: width and height of the pictures of the path.
-    """
 
-    def __init__(self, frame_size: tuple[int, int]) -> None:
-        self._size = frame_size
-        self.cameras: list[Camera] = []
+def keyframe_path(keyframes: list[Camera], seconds: float) -> list[Camera]:
+    """Return the smooth path with ``seconds`` between keyframes; fewer than two keyframes are returned as they are."""
+    if len(keyframes) < 2:
+        return keyframes
+    return interpolated(keyframes, 1 + round((len(keyframes) - 1) * seconds * FRAMES_PER_SECOND))
 
-    def add(self, camera: Camera) -> None:
-        """Append a keyframe, up to ``MOST_KEYFRAMES``; its vertical field of view is kept."""
-        if len(self.cameras) >= MOST_KEYFRAMES:
-            return
-        width, height = self._size
-        focal = camera.fy * height / camera.height
-        self.cameras.append(
-            replace(camera, width=width, height=height, fx=focal, fy=focal, cx=0.5 * width, cy=0.5 * height)
-        )
 
-    def path(self, seconds: float) -> list[Camera]:
-        """The path with ``seconds`` between keyframes; fewer than two keyframes are returned as they are."""
-        if len(self.cameras) < 2:
-            return list(self.cameras)
-        frames = 1 + round((len(self.cameras) - 1) * seconds * FRAMES_PER_SECOND)
-        return interpolated(self.cameras, frames)
-
-    def to_json(self, seconds: float) -> str:
-        """The path as JSON that ``polarguide render --path`` reads."""
-        records = [camera_record(camera) for camera in self.path(seconds)]
-        return json.dumps({"frames_per_second": FRAMES_PER_SECOND, "cameras": records})
+def path_json(path: list[Camera]) -> str:
+    """Return a path as JSON that ``polarguide render --path`` reads."""
+    records = [camera_record(camera) for camera in path]
+    return json.dumps({"frames_per_second": FRAMES_PER_SECOND, "cameras": records})
 
 
 THUMBNAIL = 96  # pixels of the longer side

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from polarguide.capture.presentation import STOPS, Crop, Presentation, Vector
+from polarguide.core.errors import PolarguideError
 from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
 from polarguide.viewer.scenery import MEASURED, UNCHANGED, Appearance
 
@@ -215,11 +216,13 @@ class Panel:
         subscribe(self.caught(act))
 
     def caught(self, act: Callable[[], None]) -> Callable[[Any], None]:
-        """A callback whose errors close this browser's connection and affect no other."""
+        """Return a callback that shows a visitor's mistake as a note; other errors close this browser's connection."""
 
         def called(_: Any) -> None:
             try:
                 act()
+            except PolarguideError as error:
+                self.show_note(f"Expected {error.expected}")
             except Exception as error:
                 self._drop(error)
 

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from polarguide.capture.presentation import Presentation, Vector, shown_length
-from polarguide.core.errors import PolarguideError
 from polarguide.results.rendering.picking import SurfacePoint, white_balance_gains
-from polarguide.viewer.panel import AS_PHOTOGRAPHED, GRAY_WORLD, OF_CAMERAS, OF_CHART, PICKED, Panel
+from polarguide.viewer.panel import GRAY_WORLD, OF_CAMERAS, OF_CHART, PICKED, Panel
 
 LINE_COLOR = (255, 80, 40)
 ASKS = {
@@ -152,21 +151,13 @@ class Presenting:
         if choice == PICKED and self._picked_white is None:
             self._ask("white")
             return
-        try:
-            gains = {AS_PHOTOGRAPHED: None, PICKED: self._picked_white}.get(choice) or (
-                self._gray_world() if choice == GRAY_WORLD else None
-            )
-        except PolarguideError as error:
-            self._panel.show_note(f"Expected {error.expected}")
-            return
+        gains = {PICKED: self._picked_white}.get(choice)
+        if choice == GRAY_WORLD:
+            gains = self._gray_world()
         self._choose(white_balance=gains, chart=self._chart if choice == OF_CHART else None)
 
     def _white_found(self, color: Tensor) -> None:
-        try:
-            self._picked_white = white_balance_gains(color)
-        except PolarguideError as error:
-            self._panel.show_note(f"Expected {error.expected}")
-            return
+        self._picked_white = white_balance_gains(color)
         self._listen("")
         self._choose(white_balance=self._picked_white, chart=None)
         self._panel["white"].value = PICKED

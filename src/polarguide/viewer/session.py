@@ -15,13 +15,16 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame
 from polarguide.viewer.cameras import (
     FRAMES_PER_SECOND,
+    MOST_KEYFRAMES,
     Frusta,
-    Keyframes,
     Photograph,
     ViewPose,
     drawn_camera,
     free_camera,
+    keyframe,
+    keyframe_path,
     move_to_view,
+    path_json,
 )
 from polarguide.viewer.painting import Paintable, Painting
 from polarguide.viewer.panel import FREE_VIEW, Panel, PanelOptions
@@ -142,7 +145,7 @@ class Session:
         self._playing: tuple[float, list[Camera]] | None = None
         first = next(iter(photographs.values())).view.camera
         self._size = first.width, first.height
-        self._keyframes = Keyframes(self._size)
+        self._keyframes: list[Camera] = []
         upright = client.camera.image_width < client.camera.image_height  # as phones are held
         self.panel = panel = Panel(client.gui, options, self._changed, drop, folded=upright)
         self._save = save
@@ -259,27 +262,31 @@ class Session:
 
     def _add_keyframe(self) -> None:
         camera = self._view_pose.view.camera if self._view_pose else self._camera(self._size)
-        self._keyframes.add(camera)
+        if len(self._keyframes) < MOST_KEYFRAMES:
+            self._keyframes.append(keyframe(camera, self._size))
         self._show_count()
 
     def _remove_keyframe(self) -> None:
-        del self._keyframes.cameras[-1:]
+        del self._keyframes[-1:]
         self._show_count()
 
     def _show_count(self) -> None:
-        count = len(self._keyframes.cameras)
+        count = len(self._keyframes)
         seconds = max(0, count - 1) * float(self.panel["seconds"].value)
         self.panel["keyframes"].value = f"{count}" + (f", {seconds:g} s" if count > 1 else "")
 
+    def _path(self) -> list[Camera]:
+        return keyframe_path(self._keyframes, float(self.panel["seconds"].value))
+
     def _save_path(self) -> None:
-        if self._keyframes.cameras and not self._soon_again("path"):
-            text = self._keyframes.to_json(float(self.panel["seconds"].value))
+        if self._keyframes and not self._soon_again("path"):
+            text = path_json(self._path())
             self._client.send_file_download(PATH_FILE, text.encode(), save_immediately=True)
 
     def _play(self) -> None:
         if self._soon_again("play"):
             return
-        path = self._keyframes.path(float(self.panel["seconds"].value))
+        path = self._path()
         if len(path) > 1:
             with self._lock:
                 self._view_pose = self._last_pose = None
@@ -331,7 +338,8 @@ class Session:
         sharp = kind == "sharp"
         if (place := self._presenting.take_click()) is not None:
             appearance = self.panel.appearance(self._presenting.chosen)
-            self._presenting.found(self._painter.point(scenery, viewpoint, appearance, view, place))
+            hit = self._painter.point(scenery, viewpoint, appearance, view, place)
+            self.panel.caught(lambda: self._presenting.found(hit))(None)
         appearance = self.panel.appearance(self._presenting.chosen)
         picture = self._painter.paint(scenery, viewpoint, appearance, view, settled=sharp)
         if self._painting is not None and picture is not None:

@@ -73,9 +73,8 @@ class ErrorSheet:
     def __init__(self, views: int) -> None:
         self._chosen = range(0, views, max(1, math.ceil(views / MOST_VIEWS)))
         self._added = 0
-        self._rows: list[tuple[str, dict[str, Picture]]] = []
-        # Measured (None: not known) and predicted Stokes vectors, and where they count: scales depend on all views.
-        self._stokes: list[tuple[Tensor | None, Tensor | None, Tensor]] = []
+        # Name, pictures, measured and predicted Stokes vectors, and where they count: scales depend on all views.
+        self._rows: list[tuple[str, dict[str, Picture], Tensor | None, Tensor | None, Tensor]] = []
 
     def add(self, view: View, target: ViewTarget, result: RenderResult, stokes: Tensor | None) -> None:
         """Add the next view, if it is one of those that are drawn; ``stokes`` [3, H, W, 3] as it is predicted."""
@@ -96,9 +95,8 @@ class ErrorSheet:
             pictures["normal"] = _heat(angles, target.surface.mask, NORMAL_HIGH)
         keep = target.valid if target.polarized is None else target.polarized
         predicted = None if stokes is None else stokes.cpu().nan_to_num()
-        self._rows.append((view.name, pictures))
         measured = view.stokes() if view.is_determined else None
-        self._stokes.append((measured, predicted, keep.mask.cpu()))
+        self._rows.append((view.name, pictures, measured, predicted, keep.mask.cpu()))
 
     def write(self, path: Path) -> None:
         """Write the sheet; nothing where no view was added."""
@@ -106,11 +104,13 @@ class ErrorSheet:
             return
         ends = {**dict.fromkeys(("final", "specular", "diffuse"), PICTURE_HIGH), "normal": NORMAL_HIGH}
         headings = dict(COLUMNS)
-        if any(measured is not None and predicted is not None for measured, predicted, _ in self._stokes):
+        if any(measured is not None and predicted is not None for _, _, measured, predicted, _ in self._rows):
             brightest, ends["stokes"] = self._draw_polarization()
             headings["measured"] = f"AoLP x DoLP / {brightest:g}"
-        keys = [key for key in COLUMNS if any(key in pictures for _, pictures in self._rows)]
-        rows: list[list[Picture | None]] = [[pictures.get(key) for key in keys] for _, pictures in self._rows]
+        keys = [key for key in COLUMNS if any(key in pictures for _, pictures, *_ in self._rows)]
+        rows: list[list[Picture | None]] = [
+            [pictures.get(key) for key in keys] for _, pictures, *_ in self._rows
+        ]
         bars = {
             key: figures.scale_bar(0.0, end, MAP, "deg" if key == "normal" else "")
             for key, end in ends.items()
@@ -119,7 +119,7 @@ class ErrorSheet:
         bars["photograph"] = figures.color_patch(NOT_COUNTED, "gray: not counted")
         sheet = contact_sheet(
             rows,
-            [name for name, _ in self._rows],
+            [name for name, *_ in self._rows],
             [headings[key] for key in keys],
             footer=[bars[key] for key in keys],
         )
@@ -127,11 +127,11 @@ class ErrorSheet:
 
     def _draw_polarization(self) -> tuple[float, float]:
         """Add the pictures of the polarization; the DoLP that is fully bright, and the end of the errors' scale."""
-        counted = [measured[:, keep] for measured, _, keep in self._stokes if measured is not None]
+        counted = [measured[:, keep] for _, _, measured, _, keep in self._rows if measured is not None]
         degrees = torch.cat([optics.dolp(optics.luminance(values)) for values in counted])
         brightest = min(max(_tenth_above(degrees), BRIGHTEST[0]), BRIGHTEST[1])
         high = _tenth_above(torch.cat([_size(values) for values in counted]))
-        for (_, pictures), (measured, predicted, keep) in zip(self._rows, self._stokes, strict=True):
+        for _, pictures, measured, predicted, keep in self._rows:
             if measured is None:
                 continue
             pictures["measured"] = _polarization(measured, brightest)

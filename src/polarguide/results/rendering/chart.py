@@ -8,7 +8,7 @@ stated as CIEDE2000 of each patch by the matrix that the others give.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -29,6 +29,8 @@ LAB: Floats = np.array([
     (50.63, 51.28, -14.12), (49.57, -29.71, -28.32), (95.19, -1.03, 2.93), (81.29, -0.57, 0.44),
     (66.89, -0.75, -0.06), (50.76, -0.13, 0.14), (35.63, -0.46, -0.48), (20.64, 0.07, -0.46),
 ])  # fmt: skip
+_ORDERS = [[(begin + step * k) % 4 for k in range(4)] for begin in range(4) for step in (1, -1)]
+"""The eight ways to go around four corners."""
 COLUMNS = 6
 ROWS = 4
 XYZ_OF_SRGB: Floats = np.array(
@@ -57,7 +59,7 @@ def chart_of(view: View, corners: Sequence[float]) -> Chart:
     """
     quad = np.array(corners, dtype=np.float64).reshape(4, 2)
     fits = []
-    for order in _orders():
+    for order in _ORDERS:
         colors = _patches(view, quad[order])
         used = np.asarray(np.isfinite(colors).all(axis=1))
         fits.append((_distance(_linear(colors[used], used), colors[used], used), colors, used))
@@ -80,13 +82,6 @@ def chart_of(view: View, corners: Sequence[float]) -> Chart:
         )
     red, green, blue = ((float(a), float(b), float(c)) for a, b, c in matrix)
     return Chart((red, green, blue), float(errors.mean()), float(errors.max()), int(used.sum()), view.name)
-
-
-def _orders() -> Iterator[list[int]]:
-    """The eight ways to go around four corners."""
-    for begin in range(4):
-        for step in (1, -1):
-            yield [(begin + step * k) % 4 for k in range(4)]
 
 
 def _patches(view: View, quad: Floats) -> Floats:
@@ -140,11 +135,14 @@ def _fitted(colors: Floats, used: NDArray[np.bool_]) -> Floats:
 
 def _left_out(colors: Floats, used: NDArray[np.bool_]) -> Floats:
     """CIEDE2000 of each patch that is used, by the matrix of the others."""
-    errors = []
-    for patch in np.flatnonzero(used):
-        one = np.arange(len(LAB)) == patch
-        errors.append(_distance(_fitted(colors[used & ~one], used & ~one), colors[one], one))
-    return np.array(errors)
+    one = np.eye(len(LAB), dtype=bool)
+    others = used & ~one
+    return np.array(
+        [
+            _distance(_fitted(colors[others[k]], others[k]), colors[one[k]], one[k])
+            for k in np.flatnonzero(used)
+        ]
+    )
 
 
 def _skimage() -> Any:

@@ -67,21 +67,17 @@ def write_priors(
         if not view.is_determined:
             raise view.undetermined("polarization at every pixel")
     make_folder(out := Path(out))
-    rows: list[list[Picture]] = []
-    labels: list[str] = []
-    names: list[str] = []
+    rows: list[dict[str, Picture]] = []
     with reporter.track("drawing", len(chosen)) as advance:
         for number, view in enumerate(chosen):
             pictures = prior_pictures(view, run, index, threshold)
-            names = list(pictures)
             for name, picture in pictures.items():
                 figures.write_png(out / f"{view.name}_{name}.png", picture)
-            if len(rows) < SHEET_VIEWS:
-                rows.append(list(pictures.values()))
-                labels.append(view.name)
+            rows = [*rows, pictures][:SHEET_VIEWS]
             advance(number + 1)
     sheet = out / CONTACT_SHEET
-    figures.write_png(sheet, contact_sheet(rows, labels, names))
+    labels = [view.name for view in chosen[:SHEET_VIEWS]]
+    figures.write_png(sheet, contact_sheet([[*row.values()] for row in rows], labels, [*rows[0]]))
     return sheet
 
 

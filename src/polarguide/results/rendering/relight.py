@@ -183,15 +183,22 @@ def read_panorama(path: Path) -> Tensor:
     Raises:
         PolarguideError: no such file, not twice as wide as high, not such a picture, without light, or NaN somewhere.
     """
-    expected = "a panorama of linear radiance, .hdr or .exr, twice as wide as high"
-    remedy = "Give an equirectangular picture."
-    if not path.is_file() or path.suffix.lower() not in (".hdr", ".exr"):
-        found = "no such file" if not path.is_file() else f"a name that ends in {path.suffix or 'nothing'}"
-        raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
-    pixels = read_radiance(path)
-    if pixels.shape[1] != 2 * pixels.shape[0] or pixels.size > 3 * LARGEST:
-        found = f"a picture of shape {list(pixels.shape)}"
-        raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
+    found = ""
+    if not path.is_file():
+        found = "no such file"
+    elif path.suffix.lower() not in (".hdr", ".exr"):
+        found = f"a name that ends in {path.suffix or 'nothing'}"
+    else:
+        pixels = read_radiance(path)
+        if pixels.shape[1] != 2 * pixels.shape[0] or pixels.size > 3 * LARGEST:
+            found = f"a picture of shape {list(pixels.shape)}"
+    if found:
+        raise PolarguideError(
+            path,
+            expected="a panorama of linear radiance, .hdr or .exr, twice as wide as high",
+            found=found,
+            remedy="Give an equirectangular picture.",
+        )
     values = torch.tensor(pixels)
     missing = int(values.isnan().any(dim=-1).sum())
     if missing or not bool((values > 0).any()):
@@ -199,8 +206,6 @@ def read_panorama(path: Path) -> Tensor:
             path,
             expected="a finite value at every pixel, and one above 0",
             found=f"NaN at {missing} of {values[..., 0].numel()} pixels" if missing else "no value above 0",
-            remedy="Export the panorama again."
-            if not missing
-            else "Export the panorama again, or fill these pixels.",
+            remedy="Export the panorama again, or fill these pixels.",
         )
     return values.clamp(0, 6e4)
