@@ -167,14 +167,14 @@ class Photograph:
 def photographs(scene: Scene) -> dict[str, Photograph]:
     """All photographs of a scene, by name of the view."""
     tests = set(scene.test_names)
-    return {view.name: Photograph(view, _thumbnail(view), view.name in tests) for view in scene.views}
-
-
-def _thumbnail(view: View) -> Picture:
-    picture = view.photograph().numpy()
-    scale = min(1.0, THUMBNAIL / max(picture.shape[:2]))
-    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return figures.radiance_to_rgb(torch.from_numpy(small))
+    found = {}
+    for view in scene.views:
+        picture = view.photograph().numpy()
+        scale = min(1.0, THUMBNAIL / max(picture.shape[:2]))
+        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        thumbnail = figures.radiance_to_rgb(torch.from_numpy(small))
+        found[view.name] = Photograph(view, thumbnail, view.name in tests)
+    return found
 
 
 class Frusta:

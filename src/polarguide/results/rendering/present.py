@@ -115,8 +115,13 @@ def present(
         changes["whole"] = crop == "all"
     credits = {"title": title, "author": author, "license": license, "provenance": provenance}
     changes |= {name: "" if text == "none" else text for name, text in credits.items() if text is not None}
-    place.refuse_inherited(_removed(changes))
-    unchanged = {name: value for name, value in own.to_record().items() if name not in _replaced(changes)}
+    replaced = {
+        name for names in EITHER if any(changes.get(n) not in NOTHING for n in names) for name in names
+    }
+    place.refuse_inherited(
+        [name for name, value in changes.items() if value in NOTHING and name not in replaced]
+    )
+    unchanged = {name: value for name, value in own.to_record().items() if name not in replaced}
     record = {**unchanged, **{name: msgspec.to_builtins(value) for name, value in changes.items()}}
     decoded = decode(record, Presentation, "presentation", remedy="Correct the value; nothing was written.")
     if changes:
@@ -165,17 +170,16 @@ class _PresentedFolder:
         """The presentation that applies, with these values of the folder's own."""
         return own.over(read_presentation(self._scene_folder)) if self._is_run else own
 
-    def refuse_inherited(self, names: Any) -> None:
+    def refuse_inherited(self, names: Sequence[str]) -> None:
         """Refuse to remove from a run what its scene says.
 
         Raises:
             PolarguideError: the scene says it.
         """
-        removed = list(names)
-        if not (self._is_run and removed):
+        if not self._is_run:
             return
         above = read_presentation(self._scene_folder)
-        for name in removed:
+        for name in names:
             if getattr(above, name) not in NOTHING:
                 raise PolarguideError(
                     name,
@@ -243,16 +247,6 @@ def _white_balance(text: str, place: _PresentedFolder) -> Vector | None:
 
 
 NOTHING = (None, "", False)
-
-
-def _replaced(changes: dict[str, Any]) -> set[str]:
-    """The fields of ``EITHER`` of which one is given: it takes the other's place."""
-    return {name for names in EITHER if any(changes.get(n) not in NOTHING for n in names) for name in names}
-
-
-def _removed(changes: dict[str, Any]) -> list[str]:
-    """The fields that are taken back without another in their place."""
-    return [name for name in changes if changes[name] in NOTHING and name not in _replaced(changes)]
 
 
 def _chart(text: str, place: _PresentedFolder) -> Chart:
@@ -328,25 +322,28 @@ def _wrong(where: str, expected: str, found: str) -> PolarguideError:
 
 
 def presentation_lines(presentation: Presentation) -> list[str]:
-    """The fields that are set, a line each; "nothing is set" for an empty presentation."""
+    """Return the fields that are set, a line each; "nothing is set" for an empty presentation."""
     chart = presentation.chart
     exposure = presentation.exposure
+    crop = presentation.crop
+    scale = presentation.meters_per_unit
+    sides = (
+        None
+        if crop is None
+        else [100 * side for ends in zip(crop.low, crop.high, strict=True) for side in ends]
+    )
     lines = {
         "white balance": _listed(presentation.white_balance),
         "color chart": chart
         and f"{chart.patches} patches in {chart.view}, CIEDE2000 {chart.delta_e:.1f}, up to {chart.delta_e_worst:.1f}",
         "exposure": f"{exposure:+g} stops" if exposure else "",
         "up axis": _listed(presentation.up_axis),
-        "scale": ""
-        if presentation.meters_per_unit is None
-        else f"1 unit is {shown_length(1.0, presentation.meters_per_unit)}",
+        "scale": "" if scale is None else f"1 unit is {shown_length(1.0, scale)}",
+        "crop": sides and f"{_listed(sides)} % of the cameras' distance",
+        **{name: getattr(presentation, name) for name in CREDITS},
     }
-    if (crop := presentation.crop) is not None:
-        sides = (100 * side for pair in zip(crop.low, crop.high, strict=True) for side in pair)
-        lines["crop"] = f"{_listed(tuple(sides))} % of the cameras' distance"
     if presentation.whole:
         lines["crop"] = "all of the scene"
-    lines |= {name: getattr(presentation, name) for name in CREDITS}
     return [f"{name}: {text}" for name, text in lines.items() if text] or ["nothing is set"]
 
 
