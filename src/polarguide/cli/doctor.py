@@ -81,7 +81,13 @@ def diagnosis() -> dict[str, Any]:
         "kernels": kernels,
         "torch": torch,
         "extras": extras,
-        "machine": _machine(),
+        "machine": {
+            "system": platform.platform(),
+            "processor": platform.machine(),
+            "cores": os.cpu_count(),
+            "free_memory_gib": round(free_memory() / GIB, 1),
+            "free_disk_gib": round(shutil.disk_usage(Path.cwd()).free / GIB, 1),
+        },
         "problems": problems,
         "notes": _notes(torch, extras),
     }
@@ -133,17 +139,6 @@ def _extra(name: str, use: str) -> dict[str, Any]:
         "installed": {each.name: _version(each.name) for each in wanted if each.name not in missing},
         "missing": missing,
         "command": install_extra(name) if missing else None,
-    }
-
-
-def _machine() -> dict[str, Any]:
-    """The system, its processors, and what is free of memory and of the disk of the current folder, in GiB."""
-    return {
-        "system": platform.platform(),
-        "processor": platform.machine(),
-        "cores": os.cpu_count(),
-        "free_memory_gib": round(free_memory() / GIB, 1),
-        "free_disk_gib": round(shutil.disk_usage(Path.cwd()).free / GIB, 1),
     }
 
 

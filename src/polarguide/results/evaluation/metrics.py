@@ -77,7 +77,10 @@ def squared_error(
     Raises:
         ValueError: shapes that do not fit.
     """
-    pred, true = _selected_values(pred_linear, true_linear, keep)
+    _check_pair(pred_linear, true_linear)
+    selection = _selected(keep, pred_linear)
+    pred = selection.pick(pred_linear.to(torch.float64))
+    true = selection.pick(true_linear.to(pred_linear.device, torch.float64))
     if aligned:
         energy = (pred * pred).sum(0)
         lit = energy > 0
@@ -200,13 +203,6 @@ def _selected_angles(pred: Tensor, true: Tensor, keep: Keep) -> Tensor:
         directed = has_direction(true)
         keep = directed if keep is None else directed & keep.to(directed.device)
     return _selected(keep, pred).pick(normal_angles_deg(pred, true))
-
-
-def _selected_values(pred: Tensor, true: Tensor, keep: Keep) -> tuple[Tensor, Tensor]:
-    """The pixels that count as [P, C] float64, on the device of the prediction."""
-    _check_pair(pred, true)
-    selection = _selected(keep, pred)
-    return selection.pick(pred.to(torch.float64)), selection.pick(true.to(pred.device, torch.float64))
 
 
 def _selected(keep: Keep, picture: Tensor) -> Selection:

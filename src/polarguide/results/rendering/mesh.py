@@ -228,18 +228,13 @@ def fused_surface(
     optional_import("skimage.measure", "a mesh")
     views = [(camera, _depth_samples(render(camera).to("cpu"), camera)) for camera in cameras.values()]
     around = scene_frame(list(cameras.values()))
-    points = [
-        _some(seen_points(camera, samples.depth, samples.mask), _BOX_POINTS // len(views))
-        for camera, samples in views
-    ]
+    points = []
+    for camera, samples in views:
+        places = seen_points(camera, samples.depth, samples.mask)
+        points.append(places[:: max(1, -(-len(places) // (_BOX_POINTS // len(views))))].clone())
     box = box_around(points, around.center, around.distance, resolution)
     field, weight = fuse(box, ((camera, samples.depth, samples.mask) for camera, samples in views))
     return zero_surface(box, field, weight), views, box
-
-
-def _some(points: Tensor, count: int) -> Tensor:
-    """At most ``count`` of points [M, 3], evenly."""
-    return points[:: max(1, -(-len(points) // count))].clone()
 
 
 @dataclass(frozen=True, eq=False)

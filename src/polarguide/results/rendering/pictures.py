@@ -194,18 +194,18 @@ def _sheet(
     """
     titles = [column for name in names for column in (name, true_name(name), f"{name}, measured")]
     columns = [column for column in titles if all(column in cells for _, cells in views)]
-    even = [column for column in columns if all(_is_even(cells[column]) for _, cells in views)]
+    # One level of difference is rounding.
+    even = [
+        column
+        for column in columns
+        if all(np.ptp(cells[column].reshape(-1, 3), axis=0).max() <= 1 for _, cells in views)
+    ]
     columns = [column for column in columns if column not in even] or columns
     if even and columns != even:
         caption = f"{caption}; left out, the same everywhere: {', '.join(even)}"
     rows = [[cells[column] for column in columns] for _, cells in views]
     scales = [layer_scale(column, depths) for column in columns]
     return contact_sheet(rows, [name for name, _ in views], columns, footer=scales, caption=caption)
-
-
-def _is_even(picture: Picture) -> bool:
-    """Whether all pixels are one color, but for rounding."""
-    return int(np.ptp(picture.reshape(-1, 3), axis=0).max()) <= 1
 
 
 def _unblended(result: RenderResult) -> RenderResult:
