@@ -1,4 +1,7 @@
-"""Records that are read back from JSON: validated by msgspec, with the file and the value found in every message."""
+"""Reading and validation of JSON records with msgspec.
+
+Every message names the file, the field, and the value at fault.
+"""
 
 from __future__ import annotations
 
@@ -22,19 +25,20 @@ _NAMES = {
     "BoolType": "true or false", "FloatType": "a number", "IntType": "a whole number", "NoneType": "null",
     "StrType": "text", "ListType": "a list", "TupleType": "a list", "VarTupleType": "a list",
 }  # fmt: skip
-"""Names of types by class of ``msgspec.inspect``; all others are JSON objects."""
+"""Names of types in messages by class of ``msgspec.inspect``; all others are JSON objects."""
 _LARGEST_INTEGER = 1 << 63
 _DEEPEST = 50
 LARGEST_RECORD = 1 << 26
-"""Bytes of a JSON file; what they decode to takes some twenty times as much."""
+"""Largest size of a JSON file in bytes. Decoded data takes about twenty times as much memory."""
 
 
 def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
-    """A record from a JSON file.
+    """Read a record from a JSON file.
 
     Args:
-        path: the file. kind: a type that msgspec knows: a ``Struct``, a dataclass, ``dict[str, Any]``, ...
-        remedy: what to do about a file that is wrong.
+        path: the file.
+        kind: a type that msgspec supports: a ``Struct``, a dataclass, ``dict[str, Any]``, ...
+        remedy: advice for the message about an invalid file.
 
     Raises:
         PolarguideError: the file cannot be read, or ``decode`` rejects it.
@@ -43,24 +47,26 @@ def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
 
 
 def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = CORRECT) -> T:
-    """A record from JSON.
+    """Convert JSON to a record.
 
-    Numbers have to be finite, true and false are no numbers, and no key may stand twice. Keys that a type does not
-    have are passed over, unless it forbids them.
+    Numbers must be finite, Booleans are not numbers, and keys must be unique. Unknown keys are ignored unless the
+    type
+    forbids them.
 
     Args:
-        data: JSON text as bytes, or what JSON text has been parsed to.
-        kind: a type that msgspec knows.
-        where: the file or flag, for messages. remedy: what to do about data that is wrong.
+        data: JSON text as bytes, or parsed JSON.
+        kind: a type that msgspec supports.
+        where: file or option for messages.
+        remedy: advice for the message about invalid data.
 
     Raises:
-        PolarguideError: the data are not JSON, or not of this type; the message names the field and the value.
+        PolarguideError: the data is not JSON, or does not fit the type.
     """
     value = parse(data, where, remedy=remedy) if isinstance(data, bytes) else data
     try:
         _require_shallow(value)
         record = msgspec.convert(value, kind)
-    except PolarguideError as error:  # of a type's own check
+    except PolarguideError as error:  # raised by a check of the type itself
         place = f"{where} ({error.where})"
         raise PolarguideError(place, expected=error.expected, found=error.found, remedy=remedy) from None
     except msgspec.ValidationError:
@@ -76,10 +82,12 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
 
 
 def parse(data: bytes, where: object, *, remedy: str = CORRECT) -> Any:
-    """The values of JSON text, of any type. NaN and infinity are let through: ``decode`` checks the fields of a type.
+    """Parse JSON text to values of any type.
+
+    NaN and infinity are accepted: ``decode`` checks them in the fields of a type.
 
     Raises:
-        PolarguideError: the data are not JSON, or a key stands there twice.
+        PolarguideError: the data is not JSON, or a key occurs twice.
     """
     try:
         value = json.loads(data, object_pairs_hook=_each_once)
@@ -92,10 +100,10 @@ def parse(data: bytes, where: object, *, remedy: str = CORRECT) -> Any:
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON; JSON leaves open which of two values of one key holds, and programs differ.
+    """Return a JSON object. The JSON standard does not define the meaning of a repeated key.
 
     Raises:
-        ValueError: a key stands there twice.
+        ValueError: a key occurs twice.
     """
     record = dict(pairs)
     if len(record) < len(pairs):
@@ -107,10 +115,10 @@ def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _require_shallow(value: Any) -> None:
-    """Refuse lists in lists in lists, which take more of the stack than there is.
+    """Refuse deeply nested data, which would exceed the recursion limit.
 
     Raises:
-        RecursionError: the lists are nested more deeply than any record of ours.
+        RecursionError: the data is nested more deeply than any record of ours.
     """
     level = [value]
     for _ in range(_DEEPEST):
@@ -128,18 +136,19 @@ def _require_shallow(value: Any) -> None:
 
 
 def option_name(field: str) -> str:
-    """The command line's option that sets a field."""
+    """Return the command-line option that sets a field."""
     return "--" + field.replace("_", "-")
 
 
 def check_options(options: Any, name: Callable[[str], str] = option_name) -> None:
-    """Check the values of a dataclass against its annotations.
+    """Validate the values of a dataclass against its annotations.
 
     Args:
-        options: the dataclass. name: what messages call a field.
+        options: the dataclass.
+        name: returns the name of a field for messages.
 
     Raises:
-        PolarguideError: one has another type or is out of range.
+        PolarguideError: a value has the wrong type or is out of range.
     """
     remedy = "Correct the value."
     values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
@@ -154,7 +163,7 @@ def check_options(options: Any, name: Callable[[str], str] = option_name) -> Non
 
 
 def to_json(content: Any) -> bytes:
-    """A record as the text of a JSON file; names of files that are no Unicode become escapes in it."""
+    """Return a record as a JSON file. Names of files that are not valid Unicode become escapes."""
     try:
         return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
     except UnicodeEncodeError:
@@ -200,7 +209,7 @@ def _parts(value: Any, kind: Any) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _mismatched_fields(value: Any, options: Any) -> tuple[str, str] | None:
-    """Return the expected and the found fields of a JSON object; None: its fields have the right names."""
+    """Return the expected and the found fields of a JSON object, or None if the names of its fields are right."""
     for option in options:
         fields = {field.encode_name: field.required for field in getattr(option, "fields", ())}
         if fields and isinstance(value, dict):
@@ -215,7 +224,7 @@ def _mismatched_fields(value: Any, options: Any) -> tuple[str, str] | None:
 
 
 def _described(value: Any, options: Any) -> str:
-    """Return the expected types of a value as text, or their limits if it has one of the types."""
+    """Return the expected types of a value as text, or the limits if the value has one of these types."""
     names = []
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if number and _LARGEST_INTEGER <= abs(value) < math.inf:
@@ -237,13 +246,16 @@ def _described(value: Any, options: Any) -> str:
 
 
 def shortened(value: Any, most: int = 100) -> str:
-    """A value as JSON, cut where it is long."""
+    """Return a value as JSON, truncated to ``most`` characters."""
     text = json.dumps(value, ensure_ascii=False, default=str)
     return text if len(text) <= most else text[:most] + "..."
 
 
 def first_differing_value(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
-    """Where two records differ first, as ``recipe_data.metal_rules.begin``, and both values (None: not recorded)."""
+    """Return the first field in which two records differ, and both values (None: not recorded).
+
+    A field of a nested record is named by its path, such as ``recipe_data.metal_rules.begin``.
+    """
     if isinstance(a, dict) and isinstance(b, dict):
         key = next(key for key in {**a, **b} if a.get(key) != b.get(key))
         return first_differing_value(f"{name}.{key}", a.get(key), b.get(key))
@@ -265,10 +277,10 @@ def _limits(option: Any) -> str:
 
 
 def _require_finite(value: Any, where: object, remedy: str, path: str = "") -> None:
-    """Refuse NaN and infinity, which Python's JSON reads although JSON has no such numbers.
+    """Refuse NaN and infinity. Python's JSON parser accepts them although JSON has no such numbers.
 
     Raises:
-        PolarguideError: there is one.
+        PolarguideError: a number is not finite.
     """
     if isinstance(value, float) and not math.isfinite(value):
         place = f"{where} ({path.lstrip('.')})" if path else where

@@ -1,4 +1,4 @@
-"""Signals, memory and processes, what only some operating systems offer, and variables that would end a process."""
+"""Signals, locks, memory, processes, and validation of environment variables."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ MOST_PROCESSES = 65536
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
 NEARLY = 0.9
-"""Share of a memory limit from which on freed memory is given back."""
+"""Share of a memory limit above which freed memory is returned to the system."""
 GROWTH = 1.05
-"""Factor on the memory of the largest step, from which on freed memory is given back again."""
+"""Factor on the memory of the largest step above which freed memory is returned again."""
 SETTLED = 3
 """Number of steps that determine the memory of the largest step."""
 PARTLY = 0.5
-"""Of a limit, from which on ``MemoryBound.clear`` gives freed memory back."""
+"""Share of a memory limit above which ``MemoryBound.clear`` returns freed memory."""
 _NOT_BUSY = {"idle", "iowait", "guest", "guest_nice"}
-"""Times of processors that pass without work, or that are counted as time of users as well."""
+"""Processor times without work, and times that are counted as user time as well."""
 
 Item = TypeVar("Item")
 
 
 def _posix(module: str) -> Any | None:
-    """A module of the standard library that POSIX systems alone have."""
+    """Return a module of the standard library that only POSIX systems have, else None."""
     try:
         return importlib.import_module(module)
     except ImportError:
@@ -50,7 +50,7 @@ def _posix(module: str) -> Any | None:
 
 
 def stop_signals() -> list[int]:
-    """SIGTERM; and SIGHUP, of a terminal that goes away, unless it is ignored (nohup) or there is none."""
+    """Return SIGTERM, and SIGHUP unless it is ignored (nohup) or does not exist."""
     signals = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     return [
         number for number in signals if signal.getsignal(number) != signal.SIG_IGN or number == signal.SIGTERM
@@ -61,23 +61,23 @@ _interrupts: list[int] = []
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """A handler of signals that raises KeyboardInterrupt, as Python's own does, and takes note of it.
+    """Raise KeyboardInterrupt as Python's own signal handler does, and record the signal.
 
-    Packages lose it: what they import while it comes looks broken, and says nothing of the reason.
+    Packages may catch the exception during an import and raise another error.
     """
     _interrupts.append(number)
     signal.default_int_handler(number, frame)
 
 
 def interrupts() -> int:
-    """How many signals ``interrupt`` has taken in this process."""
+    """Return the number of signals that ``interrupt`` has handled in this process."""
     return len(_interrupts)
 
 
 class StopSignals:
-    """A context in which Ctrl-C, SIGTERM and SIGHUP ask work to stop; the object is a training's ``should_stop``.
+    """Context in which Ctrl-C, SIGTERM and SIGHUP request a stop; the object is a training's ``should_stop``.
 
-    Before it is called for the first time, and at a second Ctrl-C, they interrupt at once.
+    The signals interrupt at once before the first call of the object, and at a second Ctrl-C.
     """
 
     def __init__(self) -> None:
@@ -101,7 +101,7 @@ class StopSignals:
                 interrupt(number, frame)
             self._stopping = True
         elif number == signal.SIGTERM and process_count() > 1:
-            # torchrun ends the others when one process is lost: first one of them has to say what happened.
+            # torchrun ends the other processes when one is lost: leave that process time for its message.
             timer = threading.Timer(LAST_WORDS_SECONDS, os._exit, (128 + number,))
             timer.daemon = True
             timer.start()
@@ -111,7 +111,7 @@ class StopSignals:
 
 @contextlib.contextmanager
 def sigterm_kept() -> Iterator[None]:
-    """Keep the handler of SIGTERM, which some libraries replace as they are loaded."""
+    """Restore the handler of SIGTERM, which some libraries replace when they are loaded."""
     handler = signal.getsignal(signal.SIGTERM)
     yield
     if handler is not None and threading.current_thread() is threading.main_thread():
@@ -120,12 +120,16 @@ def sigterm_kept() -> Iterator[None]:
 
 @contextlib.contextmanager
 def only_writer(lock: Path, *, expected: str, found: str) -> Iterator[None]:
-    """Hold the lock of a folder: a file in it, or the folder itself, on systems that have locks of folders.
+    """Hold the lock of a folder: a file in it, or the folder itself on systems that support this.
 
     Child processes inherit the lock of a file, and hold it if this process is killed.
 
+    Args:
+        lock: the file or folder.
+        expected, found: fields of the error message.
+
     Raises:
-        PolarguideError: another process holds it; ``expected`` and ``found`` say so.
+        PolarguideError: another process holds the lock.
         OSError: the file cannot be opened, or is a link, which may lead to a file of somebody else.
     """
     fcntl = _posix("fcntl")
@@ -147,7 +151,7 @@ def only_writer(lock: Path, *, expected: str, found: str) -> Iterator[None]:
                 remedy="Wait until the other command has ended, or choose another folder with --out.",
             ) from None
         except OSError:
-            if not is_folder:  # a disk of the network may have no locks of folders
+            if not is_folder:  # some network disks do not support locks of folders
                 raise
         os.set_inheritable(handle, not is_folder)
         yield
@@ -156,7 +160,7 @@ def only_writer(lock: Path, *, expected: str, found: str) -> Iterator[None]:
 
 
 def peak_memory_mib() -> float | None:
-    """The most memory in MiB that this process has held at a time, or None where the system does not tell."""
+    """Return the peak memory of this process in MiB, or None if the system does not report it."""
     resource = _posix("resource")
     if resource is None:
         return None
@@ -165,25 +169,24 @@ def peak_memory_mib() -> float | None:
 
 
 def resident_memory() -> int:
-    """Bytes of memory that this process holds now."""
+    """Return the resident memory of this process in bytes."""
     return int(psutil.Process().memory_info().rss)
 
 
 def return_freed_memory() -> None:
-    """Give what has been freed back to the system, where the allocator is glibc's."""
+    """Return freed memory to the system if the allocator is that of glibc."""
     with contextlib.suppress(AttributeError, OSError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 class MemoryBound:
-    """Gives freed memory back to the system where this process comes to hold nearly as much as it may, or half of it
-    before other work.
+    """Memory limit of a process, near which freed memory is returned to the system.
 
-    An allocator that keeps what is freed (``keep_freed_memory``) holds ever more where sizes change, as with each
-    growth of the Gaussians: pieces of former sizes lie free between those in use.
+    The allocator keeps freed memory (``keep_freed_memory``). When sizes change, as with the number of Gaussians, free
+    blocks of old sizes remain between used ones.
 
     Args:
-        limit: bytes that the process may hold; without one, nothing is done.
+        limit: bytes that the process may hold; infinity: memory is never returned.
     """
 
     def __init__(self, limit: float = math.inf) -> None:
@@ -194,9 +197,9 @@ class MemoryBound:
         self._waits = 0
 
     def keep(self) -> None:
-        """Call once per step, when allocations of successive steps have similar sizes."""
+        """Return freed memory near the limit. Call it once per step, when steps allocate similar sizes."""
         resident = resident_memory()
-        if self._waits:  # steps take what they need again: under the most of it there is nothing to return
+        if self._waits:  # steps allocate up to the largest of them again, so nothing can be returned below it
             self._most = max(self._most, resident)
             self._waits -= 1
             self._bound = min(max(self._least, GROWTH * self._most), self._limit)
@@ -206,14 +209,14 @@ class MemoryBound:
             self._waits = SETTLED
 
     def clear(self) -> None:
-        """Call between two operations whose allocations have different sizes, such as a view's targets and a step."""
+        """Return freed memory above half of the limit. Call it between operations that allocate different sizes."""
         if resident_memory() > PARTLY * self._limit:
             return_freed_memory()
 
     def between(self, items: Iterable[Item]) -> Iterator[Item]:
-        """The items, with ``clear`` called before each and after the last.
+        """Yield the items, with ``clear`` called before each and after the last.
 
-        What is kept of one would otherwise lie between gaps that the work on those before it has left.
+        This avoids fragmentation: memory that is kept for an item does not lie between blocks freed by earlier items.
         """
         iterator = iter(items)
         while True:
@@ -229,10 +232,11 @@ UNBOUNDED = MemoryBound()
 
 
 def keep_freed_memory() -> None:
-    """Tell the allocator, for the rest of this process, to keep what is freed; only glibc's can.
+    """Configure glibc's allocator to keep freed memory for the rest of this process.
 
-    Each step of a training frees and asks for the same hundred megabytes, which glibc would hand to the system and
-    fetch again, page by page, cleared. A process that is ours alone calls this, never a module as it is imported.
+    Each training step frees and allocates the same hundred megabytes. By default glibc returns them to the system,
+    which
+    clears the pages again. Only the entry points of programs call this, not modules during import.
     """
     try:
         libc = ctypes.CDLL(None)
@@ -241,23 +245,23 @@ def keep_freed_memory() -> None:
         return
     libc.mallopt(M_TRIM_THRESHOLD, -1)  # never
     if not libc.mallopt(M_MMAP_THRESHOLD, 1 << 30):
-        libc.mallopt(M_MMAP_THRESHOLD, 1 << 25)  # the most that older versions take
+        libc.mallopt(M_MMAP_THRESHOLD, 1 << 25)  # the largest value of older versions
 
 
 def network_address() -> str | None:
-    """The address of this machine in its network; None where it is in none. Nothing is sent."""
+    """Return the address of this machine in its network, or None without a network. Nothing is sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(("192.0.2.1", 9))  # RFC 5737: nobody's
+            probe.connect(("192.0.2.1", 9))  # RFC 5737: an address for documentation
         except OSError:
             return None
         return str(probe.getsockname()[0])
 
 
 def free_memory(group: Path = Path("/sys/fs/cgroup")) -> int:
-    """Bytes of memory that this process may still take, as the system and its control group say.
+    """Return the bytes of memory that this process may still allocate, by the system and by its control group.
 
-    What a control group holds of files goes when memory is asked for, and counts as free.
+    The system drops cached files of a control group on demand, so they count as free.
     """
     available = int(psutil.virtual_memory().available)
     with contextlib.suppress(OSError, ValueError):
@@ -269,13 +273,13 @@ def free_memory(group: Path = Path("/sys/fs/cgroup")) -> int:
 
 
 def machine_busy_seconds() -> float:
-    """Processor seconds that the whole machine has been busy."""
+    """Return the busy processor time of the whole machine in seconds."""
     times = psutil.cpu_times()._asdict()
     return float(sum(seconds for name, seconds in times.items() if name not in _NOT_BUSY))
 
 
 def process_is_alive(pid: int) -> bool:
-    """Whether a process runs; a zombie, which has ended and waits to be asked about, does not."""
+    """Return whether a process runs. A zombie does not."""
     try:
         return psutil.Process(pid).status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
     except psutil.NoSuchProcess:
@@ -285,16 +289,16 @@ def process_is_alive(pid: int) -> bool:
 
 
 def process_rank() -> int:
-    """The number of this process among those that torchrun started; 0 without it, or for no number."""
+    """Return the rank of this process under torchrun, 0 without torchrun or for an invalid rank."""
     text = os.environ.get("RANK", "")
     return int(text) if _is_count(text) else 0
 
 
 def process_count() -> int:
-    """How many processes torchrun started for this training; 1 without it.
+    """Return the number of processes that torchrun started for this training, 1 without torchrun.
 
     Raises:
-        PolarguideError: the variables that torchrun sets hold something else.
+        PolarguideError: a variable of torchrun is invalid.
     """
     world_text = os.environ.get("WORLD_SIZE", "1")
     rank_text = os.environ.get("RANK", "0")
@@ -322,7 +326,7 @@ def process_count() -> int:
 
 
 def _require_variable(name: str, right: bool, expected: str, found: str) -> None:
-    """Raise PolarguideError unless a variable that torchrun sets is right."""
+    """Raise PolarguideError unless a variable of torchrun is valid."""
     if not right:
         raise PolarguideError(
             name,
@@ -338,14 +342,14 @@ def _is_count(text: str) -> bool:
 
 _SIZE = re.compile(r"[0-9]{1,18}(KB|Kb|kb|MB|Mb|mb)?")
 _SIZES = re.compile(r"OPENCV_(IO_MAX_IMAGE_[A-Z]+|IMGCODECS_[A-Z]+_MAX_FILE_SIZE)")
-"""Read by OpenCV as it is loaded, which ends the process where one is not a size."""
+"""Variables that OpenCV reads when it is loaded. An invalid size ends the process."""
 
 
 def check_variables() -> None:
-    """Validate variables that OpenCV and the kernels read when they are loaded: a wrong value would end the process.
+    """Validate variables that OpenCV and the kernels read when they are loaded. A wrong value would end the process.
 
     Raises:
-        PolarguideError: the kernels would start more threads than any machine has, or OpenCV would end the process.
+        PolarguideError: a variable is invalid, or the number of threads is too large.
     """
     threads = os.environ.get("POLARGUIDE_THREADS", "").strip()
     wrong = {}
