@@ -1,4 +1,4 @@
-"""The command line: verbs by name, loaded when they are called, and the one place where errors are printed."""
+"""The command line: a table of verbs, loaded on demand, and the printing of all errors."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from polarguide.core.system import check_variables, interrupts
 
 
 class Verb(NamedTuple):
-    """A verb of the command line: where its function is, and the first paragraph of the function's docstring.
+    """A verb of the command line: the location of its function, and the first paragraph of its docstring.
 
-    The list of all verbs shows the summaries without loading a module.
+    The list of all verbs shows these summaries without loading a module.
     """
 
     module: str
@@ -70,18 +70,19 @@ VERBS = {
     "eval": Verb(
         "polarguide.cli.runs",
         "evaluate_run",
-        "Score a run on its test views and write RUN/metrics.json, and RUN/errors.png, where the errors are.",
+        "Score a run on its test views and write RUN/metrics.json, and RUN/errors.png with maps of the "
+        "errors.",
     ),
     "render": Verb(
         "polarguide.cli.runs",
         "render_run",
-        "Render a run's layers to PNG, with a contact sheet beside the ground truth; or along a "
-        "path, as a video.",
+        "Render a run's layers to PNG, with a contact sheet next to the ground truth; or along a path, as a "
+        "video.",
     ),
     "view": Verb(
         "polarguide.cli.runs",
         "view_in_browser",
-        "Look at a run in a browser: its layers from any side, beside the photographs. Ctrl-C ends it.",
+        "Show a run in a browser: its layers from any side, next to the photographs. Ctrl-C ends it.",
     ),
     "present": Verb(
         "polarguide.cli.captures",
@@ -92,7 +93,7 @@ VERBS = {
     "share": Verb(
         "polarguide.cli.runs",
         "share_run",
-        "Write a run as one web page that renders it with its reflections, and needs nothing beside itself.",
+        "Write a run as one self-contained web page that renders it with its reflections.",
     ),
     "export": Verb(
         "polarguide.cli.runs",
@@ -149,7 +150,7 @@ VERBS = {
         "installs it.",
     ),
 }
-"""No module imports torch before a verb is called."""
+"""All verbs by name. No module imports torch before a verb is called."""
 DESCRIPTION = (
     "Photographs through a linear polarizer to a 3D Gaussian splatting scene with separated reflections, surface "
     "normals and diffuse color."
@@ -157,9 +158,9 @@ DESCRIPTION = (
 
 
 def function_of(verb: str) -> Callable[..., Any]:
-    """Return the function of a verb; its signature and docstring are the verb's options and help."""
+    """Return the function of a verb. Its signature and docstring define the options and the help."""
     function: Callable[..., Any] = getattr(import_part(VERBS[verb].module, verb), VERBS[verb].function)
-    # Options that several verbs share are the fields of dataclasses, and are called as these are.
+    # Shared options are fields of dataclasses; their flags have no prefix.
     return tyro.conf.configure(tyro.conf.OmitArgPrefixes)(function)
 
 
@@ -174,7 +175,7 @@ def summary_of(verb: str) -> Callable[[], None]:
 
 
 def options_of(function: Callable[..., Any]) -> dict[str, Any]:
-    """Types of all parameters by name, those in dataclasses included."""
+    """Return the types of all parameters by name, with the fields of dataclasses."""
     types: dict[str, Any] = {}
     for name, kind in get_type_hints(function).items():
         types |= get_type_hints(kind) if dataclasses.is_dataclass(kind) else {name: kind}
@@ -182,15 +183,15 @@ def options_of(function: Callable[..., Any]) -> dict[str, Any]:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run a command line; returns the exit status (0 done, 1 stopped, 2 wrong input, or what the verb says)."""
+    """Run a command line and return the exit status: 0 done, 1 stopped, 2 wrong input, or the status of the verb."""
     verb = arguments[0] if arguments and arguments[0] in VERBS else None
     before = interrupts()
     for stream in (
         sys.stdout,
         sys.stderr,
-    ):  # names of files may have bytes that are no text, or that it cannot say
+    ):  # names of files may have bytes that are not text, or that the encoding lacks
         if isinstance(stream, io.TextIOWrapper):
-            # In the C locale Python takes names of files for ASCII, and terminals show UTF-8 all the same.
+            # In the C locale Python decodes names of files as ASCII, although terminals show UTF-8.
             stream.reconfigure(
                 encoding="utf-8" if sys.getfilesystemencoding() == "ascii" else None,
                 errors="backslashreplace",
@@ -216,20 +217,20 @@ def run(arguments: Sequence[str]) -> int:
         message = _system_error_message(error)
         if not message:
             raise
-        traceback.clear_frames(error.__traceback__)  # they hold the memory, and printing takes some
+        traceback.clear_frames(error.__traceback__)  # they keep the memory that printing needs
         return _failed(message)
     return status
 
 
 def _stopped() -> int:
-    """Print that a signal ended the command, if stderr can be written; returns the exit status."""
+    """Print that a signal ended the command, if stderr is writable, and return the exit status."""
     with contextlib.suppress(OSError):
         print("stopped.", file=sys.stderr)
     return 130
 
 
 def _from_a_signal(error: BaseException | None) -> bool:
-    """Whether an error is what a package has made of a KeyboardInterrupt, such as C code that imports another."""
+    """Return whether a KeyboardInterrupt caused an error, such as an interrupted import in a package."""
     for _ in range(20):
         if error is None or isinstance(error, KeyboardInterrupt):
             break
@@ -238,14 +239,14 @@ def _from_a_signal(error: BaseException | None) -> bool:
 
 
 def _failed(text: str) -> int:
-    """Print an error, if stderr can be written; returns the exit status."""
+    """Print an error, if stderr is writable, and return the exit status."""
     with contextlib.suppress(OSError):
         print_error(text)
     return 2
 
 
 def _system_error_message(error: Exception) -> str:
-    """The message where memory or threads have run out, or a package cannot be loaded; empty for other errors."""
+    """Return the message for exhausted memory or threads and for packages that cannot be loaded, else an empty text."""
     if isinstance(error, MemoryError) or any(phrase in str(error) for phrase in _RUN_OUT):
         reason = (str(error).splitlines() or ["none is left"])[0]
         return f"memory: expected enough of it, and of threads, found {reason[:200]}. {_MORE_ROOM}"
@@ -259,20 +260,20 @@ def _system_error_message(error: Exception) -> str:
 
 
 def _while_loading(error: Exception) -> bool:
-    """Whether an installed package failed while it was imported, as PyTorch does with variables that it cannot read."""
+    """Return whether an installed package failed during its import, such as PyTorch with invalid variables."""
     frames = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
     ours = [number for number, name in enumerate(frames) if name.startswith(_HOME)]
     return any(name.startswith("<frozen importlib") for name in frames[ours[-1] + 1 :]) if ours else False
 
 
 _RUN_OUT = ("can't start new thread", "can't allocate memory", "not enough memory")
-_HOME = str(Path(__file__).parents[1])  # also of the neighbors, whose names begin with it
+_HOME = str(Path(__file__).parents[1])  # also the prefix of the neighbors' paths
 _SETTINGS = "Check the environment's variables for it (env), such as PYTORCH_JIT and TORCH_LOGS."
 _MORE_ROOM = "Check this shell's limits (ulimit -a) and what else runs; --threads 1 takes less."
 
 
 def _call(verb: str | None, arguments: Sequence[str]) -> int:
-    """Call a verb; returns the exit status that it gives, 0 where it gives none."""
+    """Call a verb and return its exit status, by default 0."""
     if list(arguments) == ["--version"]:
         print(f"polarguide {polarguide.__version__}", flush=True)
         return 0
@@ -297,7 +298,7 @@ def _call(verb: str | None, arguments: Sequence[str]) -> int:
 
 
 def _require_place() -> None:
-    """Refuse a current folder that does not exist any more: some packages end the process there, without a word."""
+    """Refuse a current folder that no longer exists. Some packages would end the process without a message."""
     try:
         os.getcwd()
     except FileNotFoundError:
@@ -310,11 +311,10 @@ def _require_place() -> None:
 
 
 def _refuse_paths(verb: str, line: Sequence[str]) -> None:
-    """Refuse what names no file or folder: null bytes, and empty texts, as unset variables of a shell leave them, which
-    would mean this folder.
+    """Refuse empty paths and null bytes. An unset variable of a shell gives an empty path, which would mean "here".
 
     Raises:
-        PolarguideError: there is one.
+        PolarguideError: a path is empty or contains a null byte.
     """
     paths = {
         _flag(name) for name, kind in options_of(function_of(verb)).items() if Path in (kind, *get_args(kind))
@@ -340,7 +340,7 @@ def _flag(name: str) -> str:
 
 
 def _near(word: str) -> str:
-    """A hint for a word that is nearly a verb; also for what other programs call it."""
+    """Return a hint for a misspelled verb, or for its name in other programs."""
     others = {
         "evaluate": "eval",
         "test": "eval",
@@ -356,9 +356,9 @@ def _near(word: str) -> str:
 
 
 def _as_flag(error: PolarguideError, verb: str | None) -> str:
-    """The message; a parameter that is at fault is called as on the command line."""
+    """Return the message of an error, with a parameter named as on the command line."""
     text = str(error)
-    if verb in (None, error.where) or error.is_path:  # a verb as the place: its package is missing
+    if verb in (None, error.where) or error.is_path:  # the package of the verb is missing
         return text
     if error.where in options_of(function_of(verb)):
         return f"{_flag(error.where)}{text.removeprefix(error.where)}"

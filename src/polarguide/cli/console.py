@@ -1,4 +1,4 @@
-"""The console: messages, warnings and progress, as bars on a terminal and as lines anywhere else."""
+"""Console output: messages, warnings, and progress as bars on a terminal or as lines elsewhere."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ from polarguide.core.progress import Advance, Reporter
 from polarguide.core.system import process_rank
 from polarguide.core.text import printable
 
-# Of several processes of one training, the first alone talks.
+# Only the first of several processes of a training prints.
 console = Console(highlight=False, soft_wrap=True, quiet=process_rank() > 0)
 
 
-# Of a file or the command line: megabytes of it hide what is wrong.
+# Texts from files and the command line may have megabytes, which would hide the error.
 _LONG_WORD = re.compile(r"\S{1000,}?(?=:?(?:\s|$))")
 
 
 def say(text: object, *, lines: bool = False, to: Console = console) -> None:
-    """Print a text, of several ``lines``: names in it are neither markup, nor anything that a terminal obeys."""
+    """Print a text without markup and control characters. With ``lines`` its line breaks are kept."""
     to.print(printable(str(text), lines=lines), markup=False)
 
 
 def warn(text: object) -> None:
-    """Print a warning; names in it are shown as they are, but for control characters."""
+    """Print a warning without markup and control characters."""
     console.print("[yellow]warning:[/] ", end="")
     say(text)
 
 
 def print_error(text: str) -> None:
-    """Print an error on the standard error stream, with words of a thousand characters and more cut."""
+    """Print an error on the standard error stream. Words of a thousand characters and more are truncated."""
     errors = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
     errors.print("[bold red]error:[/] ", end="")
     say(_LONG_WORD.sub(lambda word: word[0][:200] + "...", text), to=errors)
 
 
 def size_text(size: int) -> str:
-    """The size of a file in bytes, for people."""
+    """Return the size of a file as text, in MB or kB."""
     return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{max(1, round(size / 1e3))} kB"
 
 
 @contextlib.contextmanager
 def warnings_printed() -> Iterator[None]:
-    """Inside, the library's warnings are lines on the console."""
+    """Print the library's warnings on the console inside this context."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", PolarguideWarning)
         others = warnings.showwarning
@@ -72,28 +72,28 @@ def warnings_printed() -> Iterator[None]:
 
 
 def set_threads(threads: int) -> None:
-    """Let our kernels, torch and OpenCV use this many threads; 0 leaves their defaults."""
+    """Set the number of threads of our kernels, torch and OpenCV; 0 keeps their defaults."""
     if threads:
         importlib.import_module("polarguide.raster").use_threads(threads)
         importlib.import_module("cv2").setNumThreads(threads)
 
 
 LINE_SECONDS = 15.0
-"""Between two lines of progress where there is no terminal."""
+"""Least time in seconds between two lines of progress without a terminal."""
 MEASURED = 0.05
-"""Share of the steps that is measured before their rate tells the time left."""
+"""Share of the steps before the remaining time is estimated."""
 UNKNOWN_TIME = "-:--:--"
 
 
 class Rate:
-    """Measures how fast a piece of work advances, from the first report on.
+    """Rate of a piece of work since its first report.
 
     Args:
-        total: how much there is to do; None where that is not known yet.
-        clock: gives the seconds of a report that does not state them.
+        total: amount of work; None: not known yet.
+        clock: time of reports that do not state their own.
 
     Attributes:
-        total: as above, or as a report has stated since.
+        total: amount of work, possibly updated by a report.
     """
 
     def __init__(self, total: int | None, clock: Callable[[], float] = time.monotonic) -> None:
@@ -102,14 +102,14 @@ class Rate:
         self._first: tuple[float, int] | None = None
 
     def left(self, done: int, total: int | None = None, seconds: float | None = None) -> float | None:
-        """Seconds that the remaining steps take at the rate so far; None before it is measured.
+        """Return the estimated remaining time in seconds, or None before enough work is done.
 
         Args:
             done, total, seconds: see ``core.progress.Advance``.
         """
         self.total = total or self.total
         now = self.clock() if seconds is None else seconds
-        if self._first is None:  # a training that is resumed does not begin at step 0
+        if self._first is None:  # a resumed training does not begin at step 0
             self._first = (now, done)
         begin, first = self._first
         steps = done - first
@@ -119,7 +119,7 @@ class Rate:
 
 
 def duration_text(seconds: float | None) -> str:
-    """Hours, minutes and seconds."""
+    """Return a duration as hours, minutes and seconds."""
     if seconds is None:
         return UNKNOWN_TIME
     whole = round(seconds)
@@ -127,9 +127,9 @@ def duration_text(seconds: float | None) -> str:
 
 
 def bars() -> Progress:
-    """A display of progress bars; a bar has the fields ``note`` and ``left``.
+    """Return a display of progress bars with the fields ``note`` and ``left``.
 
-    Step, total and time left are always shown; label and note share what room is left, and are cut.
+    Step, total and remaining time are always visible; label and note share the remaining width.
     """
     cut = {"no_wrap": True, "overflow": "ellipsis"}
     return Progress(
@@ -145,7 +145,7 @@ def bars() -> Progress:
 
 
 class Lines:
-    """Progress of one piece of work as lines, for logs: not more often than every ``LINE_SECONDS``."""
+    """Progress of one piece of work as lines of a log, at most one every ``LINE_SECONDS``."""
 
     def __init__(self, label: str, total: int | None, clock: Callable[[], float] = time.monotonic) -> None:
         self._label = label
@@ -170,13 +170,13 @@ class Lines:
             self._line = ""
 
     def close(self) -> None:
-        """Print the last state of work that had a note: its bar would stay on a terminal."""
+        """Print the last state if it has a note, like the bar that stays on a terminal."""
         if self._noted and self._line:
             say(self._line)
 
 
 class ConsoleReporter(Reporter):
-    """Prints messages, and one display with a bar for each piece of work that is in progress.
+    """Reporter that prints messages, and one display with a bar for each piece of work in progress.
 
     The last bar stays on the terminal if it has a note.
     """
@@ -185,7 +185,7 @@ class ConsoleReporter(Reporter):
         self._display = bars()
 
     def say(self, text: str) -> None:
-        """Print a finding; brackets in it are shown as they are."""
+        """Print a result without markup."""
         say(text, lines=True)
 
     def warn(self, text: str) -> None:
@@ -194,7 +194,7 @@ class ConsoleReporter(Reporter):
 
     @contextlib.contextmanager
     def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
-        """A progress bar below those that are open already, or lines where there is no terminal."""
+        """Show a progress bar below the open ones, or print lines without a terminal."""
         label = printable(label)
         if not console.is_terminal:
             lines = Lines(label, total)
@@ -230,7 +230,7 @@ RunFolder = Annotated[Path, tyro.conf.Positional]
 
 
 def open_run_folder(run: Path, compute: ThreadOptions) -> tuple[Run, ConsoleReporter]:
-    """The opened run, on the device of the options (the CPU without such an option), and the console."""
+    """Open a run on the device of the options (default: the CPU); returns the run and the console's reporter."""
     set_threads(compute.threads)
     reporter = ConsoleReporter()
     return polarguide.open_run(

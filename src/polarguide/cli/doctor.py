@@ -1,4 +1,4 @@
-"""``polarguide doctor``."""
+"""The verb ``doctor``."""
 
 from __future__ import annotations
 
@@ -29,17 +29,18 @@ EXTRAS = {
     "cluster": "compare, ablate, bench and batch on SLURM or PBS",
     "synth": "synth and bench: scenes with ground truth",
 }
-"""The extras that users need, and what for; docs and test are for those who change polarguide."""
+"""Purposes of the extras for users; docs and test are for developers of polarguide."""
 _CUDA_LIBRARY = re.compile(r"(nvidia|cuda)[-_]|triton$")
-"""Names of the distributions that PyTorch for CUDA brings along."""
+"""Names of the distributions that PyTorch for CUDA depends on."""
 GIB = float(1 << 30)
 
 
 def doctor(*, json: bool = False) -> int:
     """Print what is installed, what computes here, and what is missing, with the command that installs it.
 
-    Ends with exit status 1 where something that every command needs is missing or cannot be loaded. The output belongs
-    into a report of a problem; it names folders of this machine, and nothing of your captures.
+    The exit status is 1 if a package that every command needs is missing or cannot be loaded. Attach the output to
+    the
+    report of a problem: it contains folders of this machine, but nothing of your captures.
 
     Args:
         json: Print one JSON object instead of text.
@@ -53,13 +54,14 @@ def doctor(*, json: bool = False) -> int:
 
 
 def diagnosis() -> dict[str, Any]:
-    """The state of this installation, as plain values that JSON can hold.
+    """Return the state of this installation as plain values for JSON.
 
     Returns:
         ``polarguide`` and ``python``: versions. ``packages``: versions by name, None for a package that is not
         installed. ``kernels`` and ``torch``: their properties, or ``error`` alone if they cannot be loaded.
-        ``extras``: optional packages. ``machine``: processor, memory and disk. ``problems``: lines about faults that
-        make commands fail. ``notes``: lines about faults that do not.
+        ``extras``: optional packages. ``machine``: processor, memory and disk. ``problems``: faults that make
+        commands
+        fail. ``notes``: other faults.
     """
     packages = {
         each.name: _version(each.name)
@@ -101,21 +103,21 @@ def _version(distribution: str) -> str | None:
 
 
 def _kernels() -> dict[str, Any]:
-    """The instruction set and the threads of our kernels."""
+    """Return the instruction set and the number of threads of our kernels."""
     try:
         native = importlib.import_module("polarguide._native")
-    except Exception as error:  # loaders and their operating systems raise all kinds
+    except Exception as error:  # loaders of different systems raise different errors
         return {"error": _line(error)}
     return {"instruction_set": native.simd(), "threads": native.thread_count(), "file": native.__file__}
 
 
 def _torch() -> dict[str, Any]:
-    """PyTorch's threads, the CUDA that it was built for, and the GPUs that it can use."""
+    """Return PyTorch's threads, its CUDA version, and the usable GPUs."""
     try:
         torch = importlib.import_module("torch")
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
         properties = [torch.cuda.get_device_properties(number) for number in range(count)]
-    except Exception as error:  # loaders and their operating systems raise all kinds
+    except Exception as error:  # loaders of different systems raise different errors
         return {"error": _line(error)}
     gpus = [{"name": each.name, "memory_gib": round(each.total_memory / GIB, 1)} for each in properties]
     return {
@@ -131,7 +133,7 @@ def _line(error: Exception) -> str:
 
 
 def _extra(name: str, use: str) -> dict[str, Any]:
-    """Installed and missing packages of an extra, and the command that installs the latter (None: none is missing)."""
+    """Return installed and missing packages of an extra, and the command that installs the missing ones, or None."""
     wanted = [each for each in requirements() if each.extra == name]
     missing = [each.name for each in wanted if _version(each.name) is None]
     return {
@@ -143,7 +145,7 @@ def _extra(name: str, use: str) -> dict[str, Any]:
 
 
 def _notes(torch: dict[str, Any], extras: dict[str, Any]) -> list[str]:
-    """Shortcomings that do not stop anything."""
+    """Return faults that do not make commands fail."""
     if not extras:
         return ["polarguide is not installed here, so that its packages cannot be checked: pip install ."]
     if torch.get("gpus") and extras["cuda"]["missing"]:
@@ -157,7 +159,9 @@ def _notes(torch: dict[str, Any], extras: dict[str, Any]) -> list[str]:
 
 
 def _useless_cuda(version: str) -> str:
-    """A line about a PyTorch for CUDA where there is no GPU, its size, and the commands that replace it."""
+    """Return a note about PyTorch for CUDA on a machine without a GPU, with its size and the commands that replace
+    it.
+    """
     libraries = {
         name: sum((file.size or 0) for file in each.files or ())
         for each in metadata.distributions()

@@ -1,6 +1,6 @@
-"""Validation of the messages that a browser sends: viser reads only messages that were checked and clamped here.
+"""Validation of the messages that a browser sends. viser receives only messages that were checked and clamped here.
 
-Other messages that viser accepts, such as uploads or requests for a public tunnel, are of no use to this viewer.
+Other messages that viser accepts, such as uploads or requests for a public tunnel, are ignored.
 """
 
 from __future__ import annotations
@@ -12,27 +12,27 @@ from typing import Any
 import msgspec
 
 LARGEST = 1 << 16
-"""Bytes of a message."""
+"""Largest size of a message in bytes."""
 LARGEST_WINDOW = 8192
-"""Pixels along a side of a browser's window."""
+"""Largest width and height of a browser's window in pixels."""
 CAMERA_LIMITS = {
     "fov": (0.01, 3.0), "near": (1e-9, 1e9), "far": (1e-9, 1e12),
     "image_height": (1, LARGEST_WINDOW), "image_width": (1, LARGEST_WINDOW),
 }  # fmt: skip
 """Ranges of a camera's numbers; the field of view is in radians."""
 NO_RAY = {"ray_origin": (0.0,) * 3, "ray_direction": (0.0, 0.0, 1.0)}
-"""Ray of a click: a session computes it from the place in the window."""
+"""Placeholder for the ray of a click. A session computes it from the place in the window."""
 
 Accepts = Callable[[Any], Any]
 """Function that returns the value of a control within its range, and raises ``Refused`` for other types."""
 
 
 class Refused(Exception):
-    """A message that no browser of ours sends."""
+    """A message that the viewer's page never sends."""
 
 
 def checked_message(raw: bytes | str, control: Callable[[str], Accepts | None], reach: float) -> bytes | None:
-    """Return a message as viser may read it, or None for a message to ignore.
+    """Return a valid message for viser, or None for a message to ignore.
 
     Args:
         raw: MessagePack.
@@ -40,7 +40,7 @@ def checked_message(raw: bytes | str, control: Callable[[str], Accepts | None], 
         reach: the largest coordinate of a camera.
 
     Raises:
-        Refused: no browser of ours sends the message.
+        Refused: the viewer's page never sends such a message.
     """
     if not isinstance(raw, bytes) or len(raw) > LARGEST:
         raise Refused("not a message")
@@ -90,19 +90,19 @@ def choice(options: Sequence[str]) -> Accepts:
 
 
 def flag(value: Any) -> bool:
-    """Accept true or false; see ``Accepts``."""
+    """Accept true or false."""
     if not isinstance(value, bool):
         raise Refused("neither on nor off")
     return value
 
 
 def push(_: Any) -> bool:
-    """Accept any value for a button; see ``Accepts``."""
+    """Accept any value, for a button."""
     return True
 
 
 def _camera(message: dict[str, Any], reach: float) -> dict[str, Any]:
-    """Return the fields of a camera, clamped; directions become unit vectors."""
+    """Return the clamped fields of a camera, with unit vectors as directions."""
     fields: dict[str, Any] = {
         name: _clamped(message[name], *limits) for name, limits in CAMERA_LIMITS.items()
     }

@@ -26,7 +26,7 @@ SECONDS = (0.5, 10.0)
 CROP = (-150, 150)
 WIPE = (0, 100)
 KNOWN_LENGTH = (0.001, 1e8)
-"""Millimeters."""
+"""Range of the known length in millimeters."""
 SIZE = (0.5, 20.0)
 REACH = (0.5, 30.0)
 # Choices of the controls.
@@ -40,14 +40,16 @@ UNPAINTED, DIELECTRIC, METAL = KINDS = ("not painted", "dielectric", "metal")
 
 @dataclass(frozen=True)
 class PanelOptions:
-    """The controls that a panel has.
+    """Options of a panel.
 
     Attributes:
-        layers: layers of the shading model. turns: whether the environment can be rotated.
+        layers: layers of the shading model.
+        turns: whether the environment can be rotated.
         views: names of the photographs.
-        trains: whether a training runs, which can be paused.
-        presentation: as it was saved. saves: whether it can be saved to the run, rather than downloaded.
-        kinds: materials that can be painted, with their numbers; none: there is nothing to paint on.
+        trains: whether the panel can pause a training.
+        presentation: the saved presentation.
+        saves: whether the presentation is saved to the run; otherwise the browser downloads it.
+        kinds: numbers of the materials that can be painted; empty: no painting.
     """
 
     layers: Sequence[str]
@@ -60,11 +62,14 @@ class PanelOptions:
 
 
 class Control(NamedTuple):
-    """A row of the panel.
+    """Description of a control.
 
     Attributes:
-        kind: name of viser's method without ``add_``. label: text beside it. arguments: further positional arguments.
-        accepts: validation of the values that a browser sets; None: it sets none. options: keyword arguments.
+        kind: name of viser's method without ``add_``.
+        label: text next to the control.
+        arguments: further positional arguments.
+        accepts: validation of the values that a browser sets; None: the control is read-only.
+        options: keyword arguments.
     """
 
     kind: str
@@ -75,7 +80,7 @@ class Control(NamedTuple):
 
 
 def controls_of(options: PanelOptions) -> dict[str, dict[str, Control]]:
-    """Return the controls of a panel by folder and name; the folder without a label is the panel itself."""
+    """Return the controls of a panel by folder and name. The folder without a label is the panel itself."""
     presentation = options.presentation
     layers = (*options.layers, *MEASURED)
     views = (FREE_VIEW, *options.views)
@@ -150,20 +155,22 @@ def controls_of(options: PanelOptions) -> dict[str, dict[str, Control]]:
 
 
 class Panel:
-    """The controls of one session, by name: ``panel["layer"].value``.
+    """Controls of one session by name: ``panel["layer"].value``.
 
-    Names of views come from files, so they are shown as plain text only: Markdown in the browser may run code.
+    Names of views come from files, so they are shown as plain text: Markdown in the browser may run code.
 
     Attributes:
-        accepts: what a browser may set each control to, by viser's name of the control.
-        changed: called after every change that affects the picture.
+        accepts: validation of the values that a browser sets, by viser's name of the control.
+        changed: callback after every change of the picture.
 
     Args:
         gui: viser's handle of the session's controls.
-        options: the controls to show.
-        changed: as above. drop: called with what a callback has raised.
-        folded: whether the controls begin folded, behind the one word that opens them. On a phone viser's panel begins
-            open and covers half of the picture, and nothing that a server sends can fold it.
+        options: options of the panel.
+        changed: callback after every change of the picture.
+        drop: callback with the exception of another callback.
+        folded: whether the controls are in a closed folder. On a phone viser's panel is open at first and covers half
+            of
+            the picture, and a server cannot fold it.
     """
 
     def __init__(
@@ -179,7 +186,7 @@ class Panel:
         self.changed = changed
         self._drop = drop
         self._controls: dict[str, Any] = {}
-        # The box as it was saved, until a slider is moved; its sides are more exact than the sliders' steps.
+        # The saved box has more exact sides than the sliders' steps. It applies until a slider moves.
         self._saved_crop = options.presentation.crop
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._status = gui.add_markdown("")
@@ -216,7 +223,9 @@ class Panel:
         subscribe(self.caught(act))
 
     def caught(self, act: Callable[[], None]) -> Callable[[Any], None]:
-        """Return a callback that shows a visitor's mistake as a note; other errors close this browser's connection."""
+        """Return a callback that shows a visitor's mistake as a note. Other errors close only this browser's
+        connection.
+        """
 
         def called(_: Any) -> None:
             try:
@@ -232,31 +241,31 @@ class Panel:
         self._saved_crop = None
 
     def show_note(self, note: str) -> None:
-        """Show another note below the status, of which the same holds."""
+        """Show a note below the status. It must not contain names from files."""
         self._note = note
         self.show_status(*self._lines)
 
     def show_status(self, *lines: str) -> None:
-        """Show status lines; they must not contain names from files."""
+        """Show status lines. They must not contain names from files."""
         self._lines = lines
         text = "  \n".join((*lines, f"**{self._note}**") if self._note else lines)
         if self._status.content != text:
             self._status.content = text
 
     def crop(self, up_axis: Vector | None = None) -> Crop | None:
-        """The crop box along an axis (None: as the cameras say), or None if it is off."""
+        """Return the crop box with an up axis (None: that of the cameras), or None without cropping."""
         if not self["crop"].value:
             return None
         if self._saved_crop is not None:
             return self._saved_crop
         left_right, down_up, front_back = (self[name].value for name in SIDES)
         low = (left_right[0] / 100, down_up[0] / 100, front_back[0] / 100)
-        # A message may make the two ends equal.
+        # A message may make both ends equal.
         high = tuple(max(side[1], side[0] + 1) / 100 for side in (left_right, down_up, front_back))
         return Crop(low, (high[0], high[1], high[2]), up_axis)
 
     def presentation(self, chosen: Presentation) -> Presentation:
-        """A presentation with the exposure and the crop box of the panel."""
+        """Return a presentation with the exposure and the crop box of the panel."""
         crop = self.crop(chosen.up_axis)
         exposure = float(self["exposure"].value) or None
         return msgspec.structs.replace(
@@ -264,7 +273,7 @@ class Panel:
         )
 
     def appearance(self, chosen: Presentation) -> Appearance:
-        """The current choice of the user, with the white and the up axis that were chosen."""
+        """Return the appearance of the picture by the panel and the visitor's presentation."""
         return Appearance(
             layer=self["layer"].value,
             strength=float(self["strength"].value),
@@ -275,7 +284,7 @@ class Panel:
 
 
 def _percent(crop: Crop | None) -> list[tuple[int, int]]:
-    """Where the sliders of a crop box stand."""
+    """Return the positions of the sliders of a crop box."""
     if crop is None:
         return [(-40, 40)] * 3
     percents = []

@@ -1,4 +1,4 @@
-"""A session: one connected browser, with its controls, its camera, and the pictures that it receives."""
+"""A session of the viewer: one connected browser with its controls, camera and pictures."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from polarguide.viewer.presenting import Presenting
 from polarguide.viewer.scenery import Painter, Scenery
 from polarguide.visualization.figures import png_bytes
 
-REST = 0.25  # seconds without a change after which a sharp picture is rendered
+REST = 0.25  # seconds without a change before a sharp picture
 BUDGET = 0.1  # seconds per picture while the camera moves
 FIRST_HEIGHT = 360
 LEAST_HEIGHT = 90
@@ -41,12 +41,12 @@ GREATEST_WIDTH = 3840
 
 
 class FramePacing:
-    """Coarse pictures while the camera or a control changes, one sharp picture afterwards.
+    """Schedule of pictures: coarse ones while the camera or a control changes, a sharp one afterwards.
 
-    The height of coarse pictures adapts to the time that they take. Times are seconds of one monotonic clock.
+    The height of coarse pictures adapts to their rendering time. Times are seconds of one monotonic clock.
 
     Attributes:
-        version: number of changes so far; a picture that is rendered now shows this version.
+        version: number of changes so far, which the next picture shows.
     """
 
     def __init__(self) -> None:
@@ -57,22 +57,22 @@ class FramePacing:
         self._height = float(FIRST_HEIGHT)
 
     def mark_changed(self, now: float) -> None:
-        """Record that the camera or a control has changed at the time ``now``."""
+        """Record a change of the camera or of a control at the time ``now``."""
         self._changed = now
         self.version += 1
 
     def mark_outdated(self) -> None:
-        """Record that the scene has changed: a sharp picture is due, without coarse ones before it."""
+        """Record a change of the scene: a sharp picture is due, without coarse ones before it."""
         self.version += 1
 
     def due(self, now: float) -> str | None:
-        """The kind of picture that is due: "coarse", "sharp", or None if the last picture is up to date."""
+        """Return the kind of picture that is due: "coarse", "sharp", or None if the last picture is up to date."""
         if now - self._changed >= REST:
             return None if self._sharp == self.version else "sharp"
         return None if self._drawn == self.version else "coarse"
 
     def frame_size(self, window: tuple[int, int], kind: str) -> tuple[int, int]:
-        """Width and height in pixels of the next picture of this kind, given those of the window."""
+        """Return the width and height in pixels of the next picture of a kind in a window of a given size."""
         limit = GREATEST_HEIGHT if kind == "sharp" else round(self._height)
         height = max(1, min(window[1], limit))
         width = max(1, round(window[0] * height / max(1, window[1])))
@@ -81,13 +81,13 @@ class FramePacing:
         return min(width, GREATEST_WIDTH), height
 
     def end_frame(self, version: int, kind: str, seconds: float, now: float) -> None:
-        """Record that a picture was rendered in so many seconds."""
+        """Record the duration of a rendered picture."""
         self._drawn = version
         self.last_frame = now
         if kind == "sharp":
             self._sharp = version
             return
-        # Time is at most proportional to the number of pixels. Shrink at once, grow step by step.
+        # The time is at most proportional to the number of pixels. Shrink at once, grow step by step.
         factor = (BUDGET / max(seconds, 1e-4)) ** 0.5
         self._height *= max(0.25, factor) if factor < 1 else min(1.1, factor)
         self._height = min(float(GREATEST_HEIGHT), max(float(LEAST_HEIGHT), self._height))
@@ -96,7 +96,7 @@ class FramePacing:
 PATH_FILE = "camera_path.json"
 PICTURE_FILE = "polarguide.png"
 JPEG_QUALITY = 75
-BETWEEN_FILES = 0.5  # least seconds between two files of a kind, or two paths that are played
+BETWEEN_FILES = 0.5  # least seconds between two files of a kind, or two animations
 NO_LAYER = "This layer is not available here: go to a photograph, or choose another layer"
 
 
@@ -110,11 +110,16 @@ class Session:
     Callbacks only record changes; the rendering thread calls ``draw``.
 
     Args:
-        client: viser's handle. photographs: by name. scene_frame: frame of the scene.
-        options: options of the panel. wake: called when a picture may be due.
-        gray_world: gives the gains of the photographs' mean.
-        save: writes a presentation to the run, and returns a message; None: the browser downloads it.
-        drop: called with what a callback has raised, to let the browser go. beside: as of ``Painter``.
+        client: viser's handle.
+        photographs: photographs by name.
+        scene_frame: frame of the scene.
+        options: options of the panel.
+        wake: callback when a picture may be due.
+        gray_world: returns the gains that make the photographs' mean gray.
+        save: writes a presentation to the run and returns a message; None: the browser downloads it.
+        paintable: materials that can be painted.
+        drop: callback with the exception of another callback, to close the connection.
+        beside: another run, for wipes.
     """
 
     def __init__(
@@ -139,14 +144,16 @@ class Session:
         self._painter = Painter(scene_frame, beside)
         self.pacing = FramePacing()
         self._view_pose: ViewPose | None = None
-        self._last_pose: ViewPose | None = None  # of the view that was asked for last, left or not
+        self._last_pose: ViewPose | None = (
+            None  # pose of the last requested view, even if the camera has left it
+        )
         self._screenshot = False
         self._written_at = dict[str, float]()
         self._playing: tuple[float, list[Camera]] | None = None
         first = next(iter(photographs.values())).view.camera
         self._size = first.width, first.height
         self._keyframes: list[Camera] = []
-        upright = client.camera.image_width < client.camera.image_height  # as phones are held
+        upright = client.camera.image_width < client.camera.image_height  # as on a phone
         self.panel = panel = Panel(client.gui, options, self._changed, drop, folded=upright)
         self._save = save
         self._presenting = Presenting(
@@ -181,7 +188,7 @@ class Session:
         }
         for name, act in callbacks.items():
             panel.listen(name, act)
-        panel.caught(self._changed)(None)  # the box that was saved
+        panel.caught(self._changed)(None)  # show the saved box
 
     @property
     def client_id(self) -> int:
@@ -194,7 +201,7 @@ class Session:
         return bool(self.panel["pause"].value)
 
     def _soon_again(self, what: str) -> bool:
-        """Whether the same was requested less than ``BETWEEN_FILES`` ago; such a request is ignored."""
+        """Return whether the same was requested less than ``BETWEEN_FILES`` ago, and record the request otherwise."""
         now = time.monotonic()
         with self._lock:
             soon = now - self._written_at.get(what, -BETWEEN_FILES) < BETWEEN_FILES
@@ -220,7 +227,7 @@ class Session:
         return "Put it into the run's folder"
 
     def _moved(self) -> None:
-        """The browser reports the pose of its camera."""
+        """Handle a new camera pose from the browser."""
         camera = self._client.camera
         with self._lock:
             now = time.monotonic()
@@ -299,7 +306,7 @@ class Session:
         return free_camera(camera.wxyz, camera.position, camera.fov, frame_size)
 
     def _follow_path(self) -> None:
-        """Move the browser's camera to the current pose of the path that is played."""
+        """Move the browser's camera to the current pose of the animation."""
         if self._playing is None:
             return
         began, path = self._playing
@@ -317,7 +324,7 @@ class Session:
         self.pacing.mark_changed(time.monotonic())
 
     def due(self) -> str | None:
-        """The kind of picture that is due: "coarse", "sharp", or None."""
+        """Return the kind of picture that is due: "coarse", "sharp", or None."""
         with self._lock:
             self._follow_path()
             waits = self._presenting.waits or (self._painting is not None and self._painting.waits)
