@@ -1,4 +1,4 @@
-"""White, up, scale: how a visitor picks them in the picture, and what follows."""
+"""Picking of white, up axis and scale in the picture."""
 
 from __future__ import annotations
 
@@ -21,18 +21,19 @@ ASKS = {
     "level": "Click on a level surface",
     "length": "Click on one end of a known length",
 }
-"""Request for a click by what is picked."""
+"""Request for a click by the picked quantity."""
 
 
 class Clicks:
-    """Clicks into the picture of one browser, taken while a tool wants them.
+    """Clicks into the picture of one browser, received while a tool needs them.
 
     Attributes:
-        wanted: whether clicks are taken.
+        wanted: whether clicks are received.
 
     Args:
-        client: viser's handle. panel: controls of the session.
-        clicked: called with the place, in shares of the picture's width and height.
+        client: viser's handle.
+        panel: controls of the session.
+        clicked: callback with the place, in shares of the picture's width and height.
     """
 
     def __init__(self, client: Any, panel: Panel, clicked: Callable[[Sequence[float]], None]) -> None:
@@ -45,7 +46,7 @@ class Clicks:
         self._heard = heard
 
     def want(self, wanted: bool) -> None:
-        """Take clicks, or no more."""
+        """Start or stop receiving clicks."""
         if wanted and not self.wanted:
             self._client.scene.on_click()(self._heard)
         elif self.wanted and not wanted:
@@ -54,17 +55,20 @@ class Clicks:
 
 
 class Presenting:
-    """One session's presentation, and its pending pick.
+    """Presentation of one session, and its pending pick.
 
     Callbacks only record; the rendering thread calls ``take_click`` and ``found``.
 
     Attributes:
-        chosen: white, up, scale and credit. The crop box is the panel's.
+        chosen: white balance, up axis, scale and credit. The panel has the crop box and the exposure.
 
     Args:
-        client: viser's handle. panel: controls of the session. presentation: as it was saved.
-        gray_world: gives the gains of the photographs' mean. save: writes what was chosen, and says what it did.
-        distance: distance of the cameras.
+        client: viser's handle.
+        panel: controls of the session.
+        presentation: the saved presentation.
+        gray_world: returns the gains that make the photographs' mean gray.
+        save: writes the presentation and returns a message.
+        distance: distance of the cameras from the scene's center.
     """
 
     def __init__(
@@ -97,7 +101,7 @@ class Presenting:
 
     @property
     def waits(self) -> bool:
-        """Whether a click waits to be looked up."""
+        """Whether a click is pending."""
         return self._clicked is not None
 
     @property
@@ -106,11 +110,11 @@ class Presenting:
         return self._clicks.wanted
 
     def take_click(self) -> tuple[float, float] | None:
-        """Where was clicked, in shares of the picture's width and height; None: nowhere."""
+        """Return the pending click in shares of the picture's width and height, or None."""
         return None if self._clicked is None else self._clicked[1:]
 
     def found(self, place: SurfacePoint | None) -> None:
-        """The surface at the clicked pixel."""
+        """Use the surface at the clicked pixel for the pending pick."""
         if self._clicked is None:
             return
         what = self._clicked[0]
@@ -137,7 +141,7 @@ class Presenting:
         self._panel.show_note(ASKS[what])
 
     def _listen(self, what: str) -> None:
-        """Take clicks for something, or no more."""
+        """Start or stop receiving clicks for a quantity."""
         self._picking = what
         self._clicks.want(bool(what))
 
@@ -177,7 +181,7 @@ class Presenting:
         self._panel.show_note("Up: as the cameras say" if up is None else "Up: chosen")
 
     def turn_upright(self) -> None:
-        """Let the browser's camera turn about the chosen axis, if there is one."""
+        """Align the browser's camera with the chosen up axis, if there is one."""
         if self.chosen.up_axis is not None:
             self._client.camera.up_direction = np.array(self.chosen.up_axis)
 

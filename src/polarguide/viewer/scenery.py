@@ -1,4 +1,4 @@
-"""The scene that a viewer shows, and its pictures as a visitor wants them."""
+"""The scene that a viewer shows, and the drawing of its pictures."""
 
 from __future__ import annotations
 
@@ -38,10 +38,13 @@ class Scenery:
     """Gaussians to be rendered: the source of a viewer's pictures.
 
     Attributes:
-        gaussians: the Gaussians. light: learned, by name.
-        shading: as it is now. rasterize: rasterizer of the backend. sh_degree: degree of the base color's harmonics.
-        status: a line about it.
-        footprints: [N] of a finished training, see ``raster.magnification``.
+        gaussians: the Gaussians.
+        light: learned light by name.
+        shading: shading of the current stage.
+        rasterize: rasterizer of the backend.
+        sh_degree: degree of the base color's harmonics.
+        status: a line of text about it.
+        footprints: [N] footprints of a finished training, see ``raster.magnification``.
     """
 
     gaussians: Gaussians
@@ -62,13 +65,14 @@ class Scenery:
         within: Callable[[Tensor], Tensor] | None = None,
         turn: Tensor | None = None,
     ) -> RenderResult:
-        """All layers, on the CPU.
+        """Render all layers, on the CPU.
 
         Args:
-            camera: with the size of the picture. depth: whether depth is one of them.
+            camera: the camera, with the size of the picture.
+            depth: whether to render depth.
             surface: whether normals and depth are those of the surface at the pixel's median depth.
-            within: which places [N, 3] of the scene are shown, [N] bool; None: all.
-            turn: rotation [3, 3] of the light from afar, where it is radiance; None: as learned.
+            within: returns which places [N, 3] of the scene are shown, [N] bool; None: all.
+            turn: rotation [3, 3] of a radiance environment; None: as learned.
         """
         gaussians: Parameters = self.gaussians
         footprints = self.footprints
@@ -87,7 +91,7 @@ class Scenery:
         ).to("cpu")
 
     def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
-        """The Stokes vectors that a result predicts; None without both layers and a normal."""
+        """Predict Stokes vectors, or None without both layers and a normal."""
         if any(layer is None for layer in (result.specular, result.diffuse, result.normal)):
             return None
         return self.shading.predicted_stokes(result, camera)
@@ -101,7 +105,7 @@ class Scenery:
 
 
 def run_scenery(run: OpenedRun) -> Scenery:
-    """A trained run."""
+    """Return the scenery of a trained run."""
     model = run.model
     status = f"{run.recipe.name}, {run.steps:,} steps; {model.size}"
     return Scenery(
@@ -116,7 +120,7 @@ def run_scenery(run: OpenedRun) -> Scenery:
 
 
 def training_scenery(trainer: AngleTrainer) -> Scenery:
-    """A training as it is between two steps, Gaussians shaded as in its present stage."""
+    """Return the scenery of a training between two steps, with the shading of its current stage."""
     steps = trainer.settings.steps
     state = trainer.state
     stage = trainer.schedule.at(min(state.step, steps - 1)).stage
@@ -133,33 +137,34 @@ def training_scenery(trainer: AngleTrainer) -> Scenery:
 
 
 OF_POLARIZATION = {f"{name}, measured": name for name in POLARIZED}
-"""Layers that need pictures which determine the polarization, and what is predicted of the same."""
+"""Predicted layer by measured layer. Measured layers need pictures that determine the polarization."""
 BESIDE = {
     **dict.fromkeys(("final", "base"), "photograph"),
     **{of: name for name, of in OF_POLARIZATION.items()},
 }
-"""What was measured of a layer, for a wipe between the two."""
+"""Measured layer by rendered layer, for a wipe between the two."""
 MEASURED = ("photograph", *OF_POLARIZATION, "error")
-"""Layers that only a photograph's pose has."""
+"""Layers that exist only at a photograph's pose."""
 LEGEND = 0.25, 128, 512
-"""Width of the key to a layer's colors: as a share of the picture, and at least and at most in pixels."""
+"""Width of the legend: share of the picture, minimum and maximum in pixels."""
 
 
 UNCHANGED = Presentation()
-"""The presentation that changes nothing."""
+"""Presentation with default values, which changes nothing."""
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """A visitor's choices.
+    """A visitor's choice of a picture.
 
     Attributes:
         layer: a name in ``LAYERS``, ``POLARIZED`` or ``MEASURED``.
-        strength: factor on the specular layer; predicted polarization is that of the layers as they were learned.
-        turn: degrees of the far environment, counter-clockwise seen from above.
-        wipe: share of the picture's width, from the left, that shows the run beside in place of the layer; without one
-            what was measured (``BESIDE``), at a photograph's pose.
-        presentation: color, exposure, up axis and crop box; without a crop box all of the scene is shown.
+        strength: factor on the specular layer. Predicted polarization is always that of the learned layers.
+        turn: rotation of the far environment in degrees, counter-clockwise seen from above.
+        wipe: share of the picture's width, from the left, that shows the other run in place of the layer; without
+            another
+            run, the measured layer (``BESIDE``) at a photograph's pose.
+        presentation: color, exposure, up axis and crop box. Without a crop box all of the scene is shown.
     """
 
     layer: str = "final"
@@ -170,10 +175,11 @@ class Appearance:
 
 
 class Painter:
-    """Draws a scene as a visitor wants it.
+    """Painter of a scene's pictures.
 
     Args:
-        around: the frame of the scene's cameras. beside: another run of it, for wipes; None: what was measured.
+        around: the frame of the scene's cameras.
+        beside: another run of the scene, for wipes; None: wipes show measured layers.
     """
 
     def __init__(self, around: SceneFrame, beside: Scenery | None = None) -> None:
@@ -190,16 +196,17 @@ class Painter:
         *,
         settled: bool = True,
     ) -> Picture | None:
-        """A picture.
+        """Draw a picture.
 
         Args:
-            scenery: the scene. camera: with the window's size; of the pose alone, where there is a view.
-            appearance: what to draw.
-            view: the photograph at whose pose it is drawn.
-            settled: whether the camera rests; the colors of depths follow the picture only then.
+            scenery: the scene.
+            camera: camera with the window's size; only its size counts if there is a view.
+            appearance: choice of the picture.
+            view: the photograph whose pose the camera has.
+            settled: whether the camera rests. Only then the range of the colors of depth is updated.
 
         Returns:
-            uint8 [H, W, 3] of the camera's size; None where there is no such layer.
+            uint8 [H, W, 3] of the camera's size; None if the layer does not exist.
         """
         if appearance.layer in MEASURED:
             picture = self._measured(scenery, view, appearance, (camera.width, camera.height))
@@ -213,7 +220,7 @@ class Painter:
     def _modeled(
         self, scenery: Scenery, camera: Camera, appearance: Appearance, *, settled: bool
     ) -> Picture | None:
-        """A picture of a layer; None where there is no such layer."""
+        """Draw a rendered layer, or return None if the layer does not exist."""
         result = self._result(scenery, camera, appearance)
         if appearance.layer in POLARIZED:
             result = replace(result, predicted=scenery.stokes(result, camera))
@@ -222,7 +229,9 @@ class Painter:
     def _wiped(
         self, picture: Picture, scenery: Scenery, camera: Camera, view: View | None, appearance: Appearance
     ) -> Picture:
-        """A picture of a layer with the other run, or what was measured, to the left; as it is where there is none."""
+        """Draw the other run, or the measured layer, over the left part of a picture. Without them, return the
+        picture.
+        """
         other = BESIDE.get(appearance.layer)
         left = None
         if self._beside is not None:
@@ -239,7 +248,7 @@ class Painter:
         return wiped
 
     def _with_scale(self, picture: Picture, layer: str) -> Picture:
-        """A picture with the key to the colors of its layer at its lower left, where there is one."""
+        """Draw the legend of a layer's colors over the lower left corner of a picture."""
         scale = (
             figures.scale_bar(0.0, figures.LARGE_ERROR, "inferno", middle="difference, sRGB")
             if layer == "error"
@@ -248,7 +257,7 @@ class Painter:
         share, least, most = LEGEND
         width = min(max(round(share * picture.shape[1]), least), most)
         if scale is None or picture.shape[1] < 2 * least:
-            return picture  # it would hide what it explains
+            return picture  # the legend would hide the picture
         return figures.with_key(picture, scale, width)
 
     def point(
@@ -259,7 +268,7 @@ class Painter:
         view: View | None,
         place: tuple[float, float],
     ) -> SurfacePoint | None:
-        """The surface at a place of the picture that ``paint`` draws, in shares of its width and height."""
+        """Return the surface at a place of a picture, given in shares of its width and height."""
         camera = drawn_camera(camera, view)
         result = self._result(scenery, camera, replace(appearance, layer="depth", strength=1.0, turn=0.0))
         return surface_at(result, camera, place[0] * camera.width, place[1] * camera.height)
@@ -299,7 +308,7 @@ class Painter:
     def _measured(
         self, scenery: Scenery, view: View | None, appearance: Appearance, frame_size: tuple[int, int]
     ) -> Picture | None:
-        """A picture of what was measured at a photograph's pose, in a window; None where it is not known."""
+        """Draw a measured layer at a photograph's pose in a window, or return None if it is unknown."""
         layer = appearance.layer
         if view is None or (layer in OF_POLARIZATION and not view.is_determined):
             return None

@@ -1,4 +1,4 @@
-"""Set how a scene or a run is presented, from what the command line or a program says."""
+"""Setting of the presentation of a scene or a run, from texts of the command line or of a program."""
 
 from __future__ import annotations
 
@@ -64,34 +64,36 @@ def present(
     device: DeviceName = "cpu",
     reporter: Reporter = SILENT,
 ) -> Presentation:
-    """Set how a scene or a run is presented, in its ``presentation.json``. What is not given stays as it is.
+    """Set how a scene or a run is presented, in its ``presentation.json``. Omitted values stay.
 
     A PLACE is X,Y,Z in the scene's axes; VIEW, for the camera of a photograph; or VIEW,X,Y, for the surface that a
     run shows at a pixel of a photograph, counted from the top left corner.
 
     Args:
-        folder: folder of a scene, whose runs then have it from there, or of a run.
+        folder: folder of a scene, whose runs inherit the presentation, or of a run.
         white_balance: ``none``, ``gray`` (the mean of the photographs becomes gray), gains of R, G and B such as
             ``1.9,1,1.6``, or VIEW,X,Y: a place in a photograph that should be white or gray.
         chart: ``none``, or VIEW,X,Y,X,Y,X,Y,X,Y: the centers of the corner patches of a 24-patch color chart, around
-            it; or the folder of another scene or run, whose chart it takes. It replaces a white balance.
-        exposure: stops by which all is shown brighter, -8 to 8, or ``none``.
-        up_axis: ``none`` (as the cameras say), an axis such as ``z`` or ``-y``, three numbers, or VIEW,X,Y: a place
-            whose surface is level; up is its normal there.
-        points: two PLACEs whose distance is known. distance: it, such as ``85mm``.
-        meters_per_unit: how long one unit of the scene is, or ``none``.
-        crop: left,right,down,up,front,back in percent of the cameras' distance, as the viewer counts; ``all``: the
+            it; or the folder of another scene or run with a chart. It replaces a white balance.
+        exposure: exposure compensation in stops, -8 to 8, or ``none``.
+        up_axis: ``none`` (the up axis of the cameras), an axis such as ``z`` or ``-y``, three numbers, or VIEW,X,Y: a
+            place
+            on a level surface, whose normal is up.
+        points: two PLACEs of known distance.
+        distance: their distance, such as ``85mm``.
+        meters_per_unit: length of one unit of the scene, or ``none``.
+        crop: left,right,down,up,front,back in percent of the cameras' distance, as in the viewer; ``all``: the
             whole scene; ``none``: the subject, see ``results.rendering.subject``.
-        title, author, license, provenance: one line of text each; ``none`` or nothing removes it.
-        scene: where the scene of a run lies now, if it was moved; ``run.json`` of the run has it from then on.
-        device: what surfaces are rendered on.
+        title, author, license, provenance: one line of text each; ``none`` or an empty text removes it.
+        scene: new folder of a moved scene, which ``run.json`` of the run then names.
+        device: device of the rendering.
         reporter: receives the progress of long operations.
 
     Returns:
         The presentation of the folder: for a run, its own over its scene's.
 
     Raises:
-        PolarguideError: no such folder, or a value that cannot be read; nothing is written then.
+        PolarguideError: the folder does not exist, or a value is invalid; nothing is written.
     """
     place = _PresentedFolder(Path(folder), device, reporter)
     if scene is not None:
@@ -130,7 +132,7 @@ def present(
 
 
 class _PresentedFolder:
-    """A scene's or a run's folder, read as far as needed."""
+    """Folder of a scene or a run, read on demand."""
 
     def __init__(self, folder: Path, device: DeviceName, reporter: Reporter) -> None:
         require_folder(
@@ -153,28 +155,28 @@ class _PresentedFolder:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene, or that of the run."""
+        """The scene, or the scene of the run."""
         return self._run.scene if self._is_run else load_scene(self.folder, reporter=self._reporter)
 
     def move_scene(self, scene: PathLike) -> None:
-        """Point the run to where its scene lies now.
+        """Set the new folder of a run's scene.
 
         Raises:
-            PolarguideError: this is no run, or that is another scene.
+            PolarguideError: the folder is not a run, or the scene is another one.
         """
         if not self._is_run:
             raise _wrong("scene", "the folder of a run, whose scene was moved", str(self.folder))
         self._run.point_to(scene)
 
     def shown(self, own: Presentation) -> Presentation:
-        """The presentation that applies, with these values of the folder's own."""
+        """Return the presentation that applies, given the folder's own values."""
         return own.over(read_presentation(self._scene_folder)) if self._is_run else own
 
     def refuse_inherited(self, names: Sequence[str]) -> None:
-        """Refuse to remove from a run what its scene says.
+        """Refuse to remove inherited values from a run.
 
         Raises:
-            PolarguideError: the scene says it.
+            PolarguideError: the scene has one of the values.
         """
         if not self._is_run:
             return
@@ -189,7 +191,7 @@ class _PresentedFolder:
                 )
 
     def pixel(self, text: str) -> tuple[str, float, float] | None:
-        """A view and a place in it, if the text is VIEW,X,Y."""
+        """Parse VIEW,X,Y to a view and a place in it, or return None for other texts."""
         name, *numbers = text.rsplit(",", 2)
         places = decimals(",".join(numbers))
         if len(places) != 2 or (decimals(name) and name not in find_layout(self._scene_folder).names):
@@ -197,10 +199,10 @@ class _PresentedFolder:
         return name, places[0], places[1]
 
     def surface(self, name: str, x: float, y: float, where: str) -> tuple[Tensor, Tensor | None]:
-        """Point and normal of the surface at a pixel of a view.
+        """Return the point and the normal of the surface at a pixel of a view.
 
         Raises:
-            PolarguideError: no surface is there, or the folder is not a run's.
+            PolarguideError: there is no surface, or the folder is not a run.
         """
         if not self._is_run:
             raise PolarguideError(
@@ -221,7 +223,7 @@ class _PresentedFolder:
         return hit.point, hit.normal
 
     def point(self, text: str) -> Tensor:
-        """A PLACE as a point [3] in the world.
+        """Return a PLACE as a point [3] in the world.
 
         Raises:
             PolarguideError: the text is not a PLACE.
@@ -306,10 +308,10 @@ def _crop(text: str, up: Vector | None) -> dict[str, Any]:
 
 
 def _require_numbers(text: str, count: int, where: str, expected: str) -> tuple[float, ...]:
-    """So many numbers separated by commas.
+    """Parse a fixed count of numbers separated by commas.
 
     Raises:
-        PolarguideError: the text is something else.
+        PolarguideError: the text has another form.
     """
     numbers = decimals(text)
     if len(numbers) != count:
@@ -322,7 +324,7 @@ def _wrong(where: str, expected: str, found: str) -> PolarguideError:
 
 
 def presentation_lines(presentation: Presentation) -> list[str]:
-    """Return the fields that are set, a line each; "nothing is set" for an empty presentation."""
+    """Return the values that are set, a line each; "nothing is set" for an empty presentation."""
     chart = presentation.chart
     exposure = presentation.exposure
     crop = presentation.crop

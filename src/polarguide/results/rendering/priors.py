@@ -1,4 +1,4 @@
-"""Pictures of what polarization says about a scene, before or after training."""
+"""Pictures of the polarization of a scene and of the priors that follow from it."""
 
 from __future__ import annotations
 
@@ -31,11 +31,13 @@ def write_priors(
     threshold: float = 0.05,
     reporter: Reporter = SILENT,
 ) -> Path:
-    """Pictures of what polarization says about a scene, one PNG each, and a contact sheet of them.
+    """Write pictures of a scene's polarization, one PNG each, and a contact sheet of them.
 
-    S0, DoLP, AoLP, zenith, both separations, polarization normals, those that color differences tell, and the mask of
-    usable pixels. The exact separation needs normals: those of a trained run, else the polarization normals themselves,
-    with their ambiguity resolved only by the surface facing the camera.
+    They are S0, DoLP, AoLP, zenith, both separations, polarization normals, normals from color differences, and the
+    mask of
+    usable pixels. The exact separation needs normals: those of a trained run, else the polarization normals
+    themselves,
+    whose ambiguity is then resolved only by the surface facing the camera.
 
     Args:
         scene: a scene with poses.
@@ -44,13 +46,15 @@ def write_priors(
         views: ``test``, ``train``, ``all``, or names separated by commas.
         refractive_index: refractive index of the surfaces; None: that of the scene.
         threshold: DoLP above which a pixel's normal is used.
+        reporter: receives the progress.
 
     Returns:
         The path of the contact sheet.
 
     Raises:
-        PolarguideError: there is no such view, its pictures do not determine its polarization, or the run was trained
-            at another size.
+        PolarguideError: a view does not exist, its pictures do not determine its polarization, or the run was trained
+            at
+            another size.
     """
     check_finite("threshold", threshold, 0.0, 1.0)
     index = index_of(refractive_index, scene.refractive_index)
@@ -83,7 +87,7 @@ def write_priors(
 
 @torch.no_grad()
 def prior_pictures(view: View, run: OpenedRun | None, index: float, threshold: float) -> dict[str, Picture]:
-    """All prior pictures of one view, by the name their file gets."""
+    """Return all pictures of one view by the name of their file."""
     rays = view.camera.rays()
     stokes = view.stokes()
     luminance = optics.luminance(stokes)
@@ -123,7 +127,7 @@ def prior_pictures(view: View, run: OpenedRun | None, index: float, threshold: f
 def resolving_normals(
     view: View, run: OpenedRun | None, rays: Tensor, luminance: Tensor, index: float
 ) -> tuple[Tensor, str]:
-    """Normals in camera axes that resolve the ambiguity, and where they come from."""
+    """Return normals in camera axes that resolve the ambiguity, and the name of their source."""
     if run is not None:
         normal = run.result(view.name, depth=False).to("cpu").normal
         assert normal is not None

@@ -1,7 +1,7 @@
-"""Other light for a run; the learned environment as a panorama, and panoramas as environments.
+"""Relighting of a run, and conversion between learned environments and panoramas.
 
-A panorama [H, 2 H, 3] is upright in the scene: row i, column j is at latitude ``pi (1/2 - (i + 1/2) / H)`` over the
-cameras' common level and at longitude ``pi ((j + 1/2) / H - 1)`` from the middle, to the right. Files hold linear
+A panorama [H, 2 H, 3] is upright in the scene. Row i, column j is at latitude ``pi (1/2 - (i + 1/2) / H)`` above the
+cameras' common level, and at longitude ``pi ((j + 1/2) / H - 1)`` from the middle to the right. Files have linear
 radiance on the scale of the photographs (S0 / 2), in the color of the run's presentation.
 """
 
@@ -31,19 +31,19 @@ from polarguide.shading.model import RadianceCubemap, ShadingModel, mirrored
 
 LARGEST = 8192 * 4096
 RELIT_RESOLUTION = 128
-"""Texels along the sides of a cubemap that is made of another light, or of the learned one turned."""
+"""Texels along the sides of a cubemap made from a panorama or by rotation."""
 
 
 def relight(
     run: OpenedRun, panorama: PathLike | None = None, degrees: float = 0.0, *, reporter: Reporter = SILENT
 ) -> None:
-    """Put a panorama in the learned environment's place, or turn it, in the run as it is in memory.
+    """Replace the learned environment of a run in memory by a panorama, or rotate it.
 
     Args:
         run: the run; its scene is read.
-        panorama: file of linear radiance (.hdr, .exr), to be reflected in place of the learned environment.
-        degrees: by which to turn the environment, counter-clockwise seen from above.
-        reporter: receives a note of each layer that stays as it was learned.
+        panorama: file of linear radiance (.hdr, .exr) that replaces the learned environment.
+        degrees: rotation of the environment, counter-clockwise seen from above.
+        reporter: receives a note about layers that keep their learned light.
 
     Raises:
         PolarguideError: the recipe learns no radiance, or the file cannot be read.
@@ -66,10 +66,14 @@ def relight(
 
 
 def needs_radiance(shading: ShadingModel, *, what: str) -> RadianceCubemap:
-    """The radiance that a shading model's light holds; ``what`` asks for it.
+    """Return the radiance cubemap of a shading model's light.
+
+    Args:
+        shading: the shading model.
+        what: the option that needs the cubemap, for the message.
 
     Raises:
-        PolarguideError: the model has no light, or none that is a cubemap of radiance.
+        PolarguideError: the model has no light, or its light is not a cubemap of radiance.
     """
     cubemap = shading.radiance_cubemap
     if cubemap is not None:
@@ -84,10 +88,12 @@ def needs_radiance(shading: ShadingModel, *, what: str) -> RadianceCubemap:
 
 @torch.no_grad()
 def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -> Tensor:
-    """Raw texels [6, R, R, 3] of the learned light with what the Gaussians add of their own folded in.
+    """Return raw texels [6, R, R, 3] of the learned light together with the local light of the Gaussians.
 
-    A texel is the mean of what all training views see mirrored from its direction, weighted by the square of the share
-    that is mirrored: the least squares fit to the specular layers. Learned light counts as one more pixel of a surface
+    A texel is the mean of the light that all training views see mirrored from its direction, weighted by the square
+    of the
+    mirrored share: the least-squares fit to the specular layers. The learned light counts as one more pixel of a
+    surface
     that mirrors with all of its strength, seen squarely.
     """
     texels = run.light[cubemap.name].detach().cpu()
@@ -103,7 +109,7 @@ def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -
         share = (result.specular.sum(-1) / light.sum(-1).clamp(min=1e-6)).clamp(0, 1)[..., None].square()
         directions = mirrored(view.camera.world_rays(), unit(result.normal, 1e-3)).reshape(-1, 3)
         with torch.enable_grad():
-            # The gradient of a look-up shares each pixel among the texels that it would read.
+            # The gradient of a look-up distributes each pixel among the texels that it reads.
             cubemap_lookup(sums, directions).backward(
                 torch.cat([share * light, share], dim=-1).reshape(-1, 4)
             )
@@ -116,7 +122,7 @@ def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -
 
 @torch.no_grad()
 def panorama(texels: Tensor, cubemap: RadianceCubemap, around: SceneFrame, height: int) -> Tensor:
-    """Radiance [H, 2 H, 3] of raw texels [6, R, R, 3]."""
+    """Return the radiance [H, 2 H, 3] of raw texels [6, R, R, 3]."""
     steps = torch.arange(2 * height, dtype=torch.float64) + 0.5
     latitude = math.pi * (0.5 - steps[:height, None] / height)
     longitude = math.pi * (steps[None] / height - 1)
@@ -132,12 +138,12 @@ def panorama(texels: Tensor, cubemap: RadianceCubemap, around: SceneFrame, heigh
 def cubemap_of_panorama(
     picture: Tensor, cubemap: RadianceCubemap, around: SceneFrame, resolution: int
 ) -> Tensor:
-    """Raw texels [6, R, R, 3] of a panorama [H, W, 3] of radiance, as far as raw values can hold it."""
+    """Return raw texels [6, R, R, 3] of a panorama of radiance [H, W, 3], clamped to the range of raw values."""
     directions = texel_directions(resolution).double() @ around.panorama_axes()
     x, y, z = directions.unbind(-1)
     across = torch.atan2(x, -z) / math.pi
     down = -2 / math.pi * torch.asin(y.clamp(-1, 1))
-    # One column more on each side: the panorama goes round.
+    # One more column on each side: the panorama is periodic.
     wide = pad(picture.double().movedim(-1, 0)[None], (1, 1, 0, 0), mode="circular")
     width = picture.shape[1]
     places = torch.stack((across * width / (width + 2), down), dim=-1).reshape(
@@ -149,13 +155,18 @@ def cubemap_of_panorama(
 
 @torch.no_grad()
 def turned_cubemap(texels: Tensor, turn: Tensor, resolution: int) -> Tensor:
-    """Raw texels [6, R, R, C] after turning what they show by a rotation [3, 3] of the world."""
+    """Return raw texels [6, R, R, C] of an environment rotated by [3, 3] in the world."""
     directions = (texel_directions(resolution).double() @ turn).reshape(-1, 3)
     return cubemap_lookup(texels, directions.to(texels)).reshape(6, resolution, resolution, -1)
 
 
 def write_exr(path: Path, picture: Tensor, attributes: Mapping[str, str] = {}) -> None:
-    """Write linear radiance [H, W, 3] as 32-bit floats, with standard attributes of the format, such as ``owner``.
+    """Write linear radiance [H, W, 3] as an EXR file of 32-bit floats.
+
+    Args:
+        path: the file.
+        picture: the radiance.
+        attributes: standard attributes of the format, such as ``owner``.
 
     Raises:
         PolarguideError: OpenEXR is not installed.
@@ -171,7 +182,9 @@ def write_exr(path: Path, picture: Tensor, attributes: Mapping[str, str] = {}) -
 
 
 def write_hdr(path: Path, picture: Tensor) -> None:
-    """Write linear radiance [H, W, 3] as Radiance RGBE, which more viewers read: 8 bits a channel, one exponent."""
+    """Write linear radiance [H, W, 3] as Radiance RGBE, which more programs read: 8 bits per channel, a common
+    exponent.
+    """
     pixels = np.ascontiguousarray(picture.detach().numpy().astype(np.float32)[..., ::-1])
     _, data = cv2.imencode(".hdr", pixels)
     write_whole(path, data.tobytes())
@@ -181,7 +194,7 @@ def read_panorama(path: Path) -> Tensor:
     """Read a panorama of linear radiance, Radiance HDR or OpenEXR: [H, W, 3] float32, not negative.
 
     Raises:
-        PolarguideError: no such file, not twice as wide as high, not such a picture, without light, or NaN somewhere.
+        PolarguideError: the file is missing, has another format or aspect ratio, has no light, or contains NaN.
     """
     found = ""
     if not path.is_file():
