@@ -409,7 +409,7 @@ def test_a_damaged_journal_is_refused(tmp_path: Path) -> None:
     content = json.loads(path.read_text())
     content["prepare"]["views"]["v000"]["files"]["polar/v000_000.png"] = "large"
     path.write_text(json.dumps(content))
-    Fault("scene.json (prepare.views[...]", "a whole number", "text").raised_by(
+    Fault("scene.json (prepare.views.v000.files", "a whole number", '"large"').raised_by(
         prepare_scene, tmp_path / "in", tmp_path / "out", settings
     )
 
