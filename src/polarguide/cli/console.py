@@ -131,7 +131,7 @@ def bars() -> Progress:
 
     Step, total and remaining time are always visible; label and note share the remaining width.
     """
-    cut = {"no_wrap": True, "overflow": "ellipsis"}
+    cut: dict[str, Any] = {"no_wrap": True, "overflow": "ellipsis"}
     return Progress(
         TextColumn("{task.description}", markup=False, table_column=Column(max_width=26, **cut)),
         BarColumn(bar_width=10),

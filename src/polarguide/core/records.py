@@ -71,8 +71,8 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
         raise PolarguideError(place, expected=error.expected, found=error.found, remedy=remedy) from None
     except msgspec.ValidationError:
         path, expected, found = _fault(value, kind)
-        place = f"{where} ({path})" if path else where
-        raise PolarguideError(place, expected=expected, found=found, remedy=remedy) from None
+        at_fault = f"{where} ({path})" if path else where
+        raise PolarguideError(at_fault, expected=expected, found=found, remedy=remedy) from None
     except (ValueError, RecursionError, OverflowError) as error:
         raise PolarguideError(
             where, expected="a JSON file", found=f"broken JSON ({error})", remedy=remedy

@@ -10,6 +10,7 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
+from types import GenericAlias
 from typing import Annotated, Any, TypedDict
 
 import msgspec
@@ -147,6 +148,8 @@ _OBJECT = msgspec.defstruct(
     kw_only=True,
 )
 """Errors over the pixels of an object, or of all objects of a class of material, in all test views."""
+_PARTS = GenericAlias(dict, (str, _OBJECT))
+"""Such errors by name."""
 _VIEW = msgspec.defstruct("View", _fields(VIEW_METRICS, *_VIEW_REASONS))
 _RUN = msgspec.defstruct(
     "Run",
@@ -154,8 +157,8 @@ _RUN = msgspec.defstruct(
         *_fields(METRICS, *_RUN_REASONS),
         ("views", Annotated[dict[str, Any], msgspec.Meta(min_length=1)]),
         ("provenance", Provenance),
-        ("objects", dict[str, _OBJECT], msgspec.field(default_factory=dict)),
-        ("materials", dict[str, _OBJECT], msgspec.field(default_factory=dict)),
+        ("objects", _PARTS, msgspec.field(default_factory=dict)),
+        ("materials", _PARTS, msgspec.field(default_factory=dict)),
     ],
     kw_only=True,
 )
