@@ -30,7 +30,7 @@ FONT_SIZE = 18
 SMALLEST_FONT_SIZE = 10
 LINE_HEIGHT = 28
 READ_AT = 384
-"""Width of a tile up to which type keeps its size; a sheet of larger ones is read from farther away."""
+"""Width of a tile up to which the font size is constant. The type grows with larger tiles."""
 
 
 def contact_sheet(
@@ -148,12 +148,12 @@ COLOR_MAPS = {
     "magma": cv2.COLORMAP_MAGMA,
     "inferno": cv2.COLORMAP_INFERNO,
 }
-"""Names that ``scalar_to_rgb`` knows."""
+"""Color maps of ``scalar_to_rgb`` by name."""
 NOTHING: Mapping[str, str] = MappingProxyType({})
 
 
 def radiance_to_rgb(linear: Tensor) -> Picture:
-    """Linear radiance [H, W, 3] as a display shows it: clipped to [0, 1], sRGB. NaN is black."""
+    """Return linear radiance [H, W, 3] as a display shows it: clipped to [0, 1], sRGB. NaN is black."""
     return _to_uint8(shown(linear.detach().nan_to_num(nan=0.0)))
 
 
@@ -234,7 +234,7 @@ def aolp_to_rgb(aolp: Tensor, dolp: Tensor | None = None) -> Picture:
 
 
 LARGE_ERROR = 0.25
-"""Difference of shown pictures that is brightest."""
+"""Difference of full brightness."""
 
 
 def error_to_rgb(pred_linear: Tensor, true_linear: Tensor, high: float = LARGE_ERROR) -> Picture:
@@ -280,7 +280,7 @@ def angle_wheel(scale: float = 1.0) -> Picture:
 
 
 def normal_ball(high: int = 64, width: int = 256) -> Picture:
-    """A ball seen from the camera, in the colors of ``normal_to_rgb``: [high, width, 3]."""
+    """Return a ball seen from the camera, in the colors of ``normal_to_rgb``: [high, width, 3]."""
     drawn: Picture = np.full((high, width, 3), BACKGROUND, np.uint8)
     y, x = np.mgrid[0:high, 0:width]
     radius = high * 30 / 64
@@ -294,15 +294,12 @@ def normal_ball(high: int = 64, width: int = 256) -> Picture:
 
 
 def shares_to_rgb(shares: Tensor) -> Picture:
-    """Red, green and blue [H, W, 3] from 0 to 1 as they are, without a transfer; mid gray where not finite."""
+    """Convert red, green and blue [H, W, 3] from 0 to 1 without a transfer; mid gray where not finite."""
     return _to_uint8(shares.detach().nan_to_num(0.5, 0.5, 0.5))
 
 
 def with_key(picture: Picture, key: Picture, width: int) -> Picture:
-    """A picture with a key to its colors over its lower left corner, on a white border.
-
-    The key is ``width`` pixels wide, less what is empty at its sides.
-    """
+    """Draw a legend of ``width`` pixels over the lower left corner of a picture, on a white border."""
     scale = width / key.shape[1]
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     drawn_on = np.flatnonzero((key != BACKGROUND).any(axis=(0, 2)))
@@ -318,7 +315,7 @@ def with_key(picture: Picture, key: Picture, width: int) -> Picture:
 
 
 def with_name(picture: Picture, name: str) -> Picture:
-    """A picture with a name in its upper left corner, white on a dark rim, a thirtieth of its shorter side high."""
+    """Draw a name into the upper left corner of a picture, white on a dark rim."""
     size = min(picture.shape[:2])
     image = Image.fromarray(picture)
     font = ImageFont.load_default(size / 16)
@@ -372,13 +369,13 @@ def png_bytes(rgb8: Picture, alpha8: Picture | None = None, about: Mapping[str, 
 
 
 def _to_uint8(values: Tensor) -> Picture:
-    """[0, 1] to [0, 255], rounded half up, so that the middle is 128."""
+    """Convert [0, 1] to [0, 255], rounded half up, so that the middle is 128."""
     scaled = torch.floor(values.to("cpu", torch.float64) * 255 + 0.5)
     return scaled.clamp(0, 255).to(torch.uint8).numpy()
 
 
 def color_gradient(color_map: str) -> str:
-    """A color map of the figures as the stops of a CSS gradient."""
+    """Return a color map as the stops of a CSS gradient."""
     levels = np.linspace(0, 255, 9).round().astype(np.uint8)[None]
     colors = cv2.applyColorMap(levels, COLOR_MAPS[color_map])[0, :, ::-1]
     return ", ".join(f"rgb({r} {g} {b})" for r, g, b in colors.tolist())
