@@ -1,4 +1,4 @@
-"""``polarguide`` and ``python -m polarguide``."""
+"""Entry point of ``polarguide`` and ``python -m polarguide``."""
 
 from __future__ import annotations
 
@@ -6,31 +6,31 @@ import os
 import signal
 import sys
 
-# Threads that wait should sleep: torch's OpenMP workers must not fight the kernels' threads for cores by spinning.
-# OpenMP reads this when it is loaded, so it has to be set before torch is imported.
+# Waiting threads must sleep: torch's OpenMP workers would otherwise spin and block the kernels' threads.
+# OpenMP reads this variable when it is loaded, so it is set before torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 try:
     from polarguide.cli.app import run
     from polarguide.core.system import interrupt, keep_freed_memory, stop_signals
-except KeyboardInterrupt:  # before there is anything to stop
+except KeyboardInterrupt:  # nothing has started yet
     sys.exit(130)
 
 
 def main() -> None:
-    """Entry point of the command line."""
-    for name in ("stdout", "stderr"):  # closed by the caller (>&-): what prints would find nothing there
+    """Run the command line and exit with its status."""
+    for name in ("stdout", "stderr"):  # the caller closed the stream (>&-), so that print would fail
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, to the end of the process
-    # As Ctrl-C does, so that whatever is open is closed.
+    # Signals act like Ctrl-C, so that open resources are closed.
     for number in stop_signals():
         signal.signal(number, interrupt)
-    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:  # a shell may let it be ignored
+    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:  # a shell may ignore it
         signal.signal(signal.SIGINT, interrupt)
     keep_freed_memory()
     try:
         status = run(sys.argv[1:])
-    except KeyboardInterrupt:  # a second one, while the message about the first was printed
+    except KeyboardInterrupt:  # a second signal during the message about the first
         status = 130
     if status == 130:
         for number in (signal.SIGINT, *stop_signals()):  # nothing is left to stop

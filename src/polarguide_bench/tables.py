@@ -15,7 +15,7 @@ import pandas as pd
 from msgspec import UNSET
 
 from polarguide.core.files import write_text
-from polarguide.core.text import plain, printable
+from polarguide.core.text import csv_value, printable
 from polarguide.results.evaluation.table import (
     COLUMNS,
     MESH_LABEL,
@@ -463,4 +463,4 @@ def csv_text(frame: pd.DataFrame) -> str:
             frame.loc[frame["metric"] == metric.key, ["mean", "low", "high"]] *= metric.factor
     if "metric" in frame:
         frame["metric"] = frame["metric"].replace(names)
-    return frame.rename(columns=names).map(plain).to_csv(index=False, lineterminator="\n")
+    return frame.rename(columns=names).map(csv_value).to_csv(index=False, lineterminator="\n")

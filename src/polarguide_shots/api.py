@@ -14,7 +14,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
 from polarguide.core.options import PathLike, SceneOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.results.rendering.pictures import select_views
+from polarguide.results.rendering.pictures import views_named
 from polarguide.results.rendering.priors import write_priors
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide_shots.calibration.calibrate import calibrate_sensor
@@ -67,7 +67,7 @@ def priors(
     refuse_scene(Path(out))
     loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
     index = index_of(refractive_index, loaded.refractive_index)
-    chosen = select_views(loaded, views)
+    chosen = views_named(loaded, views)
     if formats:
         check_formats(formats)
         for view in chosen:

@@ -13,10 +13,10 @@ from typing import Annotated, Any
 import tyro
 
 import polarguide
-from polarguide.cli.console import ConsoleReporter, console, print_error, say, use_threads
+from polarguide.cli.console import ConsoleReporter, console, print_error, say, set_threads
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, read_file, write_whole
-from polarguide.core.options import SceneOptions, ThreadOptions, check_finite
+from polarguide.core.options import Memory, SceneOptions, ThreadOptions, check_finite
 from polarguide.core.records import option_name
 from polarguide.core.system import StopSignals
 from polarguide.preparation.settings import CalibrationOptions
@@ -46,7 +46,7 @@ def measure(
         paths: Raw mosaics, shots of four files, scenes, or folders of them.
         out: Folder of the table.
     """
-    use_threads(compute.threads)
+    set_threads(compute.threads)
     if bool(paths) == (watching.watch is not None):
         raise PolarguideError(
             "--watch",
@@ -124,7 +124,7 @@ def priors(
     views: str = "test",
     threshold: float | None = None,
     downscale: int = 1,
-    memory: float | None = None,
+    memory: Memory | None = None,
     shots: Annotated[ShotOptions, tyro.conf.arg(name="")],
     angles: Annotated[CalibrationOptions, tyro.conf.arg(name="")],
     machine: Annotated[ThreadOptions, tyro.conf.arg(name="")],
@@ -150,7 +150,7 @@ def priors(
         downscale: For a scene: average the pictures over boxes of this many pixels first.
         memory: For a scene: GiB that the pictures may take; without it, 80 % of what is free.
     """
-    use_threads(machine.threads)
+    set_threads(machine.threads)
     reporter = ConsoleReporter()
     if not paths:
         raise PolarguideError(
@@ -236,7 +236,7 @@ def calibrate(
         shots: Folder of raw mosaics of a linear polarizer before a uniform light, at five or more angles.
         out: File to write, ending in .safetensors; a picture (PNG) of the same name goes beside it.
     """
-    use_threads(compute.threads)
+    set_threads(compute.threads)
     calibration = importlib.import_module("polarguide_shots.calibration.calibrate")
     outcome = calibration.calibrate_sensor(shots, out, settings, ConsoleReporter())
     say(f"calibration: {outcome.path}   picture: {outcome.picture}")

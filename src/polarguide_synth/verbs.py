@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from polarguide.cli.console import ConsoleReporter, console, say, use_threads
+from polarguide.cli.console import ConsoleReporter, console, say, set_threads
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import ThreadOptions
 from polarguide.core.text import command
@@ -39,7 +39,7 @@ def synth(
         sweep: A family of scenes, such as views=9,18,36,63 or noise=0,1,2,4; also roughness, index and spacing.
         yes: Start a rendering of more than an hour without a question. Without a terminal there is no question.
     """
-    use_threads(compute.threads)
+    set_threads(compute.threads)
     spec = find_scene(scene)
     reporter = ConsoleReporter()
     render = importlib.import_module("polarguide_synth.render")

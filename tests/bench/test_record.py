@@ -47,8 +47,8 @@ def test_what_is_written_passes(tmp_path: Path) -> None:
         (("runs", 0, "seed"), -1, "runs[0].seed", "0 or more"),
         (("scenes", 0, "views"), -6, "scenes[0].views", "0 or more"),
         (("scenes", 0, "black_share"), -5.0, "scenes[0].black_share", "0 to 1"),
-        (("runs", 0, "objects", "o"), PART | {"pixels": -1}, "runs[0].objects[...].pixels", "0 or more"),
-        (("runs", 0, "materials", "m"), PART | {"views": -1}, "runs[0].materials[...].views", "0 or more"),
+        (("runs", 0, "objects", "o"), PART | {"pixels": -1}, "runs[0].objects.o.pixels", "0 or more"),
+        (("runs", 0, "materials", "m"), PART | {"views": -1}, "runs[0].materials.m.views", "0 or more"),
         (("runs", 0, "scene"), "z", "runs[0].scene", "one of x, y"),
         (("runs", 1, "state"), "lost", "runs[1].state", "done, failed or missing"),
         (
@@ -57,8 +57,8 @@ def test_what_is_written_passes(tmp_path: Path) -> None:
             "runs[1].metrics",
             "values for a run that is done and null for another",
         ),
-        (("runs", 0, "metrics", "psnr"), "high", "runs[0].metrics[...]", "a number or null"),
-        (("runs", 0, "views", "v0", "ssim"), "x", "runs[0].views[...][...]", "a number or null"),
+        (("runs", 0, "metrics", "psnr"), "high", "runs[0].metrics.psnr", "a number or null"),
+        (("runs", 0, "views", "v0", "ssim"), "x", "runs[0].views.v0.ssim", "a number or null"),
         (("runs",), 3, "runs", "a list"),
     ],
 )

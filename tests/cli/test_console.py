@@ -31,7 +31,6 @@ from polarguide.core.errors import PolarguideWarning
 from polarguide.core.text import printable
 from polarguide.results.evaluation import table
 from polarguide.results.evaluation.table import METRICS, OBJECT_METRICS
-from polarguide_bench.verbs.console import JobReporter
 
 HOSTILE = "\x1b[2J\x1b]0;mine\x07\u202e"
 
@@ -122,7 +121,7 @@ def test_names_are_readable_in_the_c_locale(tmp_path: Path, name: str) -> None:
 
 
 def test_the_display_shows_markup_in_names_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
-    reporter = JobReporter()
+    reporter = ConsoleReporter()
     with reporter.track("all", 2) as everything, reporter.track("[red]cup[/]", 1) as one:
         one(1, note="[bold]scoring[/]")
         everything(1)
@@ -180,7 +179,7 @@ def test_without_a_terminal_a_line_every_so_often(capsys: pytest.CaptureFixture[
     for step in range(0, 1001, 10):
         now[0] = step / 10
         told(step, note=f"loss {step}")
-    told.close(last=True)
+    told.close()
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "training 150/1000, 0:01:25 left  loss 150"
     assert len(said) == 7
@@ -239,6 +238,7 @@ def test_help_of_every_verb_names_and_explains_every_flag(
     function = function_of(verb)
     about = inspect.getdoc(function) or ""
     assert about.splitlines()[0] in text
+    assert VERBS[verb].summary == about.partition("\n\n")[0].replace("\n", " ")
     kinds = get_type_hints(function)
     for parameter in inspect.signature(function).parameters.values():
         kind, fields, explained = kinds[parameter.name], [parameter.name], about
@@ -275,7 +275,7 @@ def test_help_loads_nothing_heavy() -> None:
 
 def test_the_list_of_verbs_loads_none_of_them() -> None:
     """Nor NumPy: the list is what a shell's user waits for."""
-    verbs = tuple(module for module, _ in VERBS.values())
+    verbs = tuple(verb.module for verb in VERBS.values())
     command = [sys.executable, "-c", f"HEAVY = {(*HEAVY, 'numpy', *verbs)}{LOADED}", "--help"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "loaded by --help"

@@ -13,9 +13,9 @@ from other_device import BACKEND, OtherDevice, unfused_adam
 
 from polarguide.api.runs import Run, open_run
 from polarguide.capture import load_scene
-from polarguide.capture.presentation import Crop
+from polarguide.capture.presentation import Crop, Presentation
 from polarguide.cli.app import run
-from polarguide.cli.runs import render
+from polarguide.cli.runs import render_run
 from polarguide.core.options import ComputeOptions
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.inspection.evidence import short_run, trained_surface
@@ -71,7 +71,7 @@ def test_pictures_by_other_light_and_along_a_path(elsewhere: Path, tmp_path: Pat
     layers = "final,reflection,specular,normal,depth,strength"
 
     def shown(device: str, out: Path) -> np.ndarray:
-        render(
+        render_run(
             elsewhere,
             layers=layers,
             environment=light,
@@ -83,7 +83,9 @@ def test_pictures_by_other_light_and_along_a_path(elsewhere: Path, tmp_path: Pat
 
     with OtherDevice():
         there = shown("auto", tmp_path / "there")
-        render(elsewhere, layers="final,depth", rotate_environment=30, path="orbit", frames=2, out=tmp_path)
+        render_run(
+            elsewhere, layers="final,depth", rotate_environment=30, path="orbit", frames=2, out=tmp_path
+        )
     assert len(list(tmp_path.glob("path_*.png"))) == 2
     # Depth's colors jump where nothing is seen, so a few pixels may differ by much.
     assert float((np.abs(there - shown("cpu", tmp_path / "here")) > 2).mean()) < 0.01
@@ -111,7 +113,7 @@ def test_the_inspection_trains_there_and_compares_here(
 def test_the_viewer_draws_what_lies_there(elsewhere: Path) -> None:
     crop = Crop((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     chosen = [
-        Appearance(layer, exposure=0.5, strength=0.5, turn=30.0, crop=crop)
+        Appearance(layer, strength=0.5, turn=30.0, presentation=Presentation(exposure=0.5, crop=crop))
         for layer in ("final", "specular", "normal", "depth", "error")
     ]
 

@@ -66,7 +66,7 @@ def test_what_is_right_is_read(tmp_path: Path) -> None:
         ('{"count": 1, "by_name": {"a": NaN}}', "it (by_name.a)", "a finite number", "nan"),
         ('{"count": 1, "share": 1e999}', "it (share)", "a finite number", "inf"),
         ('{"count": 1, "share": 1' + "0" * 400 + "}", "it (share)", "a number of usual size", "1000"),
-        ('{"count": 1, "by_name": {"a": "x"}}', "it (by_name[...])", "a number", "text"),
+        ('{"count": 1, "by_name": {"a": "x"}}', "it (by_name.a)", "a number", '"x"'),
         ('{"count": 1, "sides": [1]}', "it (sides)", "a list of length 2", "[1]"),
     ],
 )  # fmt: skip

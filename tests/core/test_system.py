@@ -1,5 +1,6 @@
 """Signals, locks, memory and variables; and how it is done where the system has none of it."""
 
+import contextlib
 import ctypes
 import os
 import signal
@@ -17,9 +18,9 @@ from polarguide.core.system import (
     MemoryBound,
     StopSignals,
     check_variables,
-    exclusive_lock,
     free_memory,
     keep_freed_memory,
+    only_writer,
     peak_memory_mib,
     process_count,
     process_is_alive,
@@ -29,16 +30,24 @@ from polarguide.core.system import (
 )
 
 
-def test_a_lock_is_held_by_one(tmp_path: Path) -> None:
-    with exclusive_lock(tmp_path / "lock"), pytest.raises(BlockingIOError), exclusive_lock(tmp_path / "lock"):
-        pass
-    with exclusive_lock(tmp_path / "lock"):
-        pass
+def lock(path: Path) -> contextlib.AbstractContextManager[None]:
+    return only_writer(path, expected="a folder of its own", found="another writer")
+
+
+@pytest.mark.parametrize("name", ["lock", "."])
+def test_a_lock_is_held_by_one(tmp_path: Path, name: str) -> None:
+    def hold() -> None:
+        with lock(tmp_path / name):
+            pass
+
+    with lock(tmp_path / name):
+        Fault(str(tmp_path), "of its own", "another writer").raised_by(hold)
+    hold()
 
 
 def test_without_posix_nothing_is_locked_or_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(system, "_posix", lambda module: None)
-    with exclusive_lock(tmp_path / "lock"), exclusive_lock(tmp_path / "lock"):
+    with lock(tmp_path / "lock"), lock(tmp_path / "lock"), lock(tmp_path), lock(tmp_path):
         pass
     assert peak_memory_mib() is None
 

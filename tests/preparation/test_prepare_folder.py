@@ -26,7 +26,7 @@ from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES
 from polarguide.capture.sensor.pattern import SENSORS
 from polarguide.capture.sensor.raw_file import PACKINGS
 from polarguide.core import files
-from polarguide.core.system import hold_folder
+from polarguide.core.system import only_writer
 from polarguide.preparation import folder as folder_module
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
@@ -247,12 +247,11 @@ def test_one_preparation_at_a_time_writes_a_folder(tmp_path: Path) -> None:
     write_mosaics(tmp_path / "raw", 3)
     settings = PrepareSettings(sensor="IMX250MYR", bits=16, poses="none")
     (tmp_path / "out").mkdir()
-    let_go = hold_folder(tmp_path / "out")
-    Fault(found="another polarguide prepare at work").raised_by(
-        prepare_scene, tmp_path / "raw", tmp_path / "out", settings
-    )
+    with only_writer(tmp_path / "out", expected="", found=""):
+        Fault(found="another polarguide prepare at work").raised_by(
+            prepare_scene, tmp_path / "raw", tmp_path / "out", settings
+        )
     assert list((tmp_path / "out").iterdir()) == []
-    let_go()
     assert prepare_scene(tmp_path / "raw", tmp_path / "out", settings).new
 
 
@@ -410,7 +409,7 @@ def test_a_damaged_journal_is_refused(tmp_path: Path) -> None:
     content = json.loads(path.read_text())
     content["prepare"]["views"]["v000"]["files"]["polar/v000_000.png"] = "large"
     path.write_text(json.dumps(content))
-    Fault("scene.json (prepare.views[...]", "a whole number", "text").raised_by(
+    Fault("scene.json (prepare.views.v000.files", "a whole number", '"large"').raised_by(
         prepare_scene, tmp_path / "in", tmp_path / "out", settings
     )
 

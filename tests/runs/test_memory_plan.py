@@ -66,12 +66,16 @@ def test_without_a_limit_what_is_free_counts(monkeypatch: pytest.MonkeyPatch) ->
         ("3.5GiB", 3.5 * 2**30),
         ("2g", 2e9),
         ("1T", 1e12),
-        ("4", None),
-        ("GB", None),
+        ("4", 4 * 2**30),
     ],
 )
-def test_sizes(text: str, bytes_: float | None) -> None:
-    assert gibibytes(text) == (None if bytes_ is None else pytest.approx(bytes_ / 2**30))
+def test_sizes(text: str, bytes_: float) -> None:
+    assert gibibytes(text) == pytest.approx(bytes_ / 2**30)
+
+
+def test_a_unit_alone_is_no_size() -> None:
+    with pytest.raises(ValueError, match="GB"):
+        gibibytes("GB")
 
 
 def test_what_is_not_specified_follows_from_the_size_or_is_that_of_the_run_to_resume(

@@ -14,7 +14,7 @@ from torch import Tensor
 from trainings import context_of
 
 from polarguide.capture import Scene
-from polarguide.capture.presentation import Crop
+from polarguide.capture.presentation import Crop, Presentation
 from polarguide.gaussians.ply import read_ply
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.recipes import recipe_named
@@ -151,7 +151,8 @@ def test_it_is_viewed(trained: TrainingLoop) -> None:
     assert {layer for layer, found in pictures.items() if found is not None} == set(
         trained.current.shading.layers
     )
-    stronger = Appearance(strength=2.0, turn=30.0, crop=Crop((-9, -9, -9), (9, 9, 9)))
+    presentation = Presentation(crop=Crop((-9, -9, -9), (9, 9, 9)))
+    stronger = Appearance(strength=2.0, turn=30.0, presentation=presentation)
     found, plain = painter.paint(shown, camera, stronger), pictures["final"]
     assert found.mean() > plain.mean() + 1
 

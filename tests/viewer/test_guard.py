@@ -20,7 +20,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from polarguide.core.errors import PolarguideError
 from polarguide.viewer import Viewer, guard
 from polarguide.viewer.guard import Gate
-from polarguide.viewer.messages import LARGEST, Refused, checked, choice, flag, number, pair
+from polarguide.viewer.messages import LARGEST, Refused, checked_message, choice, flag, number, pair
 from polarguide.viewer.server import _listening
 
 # The viewer ignores it itself, but each test brings back the filters of before.
@@ -250,7 +250,7 @@ def test_a_camera_is_clamped() -> None:
         "wxyz": [2, 0, 0, 0],
         "more": 1,
     }
-    found = msgspec.msgpack.decode(checked(msgspec.msgpack.encode(wild), lambda _: None, 50.0) or b"")
+    found = msgspec.msgpack.decode(checked_message(msgspec.msgpack.encode(wild), lambda _: None, 50.0) or b"")
     assert (found["fov"], found["image_width"], found["position"]) == (0.01, 8192, [50.0, 0.0, 0.0])
     assert found["wxyz"] == [1.0, 0.0, 0.0, 0.0]
     assert "more" not in found
@@ -260,7 +260,7 @@ def test_a_camera_that_looks_at_its_own_place_is_refused() -> None:
     """As clamped, that is: viser asks for the direction."""
     wild = {**CAMERA, "position": [1e300, 0, 0], "look_at": [60.0, 0, 0]}
     with pytest.raises(Refused, match="looks at"):
-        checked(msgspec.msgpack.encode(wild), lambda _: None, 50.0)
+        checked_message(msgspec.msgpack.encode(wild), lambda _: None, 50.0)
 
 
 @pytest.mark.parametrize("host", ["a" * 70_000, "\udcff", "xn--\u2603.."])

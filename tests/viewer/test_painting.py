@@ -14,8 +14,8 @@ from polarguide.geometry.camera import Camera
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.result import LAYERS
 from polarguide.viewer.messages import Refused
-from polarguide.viewer.painting import KINDS, Materials, Paintable, kinds_of
-from polarguide.viewer.panel import PanelOptions
+from polarguide.viewer.painting import Materials, Paintable, kinds_of
+from polarguide.viewer.panel import KINDS, PanelOptions
 from polarguide.viewer.server import Viewer
 from polarguide.viewer.session import Session
 

@@ -19,9 +19,9 @@ from polarguide.capture.presentation import (
     read_presentation,
     write_presentation,
 )
-from polarguide.results.rendering.picking import gains_of, gray_world, surface_at
+from polarguide.results.rendering.picking import gray_world_gains, surface_at, white_balance_gains
 from polarguide.shading.result import LAYERS
-from polarguide.viewer.messages import Refused, checked
+from polarguide.viewer.messages import Refused, checked_message
 from polarguide.viewer.panel import PanelOptions
 from polarguide.viewer.server import save_to_run
 from polarguide.viewer.session import Session
@@ -48,7 +48,7 @@ class Visit:
             AROUND,
             options,
             lambda: None,
-            gray_world=lambda: gray_world(views),
+            gray_world=lambda: gray_world_gains(views),
             save=save,
         )
         self.session.go("v0")
@@ -107,7 +107,7 @@ def test_a_picked_white_is_gray_in_the_picture_and_no_click_is_asked_for_any_mor
     place = places(visit)[0]
     before = visit.draw()
     (found,) = visit.pick("white", place)
-    gains = gains_of(found.color)
+    gains = white_balance_gains(found.color)
     assert visit.chosen.white_balance == gains
     gray = found.color * torch.tensor(gains)
     torch.testing.assert_close(gray, gray[1].expand(3))
@@ -210,14 +210,14 @@ def pointer(**changes: object) -> bytes:
 
 
 def test_clicks_pass_the_gate_with_their_place_alone() -> None:
-    raw = checked(pointer(ray_origin=[1e300, 0, 0], modifier="evil"), lambda name: None, 1.0)
+    raw = checked_message(pointer(ray_origin=[1e300, 0, 0], modifier="evil"), lambda name: None, 1.0)
     assert raw is not None
     message = msgspec.msgpack.decode(raw)
     assert (message["screen_pos"], message["modifier"]) == ([[0.25, 0.5]], None)
     assert message["ray_origin"] == [0, 0, 0]
-    clamped = checked(pointer(screen_pos=[[-3, 9]]), lambda name: None, 1.0)
+    clamped = checked_message(pointer(screen_pos=[[-3, 9]]), lambda name: None, 1.0)
     assert msgspec.msgpack.decode(clamped or b"")["screen_pos"] == [[0.0, 1.0]]
-    assert checked(pointer(event_type="rect-select"), lambda name: None, 1.0) is None
+    assert checked_message(pointer(event_type="rect-select"), lambda name: None, 1.0) is None
 
 
 @pytest.mark.parametrize(
@@ -225,4 +225,4 @@ def test_clicks_pass_the_gate_with_their_place_alone() -> None:
 )
 def test_clicks_without_a_place_are_refused(place: object) -> None:
     with pytest.raises(Refused):
-        checked(pointer(screen_pos=place), lambda name: None, 1.0)
+        checked_message(pointer(screen_pos=place), lambda name: None, 1.0)

@@ -13,7 +13,7 @@ from trainings import make_trainer
 from viewer_scenes import frame_of_scene, photograph, shown
 
 from polarguide.capture import Scene
-from polarguide.capture.presentation import Crop
+from polarguide.capture.presentation import Crop, Presentation
 from polarguide.raster.magnification import footprints
 from polarguide.recipes import recipe_named
 from polarguide.shading.result import LAYERS, POLARIZED
@@ -59,7 +59,7 @@ def test_every_layer_of_a_recipe_is_drawn_as_it_is_rendered(recipe):
 def test_exposure_and_reflection():
     seen = shown()
     result = seen.render(CAMERA, depth=False)
-    brighter = paint(seen, Appearance(exposure=-1.5))
+    brighter = paint(seen, Appearance(presentation=Presentation(exposure=-1.5)))
     assert np.array_equal(brighter, figures.radiance_to_rgb(result.final / 2**1.5))
     without = paint(seen, Appearance(strength=0.0))
     assert np.array_equal(without, figures.radiance_to_rgb(result.diffuse))
@@ -92,12 +92,19 @@ def test_features_for_a_network_are_not_turned():
 def test_a_crop_shows_what_is_inside():
     seen = shown()
     alpha = Appearance(layer="alpha")
-    assert np.array_equal(paint(seen, replace(alpha, crop=EVERYTHING)), paint(seen, alpha))
+    assert np.array_equal(
+        paint(seen, replace(alpha, presentation=Presentation(crop=EVERYTHING))), paint(seen, alpha)
+    )
     nothing = figures.scalar_to_rgb(torch.zeros(CAMERA.height, CAMERA.width), 0, 1)
     outside = Crop((8, 8, 8), (9, 9, 9))
-    assert np.array_equal(paint(seen, replace(alpha, crop=outside)), nothing)
+    assert np.array_equal(paint(seen, replace(alpha, presentation=Presentation(crop=outside))), nothing)
     # What lies above the middle is in the upper half of the picture.
-    upper = paint(seen, replace(alpha, crop=Crop((-9, 0.15, -9), (9, 9, 9)))).astype(int) - nothing
+    upper = (
+        paint(seen, replace(alpha, presentation=Presentation(crop=Crop((-9, 0.15, -9), (9, 9, 9))))).astype(
+            int
+        )
+        - nothing
+    )
     rows = np.abs(upper).sum(axis=(1, 2))
     assert rows[: CAMERA.height // 2].sum() > 3 * rows[CAMERA.height // 2 :].sum()
 

@@ -18,7 +18,7 @@ from random_runs import ring
 from viewer_scenes import photograph, shown
 
 from polarguide.capture.presentation import Presentation
-from polarguide.results.rendering.picking import gains_of, surface_at
+from polarguide.results.rendering.picking import surface_at, white_balance_gains
 from polarguide.viewer import Viewer
 from polarguide.visualization import figures
 
@@ -177,7 +177,7 @@ def test_white_and_a_length_are_picked_in_the_picture_and_saved(opened):
     page.get_by_text("Saved!").wait_for()
     found = opened.saved[-1]
     spots = [surface_at(result, camera, x + 0.5, y + 0.5) for x, y in ends]
-    assert found.white_balance == pytest.approx(gains_of(spots[0].color), rel=0.1)
+    assert found.white_balance == pytest.approx(white_balance_gains(spots[0].color), rel=0.1)
     apart = float((spots[0].point - spots[1].point).norm())
     assert found.meters_per_unit == pytest.approx(0.1 / apart, rel=0.05)
     opened.choose("White", "as photographed")

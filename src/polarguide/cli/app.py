@@ -1,53 +1,156 @@
-"""The command line: verbs by name, loaded when they are called, and the one place where errors are printed."""
+"""The command line: a table of verbs, loaded on demand, and the printing of all errors."""
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import dataclasses
 import difflib
-import functools
 import importlib.util
 import io
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, NamedTuple, get_args, get_type_hints
 
 import tyro
 
 import polarguide
 from polarguide.cli.console import print_error, warnings_printed
 from polarguide.core.errors import PolarguideError, import_part
-from polarguide.core.options import gibibytes
 from polarguide.core.system import check_variables, interrupts
 
+
+class Verb(NamedTuple):
+    """A verb of the command line: the location of its function, and the first paragraph of its docstring.
+
+    The list of all verbs shows these summaries without loading a module.
+    """
+
+    module: str
+    function: str
+    summary: str
+
+
 VERBS = {
-    "demo": ("polarguide.cli.runs", "demo"),
-    "calibrate": ("polarguide_shots.verbs", "calibrate"),
-    "scale": ("polarguide_shots.verbs", "scale"),
-    "prepare": ("polarguide.cli.captures", "prepare"),
-    "inspect": ("polarguide.cli.captures", "inspect"),
-    "train": ("polarguide.cli.runs", "train"),
-    "eval": ("polarguide.cli.runs", "evaluate"),
-    "render": ("polarguide.cli.runs", "render"),
-    "view": ("polarguide.cli.runs", "view"),
-    "present": ("polarguide.cli.captures", "present"),
-    "share": ("polarguide.cli.runs", "share"),
-    "export": ("polarguide.cli.runs", "export"),
-    "priors": ("polarguide_shots.verbs", "priors"),
-    "measure": ("polarguide_shots.verbs", "measure"),
-    "compare": ("polarguide_bench.verbs.compare", "compare_recipes"),
-    "ablate": ("polarguide_bench.verbs.compare", "ablate_recipe"),
-    "batch": ("polarguide_bench.verbs.batch", "batch"),
-    "synth": ("polarguide_synth.verbs", "synth"),
-    "bench": ("polarguide_bench.verbs.compare", "bench"),
-    "tables": ("polarguide_bench.verbs.compare", "tables"),
-    "doctor": ("polarguide.cli.doctor", "doctor"),
+    "demo": Verb(
+        "polarguide.cli.runs",
+        "demo",
+        "Train, evaluate and render the small scene that ships with the program.",
+    ),
+    "calibrate": Verb(
+        "polarguide_shots.verbs",
+        "calibrate",
+        "Calibrate a polarization camera: what each of its polarizers really measures, from shots of "
+        "one before the lens.",
+    ),
+    "scale": Verb(
+        "polarguide_shots.verbs",
+        "scale",
+        "Print a scale of angles for the ring of a polarizing filter: an SVG file in exact millimeters.",
+    ),
+    "prepare": Verb(
+        "polarguide.cli.captures",
+        "prepare_capture",
+        "Convert camera files to a scene folder: raw mosaics, shots through a rotating filter, "
+        "published datasets.",
+    ),
+    "inspect": Verb(
+        "polarguide.cli.captures",
+        "inspect_capture",
+        "Check a capture and its polarizer angles, and write a page and a JSON file.",
+    ),
+    "train": Verb(
+        "polarguide.cli.runs",
+        "train_scene",
+        "Train a recipe on a scene.",
+    ),
+    "eval": Verb(
+        "polarguide.cli.runs",
+        "evaluate_run",
+        "Score a run on its test views and write RUN/metrics.json, and RUN/errors.png with maps of the "
+        "errors.",
+    ),
+    "render": Verb(
+        "polarguide.cli.runs",
+        "render_run",
+        "Render a run's layers to PNG, with a contact sheet next to the ground truth; or along a path, as a "
+        "video.",
+    ),
+    "view": Verb(
+        "polarguide.cli.runs",
+        "view_in_browser",
+        "Show a run in a browser: its layers from any side, next to the photographs. Ctrl-C ends it.",
+    ),
+    "present": Verb(
+        "polarguide.cli.captures",
+        "present_folder",
+        "Set how a scene or a run is shown and exported: color, up, scale, crop box, credit. Data "
+        "and scores stay.",
+    ),
+    "share": Verb(
+        "polarguide.cli.runs",
+        "share_run",
+        "Write a run as one self-contained web page that renders it with its reflections.",
+    ),
+    "export": Verb(
+        "polarguide.cli.runs",
+        "export_run",
+        "Write a run as the files of other programs.",
+    ),
+    "priors": Verb(
+        "polarguide_shots.verbs",
+        "priors",
+        "Polarization maps of a shot, many shots or a scene: pictures, numbers and a page.",
+    ),
+    "measure": Verb(
+        "polarguide_shots.verbs",
+        "measure",
+        "A table of many shots for inspection lines: S0, DoLP and AoLP by region, limits, a golden part.",
+    ),
+    "compare": Verb(
+        "polarguide_bench.verbs.compare",
+        "compare_recipes",
+        "Train and score several recipes on several scenes, and set tables and a report of them.",
+    ),
+    "ablate": Verb(
+        "polarguide_bench.verbs.compare",
+        "ablate_recipe",
+        "Compare a recipe with its ablations: the same with one thing changed, each.",
+    ),
+    "batch": Verb(
+        "polarguide_bench.verbs.batch",
+        "batch",
+        "Prepare, inspect, train, score, share and export every capture of a collection, with one "
+        "page over all.",
+    ),
+    "synth": Verb(
+        "polarguide_synth.verbs",
+        "synth",
+        "Render a polarized scene with ground truth: a preset (figure, kit, car, cup, water, proof, "
+        "...) or a scene file.",
+    ),
+    "bench": Verb(
+        "polarguide_bench.verbs.compare",
+        "bench",
+        "Render the scenes of the benchmark that are missing, then train and score every recipe on "
+        "each scene.",
+    ),
+    "tables": Verb(
+        "polarguide_bench.verbs.compare",
+        "tables",
+        "Join the records of comparisons that were run apart, and set their tables anew.",
+    ),
+    "doctor": Verb(
+        "polarguide.cli.doctor",
+        "doctor",
+        "Print what is installed, what computes here, and what is missing, with the command that "
+        "installs it.",
+    ),
 }
-"""The module and the function of each verb. No module imports torch before a verb is called."""
+"""All verbs by name. No module imports torch before a verb is called."""
 DESCRIPTION = (
     "Photographs through a linear polarizer to a 3D Gaussian splatting scene with separated reflections, surface "
     "normals and diffuse color."
@@ -55,38 +158,24 @@ DESCRIPTION = (
 
 
 def function_of(verb: str) -> Callable[..., Any]:
-    """The function behind a verb; its signature and docstring are the verb's options and help."""
-    module, name = VERBS[verb]
-    function: Callable[..., Any] = getattr(import_part(module, verb), name)
-    # Options that several verbs share are the fields of dataclasses, and are called as these are.
+    """Return the function of a verb. Its signature and docstring define the options and the help."""
+    function: Callable[..., Any] = getattr(import_part(VERBS[verb].module, verb), VERBS[verb].function)
+    # Shared options are fields of dataclasses; their flags have no prefix.
     return tyro.conf.configure(tyro.conf.OmitArgPrefixes)(function)
 
 
 def summary_of(verb: str) -> Callable[[], None]:
-    """A function without options that has the first paragraph of a verb's docstring.
-
-    The list of all verbs shows nothing else: their modules are read, and not loaded.
-    """
-    module, name = VERBS[verb]
+    """Return a function without options whose docstring is the summary of a verb."""
 
     def listed() -> None: ...
 
-    listed.__doc__ = _summaries(module).get(name, "(not installed)")
+    installed = importlib.util.find_spec(VERBS[verb].module.partition(".")[0])
+    listed.__doc__ = VERBS[verb].summary if installed else "(not installed)"
     return listed
 
 
-@functools.cache
-def _summaries(module: str) -> dict[str, str]:
-    """First paragraphs of docstrings by function, of a module of verbs."""
-    package, _, _ = module.partition(".")
-    spec = importlib.util.find_spec(module) if importlib.util.find_spec(package) else None
-    source = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
-    functions = [node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)]
-    return {node.name: (ast.get_docstring(node) or "").partition("\n\n")[0] for node in functions}
-
-
 def options_of(function: Callable[..., Any]) -> dict[str, Any]:
-    """Types of all parameters by name, those in dataclasses included."""
+    """Return the types of all parameters by name, with the fields of dataclasses."""
     types: dict[str, Any] = {}
     for name, kind in get_type_hints(function).items():
         types |= get_type_hints(kind) if dataclasses.is_dataclass(kind) else {name: kind}
@@ -94,17 +183,19 @@ def options_of(function: Callable[..., Any]) -> dict[str, Any]:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run a command line; returns the exit status (0 done, 1 stopped, 2 wrong input, or what the verb says)."""
+    """Run a command line and return the exit status: 0 done, 1 stopped, 2 wrong input, or the status of the verb."""
     verb = arguments[0] if arguments and arguments[0] in VERBS else None
     before = interrupts()
     for stream in (
         sys.stdout,
         sys.stderr,
-    ):  # names of files may have bytes that are no text, or that it cannot say
+    ):  # names of files may have bytes that are not text, or that the encoding lacks
         if isinstance(stream, io.TextIOWrapper):
-            # In the C locale Python takes names of files for ASCII, and terminals show UTF-8 all the same.
-            encoding = "utf-8" if sys.getfilesystemencoding() == "ascii" else None
-            stream.reconfigure(encoding=encoding, errors="backslashreplace")
+            # In the C locale Python decodes names of files as ASCII, although terminals show UTF-8.
+            stream.reconfigure(
+                encoding="utf-8" if sys.getfilesystemencoding() == "ascii" else None,
+                errors="backslashreplace",
+            )
     try:
         with warnings_printed():
             status = _call(verb, arguments)
@@ -126,20 +217,20 @@ def run(arguments: Sequence[str]) -> int:
         message = _system_error_message(error)
         if not message:
             raise
-        traceback.clear_frames(error.__traceback__)  # they hold the memory, and printing takes some
+        traceback.clear_frames(error.__traceback__)  # they keep the memory that printing needs
         return _failed(message)
     return status
 
 
 def _stopped() -> int:
-    """Print that a signal ended the command, if stderr can be written; returns the exit status."""
+    """Print that a signal ended the command, if stderr is writable, and return the exit status."""
     with contextlib.suppress(OSError):
         print("stopped.", file=sys.stderr)
     return 130
 
 
 def _from_a_signal(error: BaseException | None) -> bool:
-    """Whether an error is what a package has made of a KeyboardInterrupt, such as C code that imports another."""
+    """Return whether a KeyboardInterrupt caused an error, such as an interrupted import in a package."""
     for _ in range(20):
         if error is None or isinstance(error, KeyboardInterrupt):
             break
@@ -148,14 +239,14 @@ def _from_a_signal(error: BaseException | None) -> bool:
 
 
 def _failed(text: str) -> int:
-    """Print an error, if stderr can be written; returns the exit status."""
+    """Print an error, if stderr is writable, and return the exit status."""
     with contextlib.suppress(OSError):
         print_error(text)
     return 2
 
 
 def _system_error_message(error: Exception) -> str:
-    """The message where memory or threads have run out, or a package cannot be loaded; empty for other errors."""
+    """Return the message for exhausted memory or threads and for packages that cannot be loaded, else an empty text."""
     if isinstance(error, MemoryError) or any(phrase in str(error) for phrase in _RUN_OUT):
         reason = (str(error).splitlines() or ["none is left"])[0]
         return f"memory: expected enough of it, and of threads, found {reason[:200]}. {_MORE_ROOM}"
@@ -169,20 +260,20 @@ def _system_error_message(error: Exception) -> str:
 
 
 def _while_loading(error: Exception) -> bool:
-    """Whether an installed package failed while it was imported, as PyTorch does with variables that it cannot read."""
+    """Return whether an installed package failed during its import, such as PyTorch with invalid variables."""
     frames = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
     ours = [number for number, name in enumerate(frames) if name.startswith(_HOME)]
     return any(name.startswith("<frozen importlib") for name in frames[ours[-1] + 1 :]) if ours else False
 
 
 _RUN_OUT = ("can't start new thread", "can't allocate memory", "not enough memory")
-_HOME = str(Path(__file__).parents[1])  # also of the neighbors, whose names begin with it
+_HOME = str(Path(__file__).parents[1])  # also the prefix of the neighbors' paths
 _SETTINGS = "Check the environment's variables for it (env), such as PYTORCH_JIT and TORCH_LOGS."
 _MORE_ROOM = "Check this shell's limits (ulimit -a) and what else runs; --threads 1 takes less."
 
 
 def _call(verb: str | None, arguments: Sequence[str]) -> int:
-    """Call a verb; returns the exit status that it gives, 0 where it gives none."""
+    """Call a verb and return its exit status, by default 0."""
     if list(arguments) == ["--version"]:
         print(f"polarguide {polarguide.__version__}", flush=True)
         return 0
@@ -190,8 +281,7 @@ def _call(verb: str | None, arguments: Sequence[str]) -> int:
         _require_place()
         check_variables()
         _refuse_paths(verb, arguments[1:])
-        line = _sizes_as_numbers(arguments[1:])
-        parsed = tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=line)
+        parsed = tyro.cli(function_of(verb), prog=f"polarguide {verb}", args=arguments[1:])
         return parsed if isinstance(parsed, int) else 0
     if arguments and not arguments[0].startswith("-"):
         raise PolarguideError(
@@ -208,7 +298,7 @@ def _call(verb: str | None, arguments: Sequence[str]) -> int:
 
 
 def _require_place() -> None:
-    """Refuse a current folder that does not exist any more: some packages end the process there, without a word."""
+    """Refuse a current folder that no longer exists. Some packages would end the process without a message."""
     try:
         os.getcwd()
     except FileNotFoundError:
@@ -221,49 +311,28 @@ def _require_place() -> None:
 
 
 def _refuse_paths(verb: str, line: Sequence[str]) -> None:
-    """Refuse what names no file or folder: null bytes, and empty texts, as unset variables of a shell leave them, which
-    would mean this folder.
+    """Refuse empty paths and null bytes. An unset variable of a shell gives an empty path, which would mean "here".
 
     Raises:
-        PolarguideError: there is one.
+        PolarguideError: a path is empty or contains a null byte.
     """
     paths = {
         _flag(name) for name, kind in options_of(function_of(verb)).items() if Path in (kind, *get_args(kind))
     }
-    for place, value in _named_values(line):
-        if (not value or "\0" in value) and (place in paths or not place.startswith("--")):
+    for before, word in pairwise(["", *line]):
+        option, assigned, value = word.partition("=")
+        if not word.startswith("--"):
+            option = before if before.startswith("--") else ""
+            value = word
+        elif not assigned:
+            continue
+        if (not value or "\0" in value) and (option in paths or not option):
             raise PolarguideError(
-                place or "the command line",
+                option or "the command line",
                 expected="the name of a file or folder",
                 found="a null byte" if value else "an empty one",
                 remedy="Name it; . is the current folder.",
             )
-
-
-def _sizes_as_numbers(line: Sequence[str]) -> list[str]:
-    """The words with what --memory is given as a number of GiB: 4GB as 3.7252902984619140."""
-    converted = list(line)
-    for place, word in enumerate(line):
-        option, equals, value = word.partition("=")
-        if option == "--memory" and equals:
-            size = gibibytes(value)
-            converted[place] = word if size is None else f"--memory={size!r}"
-        elif place and line[place - 1] == "--memory":
-            size = gibibytes(word)
-            converted[place] = word if size is None else repr(size)
-    return converted
-
-
-def _named_values(line: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """The option that each word is a value of, or an empty text, and the value."""
-    before = ""
-    for word in line:
-        name, equals, value = word.partition("=")
-        if equals and name.startswith("--"):
-            yield name, value
-        elif not word.startswith("--"):
-            yield before if before.startswith("--") else "", word
-        before = word
 
 
 def _flag(name: str) -> str:
@@ -271,7 +340,7 @@ def _flag(name: str) -> str:
 
 
 def _near(word: str) -> str:
-    """A hint for a word that is nearly a verb; also for what other programs call it."""
+    """Return a hint for a misspelled verb, or for its name in other programs."""
     others = {
         "evaluate": "eval",
         "test": "eval",
@@ -287,9 +356,9 @@ def _near(word: str) -> str:
 
 
 def _as_flag(error: PolarguideError, verb: str | None) -> str:
-    """The message; a parameter that is at fault is called as on the command line."""
+    """Return the message of an error, with a parameter named as on the command line."""
     text = str(error)
-    if verb in (None, error.where) or error.is_path:  # a verb as the place: its package is missing
+    if verb in (None, error.where) or error.is_path:  # the package of the verb is missing
         return text
     if error.where in options_of(function_of(verb)):
         return f"{_flag(error.where)}{text.removeprefix(error.where)}"

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from polarguide.cli.console import ConsoleReporter, console, say, use_threads
+from polarguide.cli.console import ConsoleReporter, console, say, set_threads
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import ComputeOptions, ThreadOptions
 from polarguide.core.text import command
@@ -17,7 +17,7 @@ from polarguide.inspection.settings import InspectSettings
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 
 
-def prepare(
+def prepare_capture(
     source: Annotated[Path, tyro.conf.Positional],
     /,
     *,
@@ -31,11 +31,11 @@ def prepare(
     The same command resumes a stopped preparation. docs/reference/formats.md describes the files.
 
     Args:
-        source: Folder of raw mosaics (one file a view), filter shots (four subfolders, or four suffixes of names),
+        source: Folder of raw mosaics (one file per view), filter shots (four subfolders, or four suffixes of names),
             ordinary photographs, or a dataset.
         out: Scene folder to write.
     """
-    use_threads(compute.threads)
+    set_threads(compute.threads)
     preparation = importlib.import_module("polarguide.preparation.prepare")
     with_angles = replace(settings, calibration=angles.read(), analyzers=angles.analyzers())
     prepared = preparation.prepare_scene(source, out, with_angles, ConsoleReporter())
@@ -54,7 +54,7 @@ def prepare(
 COLORS = {"ok": "green", "warning": "yellow", "wrong": "bold red", "n/a": "dim", "not verified": "magenta"}
 
 
-def inspect(
+def inspect_capture(
     scene: Annotated[Path, tyro.conf.Positional],
     /,
     *,
@@ -65,15 +65,17 @@ def inspect(
 ) -> None:
     """Check a capture and its polarizer angles, and write a page and a JSON file.
 
-    Each check ends in ok, warning, wrong or n/a, and says what to do. Camera poses are needed only to check the order,
-    the direction of rotation and the zero of the angles. docs/how-to/inspect.md describes the checks and what they
-    cannot decide.
+    Each check results in ok, warning, wrong or n/a, and names a remedy. Camera poses are needed only to check the
+    order,
+    the direction of rotation and the zero of the angles. docs/how-to/inspect.md describes the checks and their
+    limits.
 
     Args:
         scene: Scene folder.
-        out: Folder for the page. Without it, SCENE-inspection beside the scene.
-        fix: New folder for a corrected copy of the scene, written if the order, the direction or the zero is wrong and
-            the right one is certain.
+        out: Folder for the page; default: SCENE-inspection next to the scene.
+        fix: New folder for a corrected copy of the scene, written if the order, the direction or the zero is wrong
+            and
+            the correction is certain.
     """
     if fix is not None and settings.calibration is not None:
         raise PolarguideError(
@@ -82,7 +84,7 @@ def inspect(
             found="both",
             remedy="Prepare the mosaics anew with --calibration, and fix that scene.",
         )
-    use_threads(compute.threads)
+    set_threads(compute.threads)
     reporter = ConsoleReporter()
     inspection = importlib.import_module("polarguide.inspection.inspect")
     folder = inspection.inspection_folder(scene, out)
@@ -101,7 +103,7 @@ def inspect(
 
 
 def _fix(inspected: Any, out: Path, reporter: ConsoleReporter) -> None:
-    """Write the corrected copy, or say that there is nothing to correct."""
+    """Write the corrected copy, or print that nothing needs correction."""
     fixing = importlib.import_module("polarguide.inspection.corrections")
     if not inspected.capture.four:
         raise PolarguideError(
@@ -129,7 +131,7 @@ def _print_checks(checks: Any) -> None:
 
 
 def _print_verdict(inspected: Any) -> None:
-    """The worst of all checks, and what nobody has verified."""
+    """Print the worst result of all checks, and the checks that were not verified."""
     open_ = [check.title.lower() for check in inspected.checks if check.verdict == "not verified"]
     beside = f"; not verified: {', '.join(open_)}" if open_ and inspected.verdict != "not verified" else ""
     beside = f": {', '.join(open_)}" if inspected.verdict == "not verified" else beside
@@ -137,7 +139,7 @@ def _print_verdict(inspected: Any) -> None:
 
 
 def _print_angles(angles: Any) -> None:
-    """The odds of the orders, and what they come from."""
+    """Print the probabilities of the orders and their sources."""
     if angles.hypotheses:
         say("order of the pictures called 0, 45, 90, 135: probability (log-odds to the best)")
     for row in sorted(angles.hypotheses, key=lambda row: -row.probability):
@@ -150,7 +152,7 @@ def _print_angles(angles: Any) -> None:
         say(f"  {evidence.source}{used}: {evidence.note}")
 
 
-def present(
+def present_folder(
     folder: Annotated[Path, tyro.conf.Positional],
     /,
     *,
@@ -171,31 +173,37 @@ def present(
 ) -> None:
     """Set how a scene or a run is shown and exported: color, up, scale, crop box, credit. Data and scores stay.
 
-    What is set stands in presentation.json in the folder. A scene's holds for all its runs; a run's goes before it.
-    What is not given stays as it is, "none" removes it, and without an option it is printed. `polarguide view RUN` lets
-    you pick the same with the mouse. A VIEW,X,Y is a pixel of a photograph, counted from its top left corner.
+    The settings are in presentation.json in the folder. A scene's settings apply to all its runs; a run's own
+    settings take
+    precedence. Omitted options keep their values, "none" removes a value, and without options the settings are
+    printed.
+    `polarguide view RUN` sets the same with the mouse. VIEW,X,Y is a pixel of a photograph, from its top left corner.
 
     Args:
         folder: Folder of a scene or a run.
-        white_balance: gray (the photographs' mean becomes gray), gains such as 1.9,1,1.6, or VIEW,X,Y where something
-            white or gray is.
-        chart: VIEW,X,Y,X,Y,X,Y,X,Y: the centers of the corner patches of a 24-patch color chart in a photograph, around
-            it; or the folder of another scene, whose chart it takes. It replaces a white balance.
-        exposure: Stops by which all is shown brighter, such as 0.5.
-        up_axis: An axis such as z or --up-axis=-y, three numbers, or VIEW,X,Y where a level surface is. Without it, up
-            is as the cameras say.
-        points: Two points of known distance: X,Y,Z in the scene, VIEW,X,Y on a surface, or VIEW for a camera's place.
-        distance: Of the two points, such as 85mm.
-        meters_per_unit: How long a unit of the scene is, in place of points and distance.
+        white_balance: gray (the photographs' mean becomes gray), gains such as 1.9,1,1.6, or VIEW,X,Y of something
+            white
+            or gray.
+        chart: VIEW,X,Y,X,Y,X,Y,X,Y: the centers of the corner patches of a 24-patch color chart in a photograph,
+            around
+            it; or the folder of another scene with a chart. It replaces a white balance.
+        exposure: Exposure compensation in stops, such as 0.5.
+        up_axis: An axis such as z or --up-axis=-y, three numbers, or VIEW,X,Y of a level surface. Default: the up
+            axis of
+            the cameras.
+        points: Two points of known distance: X,Y,Z in the scene, VIEW,X,Y on a surface, or VIEW for a camera's
+            position.
+        distance: Distance of the two points, such as 85mm.
+        meters_per_unit: Length of a unit of the scene, in place of points and distance.
         crop: Box as --crop=left,right,down,up,front,back in percent of the cameras' distance; all: the whole scene.
-            Without it, what the scene's masks show, or the region that most of the cameras have in their pictures.
-        title: One line.
-        author: Whom the capture is owed to.
-        license: Such as CC-BY-4.0.
-        provenance: Where, when and with what it was captured, or its number in an inventory.
-        scene: Where the scene of a run lies now, if it was moved or is on another machine.
+            Default: the foreground of the scene's masks, or the region that most of the cameras see.
+        title: Title, one line.
+        author: Author of the capture.
+        license: License, such as CC-BY-4.0.
+        provenance: Place, time and equipment of the capture, or its inventory number.
+        scene: New folder of a run's scene, if the scene was moved or is on another machine.
     """
-    use_threads(compute.threads)
+    set_threads(compute.threads)
     presenting = importlib.import_module("polarguide.results.rendering.present")
     presented = presenting.present(
         folder,
@@ -217,5 +225,5 @@ def present(
     )
     if scene is not None:
         say(f"the scene of {folder} is {scene}")
-    for line in presenting.described(presented):
+    for line in presenting.presentation_lines(presented):
         say(line)

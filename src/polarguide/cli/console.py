@@ -1,4 +1,4 @@
-"""The console: messages, warnings and progress, as bars on a terminal and as lines anywhere else."""
+"""Console output: messages, warnings, and progress as bars on a terminal or as lines elsewhere."""
 
 from __future__ import annotations
 
@@ -23,40 +23,40 @@ from polarguide.core.progress import Advance, Reporter
 from polarguide.core.system import process_rank
 from polarguide.core.text import printable
 
-# Of several processes of one training, the first alone talks.
+# Only the first of several processes of a training prints.
 console = Console(highlight=False, soft_wrap=True, quiet=process_rank() > 0)
 
 
-# Of a file or the command line: megabytes of it hide what is wrong.
+# Texts from files and the command line may have megabytes, which would hide the error.
 _LONG_WORD = re.compile(r"\S{1000,}?(?=:?(?:\s|$))")
 
 
 def say(text: object, *, lines: bool = False, to: Console = console) -> None:
-    """Print a text, of several ``lines``: names in it are neither markup, nor anything that a terminal obeys."""
+    """Print a text without markup and control characters. With ``lines`` its line breaks are kept."""
     to.print(printable(str(text), lines=lines), markup=False)
 
 
 def warn(text: object) -> None:
-    """Print a warning; names in it are shown as they are, but for control characters."""
+    """Print a warning without markup and control characters."""
     console.print("[yellow]warning:[/] ", end="")
     say(text)
 
 
 def print_error(text: str) -> None:
-    """Print an error on the standard error stream, with words of a thousand characters and more cut."""
+    """Print an error on the standard error stream. Words of a thousand characters and more are truncated."""
     errors = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
     errors.print("[bold red]error:[/] ", end="")
     say(_LONG_WORD.sub(lambda word: word[0][:200] + "...", text), to=errors)
 
 
 def size_text(size: int) -> str:
-    """The size of a file in bytes, for people."""
+    """Return the size of a file as text, in MB or kB."""
     return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{max(1, round(size / 1e3))} kB"
 
 
 @contextlib.contextmanager
 def warnings_printed() -> Iterator[None]:
-    """Inside, the library's warnings are lines on the console."""
+    """Print the library's warnings on the console inside this context."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", PolarguideWarning)
         others = warnings.showwarning
@@ -71,29 +71,29 @@ def warnings_printed() -> Iterator[None]:
         yield
 
 
-def use_threads(threads: int) -> None:
-    """Let our kernels, torch and OpenCV use this many threads; 0 leaves their defaults."""
+def set_threads(threads: int) -> None:
+    """Set the number of threads of our kernels, torch and OpenCV; 0 keeps their defaults."""
     if threads:
         importlib.import_module("polarguide.raster").use_threads(threads)
         importlib.import_module("cv2").setNumThreads(threads)
 
 
 LINE_SECONDS = 15.0
-"""Between two lines of progress where there is no terminal."""
+"""Least time in seconds between two lines of progress without a terminal."""
 MEASURED = 0.05
-"""Share of the steps that is measured before their rate tells the time left."""
+"""Share of the steps before the remaining time is estimated."""
 UNKNOWN_TIME = "-:--:--"
 
 
 class Rate:
-    """Measures how fast a piece of work advances, from the first report on.
+    """Rate of a piece of work since its first report.
 
     Args:
-        total: how much there is to do; None where that is not known yet.
-        clock: gives the seconds of a report that does not state them.
+        total: amount of work; None: not known yet.
+        clock: time of reports that do not state their own.
 
     Attributes:
-        total: as above, or as a report has stated since.
+        total: amount of work, possibly updated by a report.
     """
 
     def __init__(self, total: int | None, clock: Callable[[], float] = time.monotonic) -> None:
@@ -102,14 +102,14 @@ class Rate:
         self._first: tuple[float, int] | None = None
 
     def left(self, done: int, total: int | None = None, seconds: float | None = None) -> float | None:
-        """Seconds that the remaining steps take at the rate so far; None before it is measured.
+        """Return the estimated remaining time in seconds, or None before enough work is done.
 
         Args:
             done, total, seconds: see ``core.progress.Advance``.
         """
         self.total = total or self.total
         now = self.clock() if seconds is None else seconds
-        if self._first is None:  # a training that is resumed does not begin at step 0
+        if self._first is None:  # a resumed training does not begin at step 0
             self._first = (now, done)
         begin, first = self._first
         steps = done - first
@@ -118,8 +118,8 @@ class Rate:
         return (now - begin) / steps * max(0, self.total - done)
 
 
-def clock(seconds: float | None) -> str:
-    """Hours, minutes and seconds."""
+def duration_text(seconds: float | None) -> str:
+    """Return a duration as hours, minutes and seconds."""
     if seconds is None:
         return UNKNOWN_TIME
     whole = round(seconds)
@@ -127,18 +127,17 @@ def clock(seconds: float | None) -> str:
 
 
 def bars() -> Progress:
-    """A display of progress bars; a bar has the fields ``note`` and ``left``.
+    """Return a display of progress bars with the fields ``note`` and ``left``.
 
-    Step, total and time left are always shown; label and note share what room is left, and are cut.
+    Step, total and remaining time are always visible; label and note share the remaining width.
     """
-    label = Column(no_wrap=True, overflow="ellipsis", max_width=26)
-    note = Column(no_wrap=True, overflow="ellipsis", ratio=1)
+    cut: dict[str, Any] = {"no_wrap": True, "overflow": "ellipsis"}
     return Progress(
-        TextColumn("{task.description}", markup=False, table_column=label),
+        TextColumn("{task.description}", markup=False, table_column=Column(max_width=26, **cut)),
         BarColumn(bar_width=10),
         MofNCompleteColumn(table_column=Column(no_wrap=True)),
         TextColumn("{task.fields[left]}", style="progress.remaining", table_column=Column(no_wrap=True)),
-        TextColumn("{task.fields[note]}", markup=False, table_column=note),
+        TextColumn("{task.fields[note]}", markup=False, table_column=Column(ratio=1, **cut)),
         console=console,
         transient=True,
         expand=True,
@@ -146,44 +145,47 @@ def bars() -> Progress:
 
 
 class Lines:
-    """Progress of one piece of work as lines, for logs: not more often than every ``LINE_SECONDS``."""
+    """Progress of one piece of work as lines of a log, at most one every ``LINE_SECONDS``."""
 
     def __init__(self, label: str, total: int | None, clock: Callable[[], float] = time.monotonic) -> None:
         self._label = label
-        self.clock = clock
         self._rate = Rate(total, clock)
         self._last = clock()
         self._line = ""
+        self._noted = False
 
     def __call__(
         self, done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
     ) -> None:
         """See ``core.progress.Advance``."""
-        now = self.clock()
+        now = self._rate.clock()
         left = self._rate.left(done, total, seconds)
-        time_left = f", {clock(left)} left" if left else ""
+        time_left = f", {duration_text(left)} left" if left else ""
         of = "" if self._rate.total is None else f"/{self._rate.total}"
         self._line = f"{self._label} {done}{of}{time_left}" + (f"  {note}" if note else "")
+        self._noted = bool(note)
         if now - self._last >= LINE_SECONDS:
             self._last = now
-            self._print()
-
-    def close(self, *, last: bool) -> None:
-        """Print the last state if it stays on a terminal, too."""
-        if last:
-            self._print()
-
-    def _print(self) -> None:
-        if self._line:
             say(self._line)
             self._line = ""
 
+    def close(self) -> None:
+        """Print the last state if it has a note, like the bar that stays on a terminal."""
+        if self._noted and self._line:
+            say(self._line)
+
 
 class ConsoleReporter(Reporter):
-    """Prints what an operation reports. Bars disappear at the end, except those with a note."""
+    """Reporter that prints messages, and one display with a bar for each piece of work in progress.
+
+    The last bar stays on the terminal if it has a note.
+    """
+
+    def __init__(self) -> None:
+        self._display = bars()
 
     def say(self, text: str) -> None:
-        """Print a finding; brackets in it are shown as they are."""
+        """Print a result without markup."""
         say(text, lines=True)
 
     def warn(self, text: str) -> None:
@@ -192,41 +194,33 @@ class ConsoleReporter(Reporter):
 
     @contextlib.contextmanager
     def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
-        """A progress bar, or lines where there is no terminal."""
+        """Show a progress bar below the open ones, or print lines without a terminal."""
         label = printable(label)
         if not console.is_terminal:
-            with lines(label, total) as tell:
-                yield tell
+            lines = Lines(label, total)
+            try:
+                yield lines
+            finally:
+                lines.close()
             return
-        with bars() as progress:
-            task = progress.add_task(label, total=total, note="", left=UNKNOWN_TIME)
-            rate = Rate(total)
+        display = self._display
+        display.start()
+        task = display.add_task(label, total=total, note="", left=UNKNOWN_TIME)
+        rate = Rate(total)
 
-            def advance(
-                done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
-            ) -> None:
-                progress.live.transient = not note
-                left = clock(rate.left(done, total, seconds))
-                progress.update(task, completed=done, total=total, note=note, left=left)
+        def advance(
+            done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
+        ) -> None:
+            left = duration_text(rate.left(done, total, seconds))
+            display.live.transient = not note
+            display.update(task, completed=done, total=total, note=note, left=left)
 
+        try:
             yield advance
-
-
-@contextlib.contextmanager
-def lines(label: str, total: int | None) -> Iterator[Advance]:
-    """Progress as lines; the last one is printed where the work had a note."""
-    printer = Lines(label, total)
-    noted = False
-
-    def advance(done: int, *, total: int | None = None, note: str = "", seconds: float | None = None) -> None:
-        nonlocal noted
-        noted = bool(note)
-        printer(done, total=total, note=note, seconds=seconds)
-
-    try:
-        yield advance
-    finally:
-        printer.close(last=noted)
+        finally:
+            if len(display.tasks) == 1:
+                display.stop()
+            display.remove_task(task)
 
 
 if TYPE_CHECKING:
@@ -235,9 +229,10 @@ if TYPE_CHECKING:
 RunFolder = Annotated[Path, tyro.conf.Positional]
 
 
-def opened(run: Path, compute: ThreadOptions) -> tuple[Run, ConsoleReporter]:
-    """The opened run, on the device of the options (the CPU without such an option), and the console."""
-    use_threads(compute.threads)
+def open_run_folder(run: Path, compute: ThreadOptions) -> tuple[Run, ConsoleReporter]:
+    """Open a run on the device of the options (default: the CPU); returns the run and the console's reporter."""
+    set_threads(compute.threads)
     reporter = ConsoleReporter()
-    device = compute.device if isinstance(compute, ComputeOptions) else "cpu"
-    return polarguide.open_run(run, device=device, reporter=reporter), reporter
+    return polarguide.open_run(
+        run, device=compute.device if isinstance(compute, ComputeOptions) else "cpu", reporter=reporter
+    ), reporter

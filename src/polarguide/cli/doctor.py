@@ -1,4 +1,4 @@
-"""``polarguide doctor``."""
+"""The verb ``doctor``."""
 
 from __future__ import annotations
 
@@ -29,17 +29,18 @@ EXTRAS = {
     "cluster": "compare, ablate, bench and batch on SLURM or PBS",
     "synth": "synth and bench: scenes with ground truth",
 }
-"""The extras that users need, and what for; docs and test are for those who change polarguide."""
+"""Purposes of the extras for users; docs and test are for developers of polarguide."""
 _CUDA_LIBRARY = re.compile(r"(nvidia|cuda)[-_]|triton$")
-"""Names of the distributions that PyTorch for CUDA brings along."""
+"""Names of the distributions that PyTorch for CUDA depends on."""
 GIB = float(1 << 30)
 
 
 def doctor(*, json: bool = False) -> int:
     """Print what is installed, what computes here, and what is missing, with the command that installs it.
 
-    Ends with exit status 1 where something that every command needs is missing or cannot be loaded. The output belongs
-    into a report of a problem; it names folders of this machine, and nothing of your captures.
+    The exit status is 1 if a package that every command needs is missing or cannot be loaded. Attach the output to
+    the
+    report of a problem: it contains folders of this machine, but nothing of your captures.
 
     Args:
         json: Print one JSON object instead of text.
@@ -53,13 +54,14 @@ def doctor(*, json: bool = False) -> int:
 
 
 def diagnosis() -> dict[str, Any]:
-    """The state of this installation, as plain values that JSON can hold.
+    """Return the state of this installation as plain values for JSON.
 
     Returns:
         ``polarguide`` and ``python``: versions. ``packages``: versions by name, None for a package that is not
         installed. ``kernels`` and ``torch``: their properties, or ``error`` alone if they cannot be loaded.
-        ``extras``: optional packages. ``machine``: processor, memory and disk. ``problems``: lines about faults that
-        make commands fail. ``notes``: lines about faults that do not.
+        ``extras``: optional packages. ``machine``: processor, memory and disk. ``problems``: faults that make
+        commands
+        fail. ``notes``: other faults.
     """
     packages = {
         each.name: _version(each.name)
@@ -81,7 +83,13 @@ def diagnosis() -> dict[str, Any]:
         "kernels": kernels,
         "torch": torch,
         "extras": extras,
-        "machine": _machine(),
+        "machine": {
+            "system": platform.platform(),
+            "processor": platform.machine(),
+            "cores": os.cpu_count(),
+            "free_memory_gib": round(free_memory() / GIB, 1),
+            "free_disk_gib": round(shutil.disk_usage(Path.cwd()).free / GIB, 1),
+        },
         "problems": problems,
         "notes": _notes(torch, extras),
     }
@@ -95,21 +103,21 @@ def _version(distribution: str) -> str | None:
 
 
 def _kernels() -> dict[str, Any]:
-    """The instruction set and the threads of our kernels."""
+    """Return the instruction set and the number of threads of our kernels."""
     try:
         native = importlib.import_module("polarguide._native")
-    except Exception as error:  # loaders and their operating systems raise all kinds
+    except Exception as error:  # loaders of different systems raise different errors
         return {"error": _line(error)}
     return {"instruction_set": native.simd(), "threads": native.thread_count(), "file": native.__file__}
 
 
 def _torch() -> dict[str, Any]:
-    """PyTorch's threads, the CUDA that it was built for, and the GPUs that it can use."""
+    """Return PyTorch's threads, its CUDA version, and the usable GPUs."""
     try:
         torch = importlib.import_module("torch")
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
         properties = [torch.cuda.get_device_properties(number) for number in range(count)]
-    except Exception as error:  # loaders and their operating systems raise all kinds
+    except Exception as error:  # loaders of different systems raise different errors
         return {"error": _line(error)}
     gpus = [{"name": each.name, "memory_gib": round(each.total_memory / GIB, 1)} for each in properties]
     return {
@@ -125,7 +133,7 @@ def _line(error: Exception) -> str:
 
 
 def _extra(name: str, use: str) -> dict[str, Any]:
-    """Installed and missing packages of an extra, and the command that installs the latter (None: none is missing)."""
+    """Return installed and missing packages of an extra, and the command that installs the missing ones, or None."""
     wanted = [each for each in requirements() if each.extra == name]
     missing = [each.name for each in wanted if _version(each.name) is None]
     return {
@@ -136,19 +144,8 @@ def _extra(name: str, use: str) -> dict[str, Any]:
     }
 
 
-def _machine() -> dict[str, Any]:
-    """The system, its processors, and what is free of memory and of the disk of the current folder, in GiB."""
-    return {
-        "system": platform.platform(),
-        "processor": platform.machine(),
-        "cores": os.cpu_count(),
-        "free_memory_gib": round(free_memory() / GIB, 1),
-        "free_disk_gib": round(shutil.disk_usage(Path.cwd()).free / GIB, 1),
-    }
-
-
 def _notes(torch: dict[str, Any], extras: dict[str, Any]) -> list[str]:
-    """Shortcomings that do not stop anything."""
+    """Return faults that do not make commands fail."""
     if not extras:
         return ["polarguide is not installed here, so that its packages cannot be checked: pip install ."]
     if torch.get("gpus") and extras["cuda"]["missing"]:
@@ -162,7 +159,9 @@ def _notes(torch: dict[str, Any], extras: dict[str, Any]) -> list[str]:
 
 
 def _useless_cuda(version: str) -> str:
-    """A line about a PyTorch for CUDA where there is no GPU, its size, and the commands that replace it."""
+    """Return a note about PyTorch for CUDA on a machine without a GPU, with its size and the commands that replace
+    it.
+    """
     libraries = {
         name: sum((file.size or 0) for file in each.files or ())
         for each in metadata.distributions()
@@ -181,24 +180,28 @@ def _print(report: dict[str, Any]) -> None:
     torch = report["torch"]
     machine = report["machine"]
     table = Table("", Column(overflow="fold"), box=None, show_header=False, pad_edge=False)
-    table.add_row("polarguide", f"{report['polarguide']['version']}  {report['polarguide']['folder']}")
-    table.add_row("Python", f"{report['python']['version']}  {report['python']['executable']}")
-    table.add_row("system", f"{machine['system']}, {machine['cores']} cores")
-    table.add_row("free memory", f"{machine['free_memory_gib']} GiB")
-    table.add_row("free disk", f"{machine['free_disk_gib']} GiB in this folder")
+    rows = {
+        "polarguide": f"{report['polarguide']['version']}  {report['polarguide']['folder']}",
+        "Python": f"{report['python']['version']}  {report['python']['executable']}",
+        "system": f"{machine['system']}, {machine['cores']} cores",
+        "free memory": f"{machine['free_memory_gib']} GiB",
+        "free disk": f"{machine['free_disk_gib']} GiB in this folder",
+    }
     if "error" not in kernels:
-        table.add_row("kernels", f"{kernels['instruction_set']}, threads: {kernels['threads']}")
+        rows["kernels"] = f"{kernels['instruction_set']}, threads: {kernels['threads']}"
     if "error" not in torch:
-        gpus = ", ".join(f"{each['name']} ({each['memory_gib']} GiB)" for each in torch["gpus"]) or "none"
-        table.add_row("PyTorch", f"{torch['version']}, threads: {torch['threads']}")
-        table.add_row("GPU", gpus)
-    others = [f"{name} {version}" for name, version in report["packages"].items() if version]
-    table.add_row("packages", ", ".join(others))
+        rows["PyTorch"] = f"{torch['version']}, threads: {torch['threads']}"
+        gpus = [f"{each['name']} ({each['memory_gib']} GiB)" for each in torch["gpus"]]
+        rows["GPU"] = ", ".join(gpus) or "none"
+    rows["packages"] = ", ".join(
+        f"{name} {version}" for name, version in report["packages"].items() if version
+    )
     for name, extra in report["extras"].items():
         state = extra["command"] or ", ".join(f"{each} {v}" for each, v in extra["installed"].items())
-        table.add_row(
-            f"extra {name}", f"{'missing' if extra['missing'] else 'installed'} ({extra['use']}): {state}"
-        )
+        installed = "missing" if extra["missing"] else "installed"
+        rows[f"extra {name}"] = f"{installed} ({extra['use']}): {state}"
+    for row in rows.items():
+        table.add_row(*row)
     console.print(table, markup=False, soft_wrap=False)
     for note in report["notes"]:
         say(note)

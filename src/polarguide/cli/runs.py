@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 import polarguide
-from polarguide.cli.console import ConsoleReporter, RunFolder, console, opened, say, size_text, warn
+from polarguide.cli.console import ConsoleReporter, RunFolder, console, open_run_folder, say, size_text, warn
 from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.options import (
     EXPORT_PACKAGES,
@@ -34,7 +34,7 @@ from polarguide.core.text import command, printable
 from polarguide.training.settings import TrainSettings
 
 
-def train(
+def train_scene(
     scene: Annotated[Path, tyro.conf.Positional],
     /,
     *,
@@ -47,17 +47,20 @@ def train(
 ) -> None:
     """Train a recipe on a scene.
 
-    Can be stopped with Ctrl-C at any time: the state is saved, and --resume goes on to the same result. Several
-    processes share the views of each step: torchrun --nproc-per-node N --no-python polarguide train ...
+    Ctrl-C stops the training and saves its state; --resume continues to the same result. Several processes share the
+    views
+    of each step: torchrun --nproc-per-node N --no-python polarguide train ...
 
     Args:
         scene: Scene folder: polar/<view>_000|_045|_090|_135.png or four folders I-00 I-45 I-90 I-135, and a COLMAP
             model in sparse/0.
         out: Run folder to write (configuration, checkpoint, log, PLY).
-        recipe: Which method: polarguide-stokes (renders the measured polarization, too), polarguide (PolarGuide-GSDR's
-            stages with repaired physics), polarguide-paper; 3dgs, 3dgs-dr and ref-gs, which ignore polarization; an
-            ablation of one, such as polarguide:without-normals; or a recipe of an installed package.
-        resume: Go on with the run in --out.
+        recipe: Method: polarguide-stokes (renders the measured polarization as well), polarguide (PolarGuide-GSDR's
+            stages
+            with repaired physics), polarguide-paper; 3dgs, 3dgs-dr and ref-gs, which ignore polarization; an ablation
+            of
+            one, such as polarguide:without-normals; or a recipe of an installed package.
+        resume: Continue the run in --out.
     """
     with StopSignals() as should_stop:
         try:
@@ -73,37 +76,37 @@ def train(
                 should_stop=should_stop,
             )
         except KeyboardInterrupt as stopped:
-            if str(stopped):  # it was asked to stop, and says after which step it did
+            if str(stopped):  # a requested stop; the text names the last step
                 say(f"{stopped}; go on with the same command and --resume")
             raise
     say(f"trained: {out}   next: {command('eval', out)}   {command('view', out)}")
 
 
 _MOST_OBJECTS = 100
-"""Lines of the table: a terminal takes minutes to lay out the most that a scene may have."""
+"""Largest number of rows in the table of objects. The layout of the largest possible table takes minutes."""
 
 
-def evaluate(
+def evaluate_run(
     run: RunFolder,
     /,
     *,
     speed: bool = True,
     compute: ComputeOptions = ComputeOptions(),
 ) -> None:
-    """Score a run on its test views and write RUN/metrics.json, and RUN/errors.png, where the errors are.
+    """Score a run on its test views and write RUN/metrics.json, and RUN/errors.png with maps of the errors.
 
     Args:
         run: Run folder.
-        speed: Measure frames a second; --speed makes sense only while nothing else runs.
+        speed: Measure frames per second. The result is valid only while nothing else runs.
     """
-    trained, reporter = opened(run, compute)
+    trained, reporter = open_run_folder(run, compute)
     record = trained.evaluate(speed=speed, reporter=reporter)
     title = (
         f"{trained.configuration.recipe} on {trained.scene.name}: mean of {len(record['views'])} test views"
     )
     print_scores(record, title)
     health = trained.health
-    for warning in () if health is None else health.warnings:
+    for warning in health.warnings if health else ():
         warn(warning)
     say(f"polarization: {trained.polarization}")
     say("health: not recorded, the training was not checked" if health is None else health.summary)
@@ -135,7 +138,7 @@ def print_scores(record: dict[str, Any], title: str) -> None:
 
 
 def _errors(record: dict[str, Any], columns: list[Any]) -> Table:
-    """Errors by object and by material, over the pixels of all test views; ``columns``: metrics."""
+    """Return a table of the errors by object and by material, over the pixels of all test views."""
     table = Table(title="by object and material, over the pixels of all test views")
     table.add_column("object", no_wrap=True)
     table.add_column("pixels", justify="right", no_wrap=True)
@@ -165,7 +168,7 @@ FRAMES = 120
 LAYERS = "final,base,reflection,specular,diffuse,strength,roughness,metalness,normal,depth,dolp,aolp"
 
 
-def render(
+def render_run(
     run: RunFolder,
     /,
     *,
@@ -182,7 +185,7 @@ def render(
     out: Path | None = None,
     compute: ComputeOptions = ComputeOptions(),
 ) -> None:
-    """Render a run's layers to PNG, with a contact sheet beside the ground truth; or along a path, as a video.
+    """Render a run's layers to PNG, with a contact sheet next to the ground truth; or along a path, as a video.
 
     specular and diffuse are the contributions that add up to final; normals are in camera space, blue facing the
     camera.
@@ -191,18 +194,19 @@ def render(
         run: Run folder.
         views: test, train, all, or names separated by commas.
         layers: Any of final, base, reflection, specular, diffuse, strength, roughness, metalness, normal, depth,
-            alpha, and the predicted polarization: stokes, dolp, aolp. By default most of them, along a path final.
-        path: In place of views: orbit, turntable (so near that the subject fills the picture), spiral, interpolate
-            (through the photographs), or a JSON file of cameras.
-        frames: Pictures along the path (a file has its own).
-        size: Of the pictures along the path, such as 1920x1080, all layers together.
-        video: MP4 file to write of the path, layers side by side with their names; PNG files if not given.
-        format: Of the layers of views: png as a display shows them, or exr and npy with the linear numbers, whose units
-            layers.json states. The contact sheet is PNG.
-        transparent: PNG files of views are transparent where nothing is, without a dark rim around the subject.
-        environment: Panorama of linear radiance (.hdr, .exr) to be reflected in place of the learned environment.
-        rotate_environment: Degrees by which to turn the environment, counter-clockwise seen from above.
-        out: Folder to write; RUN/render by default.
+            alpha, and the predicted polarization: stokes, dolp, aolp. Default: most of them; along a path, final.
+        path: Camera path in place of views: orbit, turntable (so near that the subject fills the picture), spiral,
+            interpolate (through the photographs), or a JSON file of cameras.
+        frames: Number of pictures along the path (a file has its own).
+        size: Size of the pictures along the path, such as 1920x1080, for all layers together.
+        video: MP4 file of the path, layers side by side with their names; default: PNG files.
+        format: Format of the layers of views: png as a display shows them, or exr and npy with the linear numbers,
+            whose
+            units layers.json states. The contact sheet is PNG.
+        transparent: Write PNG files of views with a transparent background, without a dark rim around the subject.
+        environment: Panorama of linear radiance (.hdr, .exr) that replaces the learned environment.
+        rotate_environment: Rotation of the environment in degrees, counter-clockwise seen from above.
+        out: Folder to write; default: RUN/render.
     """
     if video is not None and (not path or video.suffix.lower() != ".mp4"):
         raise PolarguideError(
@@ -240,7 +244,7 @@ def render(
     if layers is None:
         layers = "final" if path else LAYERS
     names = [name.strip() for name in layers.split(",") if name.strip()]
-    trained, reporter = opened(run, compute)
+    trained, reporter = open_run_folder(run, compute)
     trained.relight(environment, rotate_environment, reporter=reporter)
     if path:
         trained.write_film(
@@ -262,7 +266,7 @@ DEMO_STEPS = 2000
 FIRST_VIEW = "v022"
 FIRST_LAYERS = ("final", "specular", "diffuse", "normal")
 FINER = 3
-"""How many times finer than the photographs the first picture is."""
+"""Size of the first picture in units of the photographs' size."""
 
 
 def demo(
@@ -275,17 +279,21 @@ def demo(
     """Train, evaluate and render the small scene that ships with the program.
 
     Args:
-        out: Run folder to write; a demo there that is finished or was interrupted is resumed.
+        out: Run folder to write; a finished or interrupted demo in it is resumed.
         steps: Optimizer steps.
-        seed: Seed of every random draw.
+        seed: Seed of all random numbers.
     """
     scene = polarguide.demo_scene()
     say(f"scene: {scene} (50 views of glossy objects, four polarizer angles each)")
-    settings = TrainSettings(steps, seed)
-    session = SessionOptions(threads=machine.threads)
-    train(scene, out=out, settings=settings, session=session, resume=(out / "run.json").exists())
-    evaluate(out, compute=ComputeOptions(machine.threads))
-    render(out)
+    train_scene(
+        scene,
+        out=out,
+        settings=TrainSettings(steps, seed),
+        session=SessionOptions(threads=machine.threads),
+        resume=(out / "run.json").exists(),
+    )
+    evaluate_run(out, compute=ComputeOptions(machine.threads))
+    render_run(out)
     picture = _first_picture(out)
     say(f"look at {picture}: {FIRST_VIEW}, which training has not seen, and its layers")
     say(
@@ -296,7 +304,7 @@ def demo(
 
 
 def _first_picture(out: Path) -> Path:
-    """A test view larger than its photograph, with its layers: what somebody is shown first."""
+    """Write a held-out view with its layers, larger than its photograph, and return the path."""
     layers = importlib.import_module("polarguide.visualization.layers")
     figures = importlib.import_module("polarguide.visualization.figures")
     run = polarguide.open_run(out)
@@ -309,7 +317,7 @@ def _first_picture(out: Path) -> Path:
     return path
 
 
-def view(
+def view_in_browser(
     run: RunFolder,
     /,
     *,
@@ -319,13 +327,13 @@ def view(
     visitors: VisitorOptions = VisitorOptions(),
     compute: ComputeOptions = ComputeOptions(),
 ) -> None:
-    """Look at a run in a browser: its layers from any side, beside the photographs. Ctrl-C ends it.
+    """Show a run in a browser: its layers from any side, next to the photographs. Ctrl-C ends it.
 
     Args:
         run: Run folder.
-        host: Address to listen at. Others can reach it only if you give one of theirs (0.0.0.0: anyone's).
-        port: To listen at; the next free one is taken if it is in use.
-        beside: Another run of the same scene, such as one without polarization, for the wipe between the two.
+        host: Address of the server. Other machines can connect only to an address of the network (0.0.0.0: any).
+        port: Port of the server; the next free port is taken if it is in use.
+        beside: Another run of the same scene, such as one without polarization, for a wipe between the two.
     """
     if run.is_file():
         raise PolarguideError(
@@ -336,12 +344,12 @@ def view(
             "they reflect, are for other viewers (SuperSplat).",
         )
     require_package("viser", "the viewer")
-    trained, reporter = opened(run, compute)
-    other = None if beside is None else opened(beside, compute)[0]
+    trained, reporter = open_run_folder(run, compute)
+    other = None if beside is None else open_run_folder(beside, compute)[0]
     trained.view(host=host, port=port, visitors=visitors, reporter=reporter, beside=other)
 
 
-def share(
+def share_run(
     run: RunFolder,
     /,
     *,
@@ -350,20 +358,20 @@ def share(
     caption: str = "",
     machine: ThreadOptions = ThreadOptions(),
 ) -> None:
-    """Write a run as one web page that renders it with its reflections, and needs nothing beside itself.
+    """Write a run as one self-contained web page that renders it with its reflections.
 
     Args:
         run: Run folder.
-        out: File to write; RUN/share.html by default.
-        title: Heading of the page; the scene's name by default.
-        caption: Text below it; the recipe and its steps by default.
+        out: File to write; default: RUN/share.html.
+        title: Heading of the page; default: the scene's name.
+        caption: Text below the heading; default: the recipe and its steps.
     """
-    trained, reporter = opened(run, machine)
+    trained, reporter = open_run_folder(run, machine)
     path = trained.share(out, title=title, caption=caption, reporter=reporter)
     say(f"page: {path} ({size_text(path.stat().st_size)})")
 
 
-def export(
+def export_run(
     run: RunFolder,
     /,
     *,
@@ -378,25 +386,28 @@ def export(
 ) -> None:
     """Write a run as the files of other programs.
 
-    ply, spz, sog, splat-glb and splat-usdz are ordinary splats, with reflections baked as far as harmonics carry them;
+    ply, spz, sog, splat-glb and splat-usdz are ordinary splats, with reflections baked as far as harmonics represent
+    them;
     mesh (GLB and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb (or obj, usdz) is a
     textured model for Blender, game engines and viewers, whose base color has neither highlights nor shading; stl is
-    its closed surface for 3D printing; points are opaque Gaussians with normals; environment is the learned light as a
+    its closed surface for 3D printing; points are opaque Gaussians with normals; environment is the learned light as
+    a
     panorama (EXR, HDR and PNG); cameras are a COLMAP model and transforms.json; all is a package of most of these.
 
     Args:
         run: Run folder.
         format: ply, spz, sog, splat-glb, splat-usdz, mesh, glb, obj, usdz, stl, points, environment, cameras or all.
-        out: Folder to write; RUN/export by default.
+        out: Folder to write; default: RUN/export.
         resolution: Voxels of the mesh along its longest side.
-        spz_version: Version of the SPZ file; readers are split between the two.
-        fields: Of ply: release is what every reader of 3DGS files takes; all adds polarguide.ply, with linear colors,
-            strength, roughness and more, for programs that read fields by name.
-        axes: Upright (+y in GLB and USD, -y elsewhere); or the scene's own, in all but GLB and USD.
+        spz_version: Version of the SPZ file; programs support only one of the two.
+        fields: Fields of ply: release has those of every 3DGS file; all adds polarguide.ply, with linear colors,
+            strength,
+            roughness and more, for programs that read fields by name.
+        axes: upright (+y in GLB and USD, -y elsewhere), or the axes of the scene, except in GLB and USD.
     """
     for package in EXPORT_PACKAGES.get(format, ()):
         require_package(package, f"--format {format}")
-    trained, reporter = opened(run, machine)
+    trained, reporter = open_run_folder(run, machine)
     for path in trained.export(
         format,
         out,

@@ -1,4 +1,4 @@
-"""Reading and writing files: what is read is either the old file or the whole new one; failures are explained."""
+"""Reading and writing of files. Writing is atomic, and failures are explained."""
 
 from __future__ import annotations
 
@@ -19,18 +19,16 @@ from polarguide.core.system import process_is_alive
 from polarguide.core.text import canonical
 
 LARGEST_FILE = 1 << 31
-_MASK = os.umask(0)  # what rights new files do not get; it can only be asked for by setting it
-os.umask(_MASK)
 
 
 @contextlib.contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """Write to a temporary file that takes the place of ``path`` only when it is complete and on disk.
+    """Write to a temporary file that replaces ``path`` when it is complete and on disk.
 
-    What processes that were killed have left of the same file is removed.
+    Temporary files that killed processes left behind are removed.
 
     Yields:
-        The temporary file's path, in the same folder.
+        The path of the temporary file, in the same folder.
 
     Raises:
         PolarguideError: the file or folder cannot be written, for example because the disk is full.
@@ -38,10 +36,12 @@ def atomic(path: Path) -> Iterator[Path]:
     temporary = _temporary(path)
     with writing(path):
         try:
+            temporary.touch(exist_ok=False)
+            rights = temporary.stat().st_mode
             yield temporary
             with open(temporary, "rb") as file:
                 os.fsync(file.fileno())
-            os.chmod(temporary, 0o666 & ~_MASK)  # some libraries write for the owner alone
+            temporary.chmod(rights)  # some libraries replace the file by one that only the owner may read
             os.replace(temporary, path)
             _sync_folder(path.parent)
         finally:
@@ -50,7 +50,9 @@ def atomic(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def temporary_folder(path: Path) -> Iterator[Path]:
-    """A folder beside ``path`` for work on it, which is removed afterwards, and at the next call after a kill.
+    """Create a temporary folder next to ``path``, and remove it afterwards.
+
+    A folder that a killed process left behind is removed by the next call.
 
     Raises:
         PolarguideError: the file or folder cannot be written, for example because the disk is full.
@@ -66,10 +68,10 @@ def temporary_folder(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Write into a temporary folder whose files then take their places in ``path``, each as a whole.
+    """Write into a temporary folder, and then move each complete file into ``path``.
 
     Yields:
-        The temporary folder, beside ``path``, which is made.
+        The temporary folder, next to ``path``, which is created.
 
     Raises:
         PolarguideError: the file or folder cannot be written, for example because the disk is full.
@@ -86,9 +88,9 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 def _temporary(path: Path) -> Path:
-    """The temporary name of a file or folder in this process; removes those of processes that are no more.
+    """Return the temporary name of a file or folder in this process, and remove those of processes that have ended.
 
-    What has this process's own number is of an earlier one, or a link that somebody put there to be written through.
+    A temporary file with the number of this process belongs to an earlier process, or is a malicious link.
     """
     with contextlib.suppress(OSError):
         for old in path.parent.glob(f".{glob.escape(path.name)}.*.tmp*"):
@@ -102,7 +104,7 @@ def _temporary(path: Path) -> Path:
 
 @contextlib.contextmanager
 def in_utf8(path: Path) -> Iterator[Path]:
-    """A name in UTF-8 by which to read or write a file whose own is other bytes: some libraries take no others."""
+    """Yield a path in UTF-8 for a file whose name has other bytes. Some libraries accept UTF-8 only."""
     try:
         os.fspath(path).encode()
     except UnicodeEncodeError:
@@ -115,12 +117,12 @@ def in_utf8(path: Path) -> Iterator[Path]:
 
 
 def holds_files(folder: Path) -> bool:
-    """Whether there is anything in a folder but what a process that was killed left half-written."""
+    """Return whether a folder has files other than the temporary ones of a killed process."""
     return any(re.fullmatch(r"\..+\.\d+\.tmp", path.name) is None for path in folder.iterdir())
 
 
 def write_whole(path: Path, data: bytes) -> int:
-    """Write a file completely or not at all; returns its size.
+    """Write a file atomically and return its size.
 
     Raises:
         PolarguideError: the file cannot be written.
@@ -131,7 +133,7 @@ def write_whole(path: Path, data: bytes) -> int:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file in UTF-8, completely or not at all; halves of characters in it become escapes.
+    """Write a text file in UTF-8 atomically. Surrogates become escapes.
 
     Raises:
         PolarguideError: the file cannot be written.
@@ -140,7 +142,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder and those above it, unless it exists.
+    """Create a folder and its parents unless it exists.
 
     Raises:
         PolarguideError: the folder cannot be created.
@@ -151,31 +153,29 @@ def make_folder(path: Path) -> None:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn an OSError of what writes ``path`` into a message that says how to go on.
+    """Convert an OSError during the writing of ``path`` to a message with a remedy.
 
     Raises:
-        PolarguideError: there was one.
+        PolarguideError: the file cannot be written.
     """
     try:
         yield
     except OSError as error:
+        # ``shutil.copytree`` raises one error with a list of all errors.
+        several = isinstance(error, shutil.Error) and isinstance(error.args[0], list)
         raise PolarguideError(
             path,
             expected="to write this file",
-            found=_reason(error),
+            found=str(error.args[0][0][-1]) if several else error.strerror or str(error),
             remedy="Make room or give rights, and repeat the command: it goes on where it stopped.",
         ) from error
 
 
-def _reason(error: OSError) -> str:
-    """The text of an operating system error; for a copied folder that of its first file."""
-    if isinstance(error, shutil.Error) and isinstance(error.args[0], list):
-        return str(error.args[0][0][-1])
-    return error.strerror or str(error)
-
-
 def stored(path: Path) -> Path:
-    """A path as the file system has it: where nothing is there, what has the same name in another form of Unicode."""
+    """Return the path that the file system has for a name.
+
+    If the path does not exist, the name of an existing file in another normal form of Unicode is taken.
+    """
     if os.path.lexists(path) or path == path.parent:
         return path
     folder = stored(path.parent)
@@ -189,18 +189,19 @@ def require_folder(path: Path, *, expected: str, remedy: str) -> None:
     """Check that a folder exists.
 
     Raises:
-        PolarguideError: there is a file of this name, or nothing.
+        PolarguideError: the path is a file, or does not exist.
     """
     if not path.is_dir():
-        found = "a file" if path.exists() else "nothing"
-        raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
+        raise PolarguideError(
+            path, expected=expected, found="a file" if path.exists() else "nothing", remedy=remedy
+        )
 
 
 def require_file(path: Path, *, expected: str, remedy: str) -> None:
-    """Check that something is an ordinary file: reading a pipe or a device may never end.
+    """Check that a path is a regular file. Reading a pipe or a device may block forever.
 
     Raises:
-        PolarguideError: ``path`` is no ordinary file, or does not exist.
+        PolarguideError: ``path`` is not a regular file, or does not exist.
     """
     if path.is_file():
         return
@@ -209,10 +210,10 @@ def require_file(path: Path, *, expected: str, remedy: str) -> None:
 
 
 def check_out(path: Path) -> None:
-    """Check that a folder can be written to where there may be none yet.
+    """Check that an output folder exists or can be created.
 
     Raises:
-        PolarguideError: there is a file of this name, or a link to nowhere; or no file can have this name.
+        PolarguideError: the path is a file or a broken link, or contains a null byte.
     """
     if "\0" in os.fspath(path):
         raise PolarguideError(
@@ -226,13 +227,14 @@ def check_out(path: Path) -> None:
 
 
 def require_inside(folder: Path, *paths: Path) -> None:
-    """Refuse places that links lead out of a folder: somebody else may have made what it holds.
+    """Refuse paths that links lead out of a folder. The content of the folder may come from somebody else.
 
     Args:
-        folder: what is written into; it may be a link itself. paths: places in it, which need not exist.
+        folder: the output folder, which may be a link itself.
+        paths: paths in it, which need not exist.
 
     Raises:
-        PolarguideError: one lies elsewhere.
+        PolarguideError: a path lies outside the folder.
     """
     whole = Path(os.path.realpath(folder))
     for path in paths:
@@ -249,14 +251,19 @@ def require_inside(folder: Path, *paths: Path) -> None:
 def read_file(
     path: Path, *, largest: int = LARGEST_FILE, remedy: str = "Check that the file exists and may be read."
 ) -> bytes:
-    """The bytes of a file of up to ``largest``, 2 GiB; ``remedy`` is for messages.
+    """Read a file.
+
+    Args:
+        path: the file.
+        largest: limit of its size in bytes.
+        remedy: advice for the message.
 
     Raises:
-        PolarguideError: the file cannot be read, or is larger.
+        PolarguideError: the file cannot be read, or is too large.
     """
     try:
         about = path.stat()
-        if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):  # reading may never end
+        if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):  # reading it may block forever
             raise OSError("a pipe or device")
         if about.st_size > largest:
             raise OSError(f"one of {about.st_size} bytes, more than {largest >> 20} MiB")
@@ -274,44 +281,44 @@ _LARGEST_TABLE = 1 << 26
 
 
 def read_rows(path: Path, remedy: str) -> list[tuple[int, list[str]]]:
-    """The rows of a CSV file that are not empty: number of the line, from 1, and cells without blanks around them.
+    """Read the rows of a CSV file that are not empty: line number, from 1, and stripped cells.
 
-    Cells have commas between them, or semicolons as spreadsheets of some countries write them.
+    The delimiter is a comma, or a semicolon as in the spreadsheets of some countries.
+
+    Args:
+        path: the file.
+        remedy: advice for the message.
 
     Raises:
-        PolarguideError: the file cannot be read, or is no CSV file; ``remedy`` is for messages.
+        PolarguideError: the file cannot be read, or is not CSV.
     """
     data = read_file(path, largest=_LARGEST_TABLE, remedy=remedy)
+    rows: list[tuple[int, list[str]]] = []
+    line = 0  # last line of the previous row
     try:
         text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise _no_csv(path, error, remedy) from None
-    head = text.partition("\n")[0]
-    delimiter = ";" if head.count(";") > head.count(",") else ","
-    reader = csv.reader(
-        io.StringIO(text, newline=""), strict=True, skipinitialspace=True, delimiter=delimiter
-    )
-    rows: list[tuple[int, list[str]]] = []
-    line = 0  # where the last row ended
-    try:
+        head = text.partition("\n")[0]
+        reader = csv.reader(
+            io.StringIO(text, newline=""),
+            strict=True,
+            skipinitialspace=True,
+            delimiter=";" if head.count(";") > head.count(",") else ",",
+        )
         for row in reader:
+            if any("\0" in cell for cell in row):
+                raise csv.Error("a null character")
             line = reader.line_num
             rows.append((line, [cell.strip() for cell in row]))
-    except csv.Error as error:
-        raise _no_csv(f"{path} (line {line + 1})", error, remedy) from None
-    null = next((number for number, row in rows if any("\0" in cell for cell in row)), None)
-    if null is not None:
-        raise _no_csv(f"{path} (line {null})", "a null character", remedy)
+    except (UnicodeDecodeError, csv.Error) as error:
+        where = path if isinstance(error, UnicodeDecodeError) else f"{path} (line {line + 1})"
+        raise PolarguideError(
+            where, expected="CSV text in UTF-8", found=f"something else ({error})", remedy=remedy
+        ) from None
     return [(number, row) for number, row in rows if any(row)]
 
 
-def _no_csv(where: object, found: object, remedy: str) -> PolarguideError:
-    found = f"something else ({found})"
-    return PolarguideError(where, expected="CSV text in UTF-8", found=found, remedy=remedy)
-
-
 def _sync_folder(folder: Path) -> None:
-    """Make a rename in a folder durable, on systems that can."""
+    """Make a rename in a folder durable, on systems that support it."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

@@ -1,6 +1,6 @@
-"""Options that commands share: how a scene is read, and the device. Nothing here imports torch.
+"""Options that several verbs share. This module does not import torch.
 
-The command line reads names, types, defaults and texts from these classes.
+The command line takes names, types, defaults and help texts from these classes.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
+
+from tyro.constructors import PrimitiveConstructorSpec
 
 from polarguide.core.errors import PolarguideError
 
@@ -50,63 +52,77 @@ EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
     "stl": ("skimage", "fast_simplification"),
     "environment": ("OpenEXR",),
 }
-"""The packages that formats need: looked for before a run is loaded."""
+"""Packages that export formats need. They are checked before a run is loaded."""
 PathLike = str | os.PathLike[str]
 INDEX = 1.5
-"""Refractive index of glass, plastic and glaze, for scenes that name none."""
+"""Refractive index of glass, plastic and glaze: the default for scenes without an index."""
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 MOST = 10**9
-"""The largest count that any option takes."""
+"""Largest count that an option accepts."""
 MOST_THREADS = 1024
 LEAST_MEMORY = 2**-10
-"""In GiB. Nothing fits into less; what is needed, the pictures say."""
+"""Smallest memory limit in GiB. No scene fits into less."""
 
 
 def check_count(name: str, value: int, minimum: int = 1, most: int = MOST) -> None:
-    """Check an option's value.
+    """Check an integer option.
+
+    Args:
+        name: name of the option.
+        value: its value.
+        minimum, most: smallest and largest valid value.
 
     Raises:
-        PolarguideError: the value is not a whole number, or less than ``minimum`` or more than ``most``.
+        PolarguideError: the value is not a whole number, or out of range.
     """
     if not isinstance(value, numbers.Integral) or isinstance(value, bool):
-        remedy = "Round it."
-        raise PolarguideError(name, expected="a whole number", found=repr(value), remedy=remedy)
+        raise PolarguideError(name, expected="a whole number", found=repr(value), remedy="Round it.")
     if not minimum <= value <= most:
         expected, change = (f"up to {most}", "smaller") if value > most else (f"{minimum} or more", "larger")
         raise PolarguideError(name, expected=expected, found=str(value), remedy=f"Give a {change} number.")
 
 
 def check_finite(name: str, value: float, least: float = -math.inf, most: float = math.inf) -> None:
-    """Check an option's value.
+    """Check a numerical option.
+
+    Args:
+        name: name of the option.
+        value: its value.
+        least, most: smallest and largest valid value.
 
     Raises:
-        PolarguideError: the value is not a finite number from ``least`` to ``most``.
+        PolarguideError: the value is not finite, or out of range.
     """
     if not (math.isfinite(value) and least <= value <= most):
         whole = math.isinf(least) and math.isinf(most)
-        expected = "a finite number" if whole else f"{least:g} to {most:g}"
-        raise PolarguideError(name, expected=expected, found=str(value), remedy="Correct the number.")
+        raise PolarguideError(
+            name,
+            expected="a finite number" if whole else f"{least:g} to {most:g}",
+            found=str(value),
+            remedy="Correct the number.",
+        )
 
 
 def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
-    """Check an option's value.
+    """Check an option with a fixed set of values.
 
     Raises:
         PolarguideError: the value is not one of the choices.
     """
     allowed = list(choices)
     if value not in allowed:
-        expected = "one of " + ", ".join(allowed)
-        raise PolarguideError(name, expected=expected, found=value, remedy="Correct the name.")
+        raise PolarguideError(
+            name, expected="one of " + ", ".join(allowed), found=value, remedy="Correct the name."
+        )
 
 
 def picture_size(size: str) -> tuple[int, int]:
-    """Width and height from text such as 1920x1080.
+    """Parse a width and a height such as 1920x1080.
 
     Raises:
-        PolarguideError: the text is something else, or a side is not from 16 to 8192.
+        PolarguideError: the text has another form, or a side is not from 16 to 8192.
     """
     try:
         width, height = (int(part) for part in size.lower().split("x"))
@@ -128,36 +144,55 @@ _BINARY = {"k": 1 << 10, "m": 1 << 20, "g": 1 << 30, "t": 1 << 40}
 _SIZE = re.compile(r"(?P<count>\d+(\.\d*)?|\.\d+) ?(?P<unit>[kmgt])(?P<binary>i?)b?", re.IGNORECASE)
 
 
-def gibibytes(text: str) -> float | None:
-    """A size such as 4GB, 600MB or 3.5GiB in GiB; None for other texts, and for a number without a unit."""
+def gibibytes(text: str) -> float:
+    """Parse a size such as 4GB, 600MB or 3.5GiB to GiB. The default unit is GiB.
+
+    Raises:
+        ValueError: the text is not a size.
+    """
     match = _SIZE.fullmatch(text.strip())
     if match is None:
-        return None
+        return float(text)
     units = _BINARY if match["binary"] else _UNITS
     return float(match["count"]) * units[match["unit"].lower()] / _BINARY["g"]
 
 
+Memory = Annotated[
+    float,
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="SIZE",
+        instance_from_str=lambda words: gibibytes(words[0]),
+        is_instance=lambda value: isinstance(value, int | float),
+        str_from_instance=lambda value: [f"{value}GiB"],
+    ),
+]
+"""Memory in GiB; the command line reads sizes such as 4GB."""
+
+
 def index_of(specified: float | None, scene: float | None = None) -> float:
-    """The specified refractive index, else that of ``scene.json``, else ``INDEX``."""
+    """Return the specified refractive index, else that of ``scene.json``, else ``INDEX``."""
     return next((index for index in (specified, scene) if index is not None), INDEX)
 
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """How a scene folder is read.
+    """Options for reading a scene folder.
 
     Attributes:
-        downscale: Average the pictures over boxes of this many pixels first.
-        transfer: How the files encode radiance. Polarization needs linear; srgb undoes the display curve of JPEGs.
-        memory: The most memory to take, such as 4GB (a number alone is GiB): of training, all that the process takes;
-            elsewhere what the pictures take, as their headers state. Without it, 80 % of what is free.
-        split: Which views are held out to be scored on where the scene has no split.json, one in eight: directions
-            spreads them among the others, every-8th counts through the names.
+        downscale: Factor of the reduction: pictures are averaged over boxes of this many pixels.
+        transfer: Encoding of radiance in the files. Polarization needs linear; srgb undoes the display curve of
+            JPEGs.
+        memory: Memory limit, such as 4GB (the default unit is GiB). For a training, the limit of the process;
+            elsewhere, of
+            the pictures as their headers state. Default: 80 % of the free memory.
+        split: Held-out views, one in eight, of a scene without split.json: directions spreads them among the others,
+            every-8th counts through the names.
     """
 
     downscale: int = 1
     transfer: Transfer = "linear"
-    memory: float | None = None
+    memory: Memory | None = None
     split: Split = "directions"
 
     def __post_init__(self) -> None:
@@ -168,19 +203,22 @@ class SceneOptions:
 
 @dataclass(frozen=True)
 class ModelOptions:
-    """A textured model (formats glb, obj and usdz), or its surface (stl).
+    """Options of a textured model (formats glb, obj and usdz) or of its surface (stl).
 
     Attributes:
-        triangles: Triangles to simplify the surface to, about.
+        triangles: Approximate number of triangles of the simplified surface.
         texture: Texels along the texture's side.
-        jpeg: Textures as JPEG, a third of the size, in place of PNG.
-        base_color: delit: the diffuse layer without its shading; diffuse: the layer as it is; photographs; picture: the
-            rendered picture with its highlights. By default delit, and with unlit picture.
-        albedo_scale: Factor on the base color. The learned light has no absolute scale, so that one factor of a delit
-            base color is not known: give what makes a gray card right.
-        unlit: For viewers without light: the color is shown as it is.
-        close_bottom: Close flat what no camera saw, such as the bottom of what stood on a table; always in an STL.
-        masked: Only what most of the scene's masks show, besides the crop box.
+        jpeg: Write textures as JPEG, a third of the size of PNG.
+        base_color: delit: the diffuse layer without its shading; diffuse: the layer with its shading; photographs;
+            picture: the rendered picture with its highlights. Default: delit, or picture with unlit.
+        albedo_scale: Factor on the base color. The learned light has no absolute scale, so one factor of a delit base
+            color
+            is unknown: choose the value that makes a gray card right.
+        unlit: Show the color without shading, for viewers without light.
+        close_bottom: Close surfaces that no camera saw with a plane, such as the bottom of an object on a table;
+            always in
+            an STL.
+        masked: Restrict the model to the foreground of most of the scene's masks, in addition to the crop box.
     """
 
     triangles: int = 50_000
@@ -201,16 +239,16 @@ class ModelOptions:
 
     @property
     def resolved_base_color(self) -> BaseColor:
-        """The base color, where none was chosen the one that goes with the light."""
+        """The base color, by default the one that fits the option ``unlit``."""
         return self.base_color or ("picture" if self.unlit else "delit")
 
 
 @dataclass(frozen=True)
 class ThreadOptions:
-    """How much of the machine to use.
+    """Use of the machine.
 
     Attributes:
-        threads: Threads to use; 0 takes all cores.
+        threads: Number of threads; 0: all cores.
     """
 
     threads: int = 0
@@ -221,10 +259,10 @@ class ThreadOptions:
 
 @dataclass(frozen=True)
 class ComputeOptions(ThreadOptions):
-    """The device and the threads of a computation.
+    """Device and threads of a computation.
 
     Attributes:
-        device: What to compute on; auto takes the GPU where there is one and gsplat is installed.
+        device: Device of the computation; auto: the GPU if there is one and gsplat is installed.
     """
 
     device: DeviceName = "auto"
@@ -232,12 +270,12 @@ class ComputeOptions(ThreadOptions):
 
 @dataclass(frozen=True)
 class VisitorOptions:
-    """Which web pages may talk to the viewer, besides those that it sends itself to an address of its machine.
+    """Web pages that may connect to the viewer, in addition to its own pages at an address of its machine.
 
     Attributes:
-        allow_host: Host names, such as a tunnel's, under which the viewer may be opened, besides addresses and
+        allow_host: Host names, such as a tunnel's, under which the viewer may be opened, in addition to addresses and
             localhost.
-        allow_origin: Names of sites, such as a proxy, whose pages may talk to the viewer.
+        allow_origin: Names of sites, such as a proxy, whose pages may connect to the viewer.
     """
 
     allow_host: tuple[str, ...] = ()
@@ -246,15 +284,18 @@ class VisitorOptions:
 
 @dataclass(frozen=True)
 class SessionOptions(VisitorOptions, ComputeOptions):
-    """Options of a training on which its result does not depend.
+    """Options of a training that do not change its result.
 
     Attributes:
-        checkpoint_every: Steps between two checkpoints: a kill loses at most as many.
-        keep_optimizer: Keep the optimizer's state in the last checkpoint, which then is four times as large. Rendering,
-            scores and exports do without; only code of yours that trains on from it would want it.
-        viewer: Look on in a browser while it trains (afterwards: polarguide view).
-        viewer_host: Address to listen at. Others can reach it only if you give one of theirs (0.0.0.0: anyone's).
-        viewer_port: To listen at; the next free one is taken if it is in use.
+        checkpoint_every: Steps between two checkpoints. A killed training loses at most as many.
+        keep_optimizer: Keep the optimizer's state in the last checkpoint, which is then four times as large. Only
+            your own
+            code that continues the training needs it.
+        viewer: Show the training in a browser (afterwards: polarguide view).
+        viewer_host: Address of the viewer's server. Other machines can connect only to an address of the network
+            (0.0.0.0:
+            any).
+        viewer_port: Port of the viewer's server. The next free port is taken if it is in use.
     """
 
     checkpoint_every: int = 500

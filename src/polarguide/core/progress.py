@@ -1,4 +1,4 @@
-"""Progress reporting for long operations. Silent by default; the command line installs a reporter."""
+"""Progress of long operations. The default reporter is silent; the command line installs its own."""
 
 from __future__ import annotations
 
@@ -8,14 +8,18 @@ from typing import Protocol
 
 
 class Advance(Protocol):
-    """Records how much of a piece of work is done."""
+    """Function that reports the progress of an operation."""
 
     def __call__(
         self, done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
     ) -> None:
-        """``done`` so far, of ``total`` if that has become known, and a few words about it.
+        """Report the progress.
 
-        ``seconds``: on a clock that stands still during pauses; None: there are no pauses.
+        Args:
+            done: amount of finished work.
+            total: amount of all work, if it has become known.
+            note: short text about the state.
+            seconds: time of the report on a clock that stops during pauses; None: there are no pauses.
         """
 
 
@@ -24,20 +28,21 @@ def _ignore(done: int, *, total: int | None = None, note: str = "", seconds: flo
 
 
 class Reporter:
-    """Where messages and progress go. This one drops them; derive from it to show them."""
+    """Receiver of messages and progress. This class ignores them; derive from it to show them."""
 
     def say(self, text: str) -> None:
-        """A finding, as a plain sentence."""
+        """Report a result in a plain sentence."""
 
     def warn(self, text: str) -> None:
-        """Something the user should know before going on."""
+        """Report a warning."""
 
     @contextlib.contextmanager
     def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
-        """Progress of one piece of work; yields a function that takes what has been done so far.
+        """Report the progress of an operation; yields the function that reports the finished work.
 
         Args:
-            label: what is done. total: how much there is to do; None where that is not known yet.
+            label: name of the operation.
+            total: amount of work; None: not known yet.
         """
         yield _ignore
 

@@ -1,14 +1,17 @@
-"""Records that are read back from JSON: validated by msgspec, with the file and the value found in every message."""
+"""Reading and validation of JSON records with msgspec.
+
+Every message names the file, the field, and the value at fault.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 import math
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -17,22 +20,25 @@ from polarguide.core.files import read_file
 
 T = TypeVar("T")
 CORRECT = "Correct or remove the file."
-_WORDS = {
-    "array": "a list", "bool": "true or false", "float": "a number", "int": "a whole number", "null": "null",
-    "object": "a JSON object {...}", "str": "text",
+_OBJECT = "a JSON object {...}"
+_NAMES = {
+    "BoolType": "true or false", "FloatType": "a number", "IntType": "a whole number", "NoneType": "null",
+    "StrType": "text", "ListType": "a list", "TupleType": "a list", "VarTupleType": "a list",
 }  # fmt: skip
+"""Names of types in messages by class of ``msgspec.inspect``; all others are JSON objects."""
+_LARGEST_INTEGER = 1 << 63
 _DEEPEST = 50
 LARGEST_RECORD = 1 << 26
-"""Bytes of a JSON file; what they decode to takes some twenty times as much."""
-_STEP = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
+"""Largest size of a JSON file in bytes. Decoded data takes about twenty times as much memory."""
 
 
 def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
-    """A record from a JSON file.
+    """Read a record from a JSON file.
 
     Args:
-        path: the file. kind: a type that msgspec knows: a ``Struct``, a dataclass, ``dict[str, Any]``, ...
-        remedy: what to do about a file that is wrong.
+        path: the file.
+        kind: a type that msgspec supports: a ``Struct``, a dataclass, ``dict[str, Any]``, ...
+        remedy: advice for the message about an invalid file.
 
     Raises:
         PolarguideError: the file cannot be read, or ``decode`` rejects it.
@@ -41,31 +47,32 @@ def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
 
 
 def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = CORRECT) -> T:
-    """A record from JSON.
+    """Convert JSON to a record.
 
-    Numbers have to be finite, true and false are no numbers, and no key may stand twice. Keys that a type does not
-    have are passed over, unless it forbids them.
+    Numbers must be finite, Booleans are not numbers, and keys must be unique. Unknown keys are ignored unless the
+    type
+    forbids them.
 
     Args:
-        data: JSON text as bytes, or what JSON text has been parsed to.
-        kind: a type that msgspec knows.
-        where: the file or flag, for messages. remedy: what to do about data that is wrong.
+        data: JSON text as bytes, or parsed JSON.
+        kind: a type that msgspec supports.
+        where: file or option for messages.
+        remedy: advice for the message about invalid data.
 
     Raises:
-        PolarguideError: the data are not JSON, or not of this type; the message names the field and the value.
+        PolarguideError: the data is not JSON, or does not fit the type.
     """
     value = parse(data, where, remedy=remedy) if isinstance(data, bytes) else data
     try:
         _require_shallow(value)
         record = msgspec.convert(value, kind)
-    except PolarguideError as error:  # of a type's own check
+    except PolarguideError as error:  # raised by a check of the type itself
         place = f"{where} ({error.where})"
         raise PolarguideError(place, expected=error.expected, found=error.found, remedy=remedy) from None
-    except msgspec.ValidationError as error:
-        field, expected, found = _fault(str(error), value, kind)
-        raise PolarguideError(
-            f"{where} ({field})" if field else where, expected=expected, found=found, remedy=remedy
-        ) from None
+    except msgspec.ValidationError:
+        path, expected, found = _fault(value, kind)
+        at_fault = f"{where} ({path})" if path else where
+        raise PolarguideError(at_fault, expected=expected, found=found, remedy=remedy) from None
     except (ValueError, RecursionError, OverflowError) as error:
         raise PolarguideError(
             where, expected="a JSON file", found=f"broken JSON ({error})", remedy=remedy
@@ -75,25 +82,28 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
 
 
 def parse(data: bytes, where: object, *, remedy: str = CORRECT) -> Any:
-    """The values of JSON text, of any type. NaN and infinity are let through: ``decode`` checks the fields of a type.
+    """Parse JSON text to values of any type.
+
+    NaN and infinity are accepted: ``decode`` checks them in the fields of a type.
 
     Raises:
-        PolarguideError: the data are not JSON, or a key stands there twice.
+        PolarguideError: the data is not JSON, or a key occurs twice.
     """
     try:
         value = json.loads(data, object_pairs_hook=_each_once)
         _require_shallow(value)
     except (ValueError, RecursionError) as error:
-        found = f"broken JSON ({error})"
-        raise PolarguideError(where, expected="a JSON file", found=found, remedy=remedy) from None
+        raise PolarguideError(
+            where, expected="a JSON file", found=f"broken JSON ({error})", remedy=remedy
+        ) from None
     return value
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON; JSON leaves open which of two values of one key holds, and programs differ.
+    """Return a JSON object. The JSON standard does not define the meaning of a repeated key.
 
     Raises:
-        ValueError: a key stands there twice.
+        ValueError: a key occurs twice.
     """
     record = dict(pairs)
     if len(record) < len(pairs):
@@ -105,10 +115,10 @@ def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _require_shallow(value: Any) -> None:
-    """Refuse lists in lists in lists, which take more of the stack than there is.
+    """Refuse deeply nested data, which would exceed the recursion limit.
 
     Raises:
-        RecursionError: the lists are nested more deeply than any record of ours.
+        RecursionError: the data is nested more deeply than any record of ours.
     """
     level = [value]
     for _ in range(_DEEPEST):
@@ -126,149 +136,151 @@ def _require_shallow(value: Any) -> None:
 
 
 def option_name(field: str) -> str:
-    """The command line's option that sets a field."""
+    """Return the command-line option that sets a field."""
     return "--" + field.replace("_", "-")
 
 
 def check_options(options: Any, name: Callable[[str], str] = option_name) -> None:
-    """Check the values of a dataclass against its annotations.
+    """Validate the values of a dataclass against its annotations.
 
     Args:
-        options: the dataclass. name: what messages call a field.
+        options: the dataclass.
+        name: returns the name of a field for messages.
 
     Raises:
-        PolarguideError: one has another type or is out of range.
+        PolarguideError: a value has the wrong type or is out of range.
     """
     remedy = "Correct the value."
     values = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
     for field, value in values.items():
         _require_finite(value, name(field), remedy)
     try:
-        msgspec.convert(values, type(options), dec_hook=lambda kind, value: kind(value))
-    except msgspec.ValidationError as error:
-        field, expected, found = _fault(str(error), values, type(options))
-        raise PolarguideError(
-            name(field.partition("[")[0]), expected=expected, found=found, remedy=remedy
-        ) from None
+        _convert(values, type(options))
+    except msgspec.ValidationError:
+        path, expected, found = _fault(values, type(options))
+        field = path.partition("[")[0]
+        raise PolarguideError(name(field), expected=expected, found=found, remedy=remedy) from None
 
 
 def to_json(content: Any) -> bytes:
-    """A record as the text of a JSON file; names of files that are no Unicode become escapes in it."""
+    """Return a record as a JSON file. Names of files that are not valid Unicode become escapes."""
     try:
         return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
     except UnicodeEncodeError:
         return (json.dumps(content, indent=1) + "\n").encode()
 
 
-def _fault(message: str, value: Any, kind: Any) -> tuple[str, str, str]:
-    """Field, what was expected there and what was found, from a message of msgspec's."""
-    what, _, path = message.partition(" - at `$")
-    what, _, got = what.partition(", got ")
-    path = path.rstrip("`")
-    form: Any = msgspec.inspect.type_info(kind)
-    for name, index in _STEP.findall(path):
-        value = _at(value, name, index)
-        form = _form_at(form, name, index)
-    field = path.lstrip(".")
-    expected = _plain(what.removeprefix("Expected "))
-    value_found = shortened(value)
-    if value is _UNKNOWN:
-        value_found = _plain(got) or "another"
-    if what.startswith("Object contains unknown field"):
-        fields = [field for kind in _kinds(form) for field in getattr(kind, "fields", ())]
-        expected = f"only {', '.join(field.encode_name for field in fields)}"
-        value_found = what.partition("`")[2].rstrip("`")
-    elif what.startswith("Object missing required field"):
-        expected = f"the field {what.partition('`')[2].rstrip('`')}"
-        value_found = f"only {', '.join(value)}" if isinstance(value, dict) and value else "none"
-    elif what.startswith("Number out of range"):
-        expected = "a number of usual size"
-    elif what.startswith("Invalid enum value"):
-        *others, last = (str(choice) for kind in _kinds(form) for choice in getattr(kind, "values", ()))
-        expected = f"{', '.join(others)} or {last}" if others else last
-    elif _limits(form) and not got:
-        expected = _limits(form)
-    return field, expected, value_found
+def _convert(value: Any, kind: Any) -> Any:
+    return msgspec.convert(value, kind, dec_hook=lambda custom, part: custom(part))
+
+
+def _fault(value: Any, kind: Any, path: str = "") -> tuple[str, str, str]:
+    """Return the path of the part of a value that does not fit a type, the expected type, and the part."""
+    for step, part, part_kind in _parts(value, kind):
+        try:
+            _convert(part, part_kind)
+        except msgspec.ValidationError:
+            return _fault(part, part_kind, path + step)
+    form = msgspec.inspect.type_info(kind)
+    options = getattr(form, "types", (form,))
+    expected, found = _mismatched_fields(value, options) or (_described(value, options), shortened(value))
+    return path.lstrip("."), expected, found
+
+
+def _parts(value: Any, kind: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the parts of a value: the step to each, the part, and its type."""
+    origin = get_origin(kind)
+    arguments = get_args(kind)
+    if origin in (Annotated, Union, UnionType):
+        for option in arguments[:1] if origin is Annotated else arguments:
+            yield from _parts(value, option)
+    elif origin in (list, tuple) and isinstance(value, list | tuple):
+        kinds = [arguments[0]] * len(value) if origin is list or arguments[-1] is ... else arguments
+        for number, (item, item_kind) in enumerate(zip(value, kinds, strict=False)):
+            yield f"[{number}]", item, item_kind
+    elif origin is dict and isinstance(value, dict):
+        yield from ((f".{key}", item, arguments[1]) for key, item in value.items())
+    elif isinstance(value, dict):
+        fields = getattr(msgspec.inspect.type_info(kind), "fields", ())
+        hints = get_type_hints(kind, include_extras=True) if fields else {}
+        for field in fields:
+            if field.encode_name in value:
+                yield f".{field.encode_name}", value[field.encode_name], hints[field.name]
+
+
+def _mismatched_fields(value: Any, options: Any) -> tuple[str, str] | None:
+    """Return the expected and the found fields of a JSON object, or None if the names of its fields are right."""
+    for option in options:
+        fields = {field.encode_name: field.required for field in getattr(option, "fields", ())}
+        if fields and isinstance(value, dict):
+            missing = [name for name, required in fields.items() if required and name not in value]
+            closed = getattr(option, "forbid_unknown_fields", False)
+            unknown = [name for name in value if closed and name not in fields]
+            if missing:
+                return f"the field {missing[0]}", f"only {', '.join(value)}" if value else "none"
+            if unknown:
+                return f"only {', '.join(fields)}", unknown[0]
+    return None
+
+
+def _described(value: Any, options: Any) -> str:
+    """Return the expected types of a value as text, or the limits if the value has one of these types."""
+    names = []
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if number and _LARGEST_INTEGER <= abs(value) < math.inf:
+        return "a number of usual size"
+    for option in options:
+        if number and _limits(option):
+            return _limits(option)
+        name = _NAMES.get(type(option).__name__, _OBJECT)
+        if hasattr(option, "values"):
+            name = ", ".join(map(str, option.values))
+            name = " or ".join(name.rsplit(", ", 1))
+        elif hasattr(option, "item_types"):
+            name += f" of length {len(option.item_types)}"
+        for limit, sign in (("min_length", ">="), ("max_length", "<=")):
+            if getattr(option, limit, None) is not None:
+                name += f" of length {sign} {getattr(option, limit)}"
+        names.append(name)
+    return " or ".join(names)
 
 
 def shortened(value: Any, most: int = 100) -> str:
-    """A value as JSON, cut where it is long."""
+    """Return a value as JSON, truncated to ``most`` characters."""
     text = json.dumps(value, ensure_ascii=False, default=str)
     return text if len(text) <= most else text[:most] + "..."
 
 
-def first_difference(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
-    """Where two records differ first, as ``recipe_data.metal_rules.begin``, and both values (None: not recorded)."""
+def first_differing_value(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
+    """Return the first field in which two records differ, and both values (None: not recorded).
+
+    A field of a nested record is named by its path, such as ``recipe_data.metal_rules.begin``.
+    """
     if isinstance(a, dict) and isinstance(b, dict):
         key = next(key for key in {**a, **b} if a.get(key) != b.get(key))
-        return first_difference(f"{name}.{key}", a.get(key), b.get(key))
+        return first_differing_value(f"{name}.{key}", a.get(key), b.get(key))
     if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
         place = next(place for place, (x, y) in enumerate(zip(a, b, strict=True)) if x != y)
-        return first_difference(f"{name}.{place}", a[place], b[place])
+        return first_differing_value(f"{name}.{place}", a[place], b[place])
     return name, a, b
 
 
-_UNKNOWN = object()
-
-
-def _at(value: Any, name: str, index: str) -> Any:
-    """The value one step further; msgspec does not say at which key of a mapping a mistake is."""
-    if name and isinstance(value, dict):
-        return value.get(name, _UNKNOWN)
-    if index.isdigit() and isinstance(value, list | tuple):
-        return value[int(index)]
-    return _UNKNOWN
-
-
-def _form_at(form: Any, name: str, index: str) -> Any:
-    """The type one step further, None where it is not known."""
-    for option in _kinds(form):
-        if name:
-            for field in getattr(option, "fields", ()):
-                if field.encode_name == name:
-                    return field.type
-        elif hasattr(option, "item_type"):
-            return option.item_type
-        elif hasattr(option, "item_types") and index.isdigit():
-            return option.item_types[int(index)]
-        elif hasattr(option, "value_type"):
-            return option.value_type
-    return None
-
-
-def _kinds(form: Any) -> Any:
-    """The types that a value may have, of one or of a union."""
-    return getattr(form, "types", (form,))
-
-
-def _limits(form: Any) -> str:
-    """The range of a number as text; empty without a range."""
-    for option in _kinds(form):
-        least, above, most, below = (getattr(option, name, None) for name in ("ge", "gt", "le", "lt"))
-        if least is not None and most is not None:
-            return f"{least:.10g} to {most:.10g}"
-        texts = (
-            (least, "{:.10g} or more"), (above, "above {:.10g}"), (most, "up to {:.10g}"), (below, "below {:.10g}"),
-        )  # fmt: skip
-        if any(limit is not None for limit, _ in texts):
-            return " and ".join(text.format(limit) for limit, text in texts if limit is not None)
-    return ""
-
-
-def _plain(text: str) -> str:
-    """msgspec's names of types as text: `float | null` -> a number or null."""
-
-    def words(match: re.Match[str]) -> str:
-        return " or ".join(_WORDS.get(word, word) for word in match[1].split(" | "))
-
-    return re.sub(r"`([^`]*)`", words, text)
+def _limits(option: Any) -> str:
+    """Return the range of a number as text; empty without a range."""
+    least, above, most, below = (getattr(option, name, None) for name in ("ge", "gt", "le", "lt"))
+    if least is not None and most is not None:
+        return f"{least:.10g} to {most:.10g}"
+    texts = (
+        (least, "{:.10g} or more"), (above, "above {:.10g}"), (most, "up to {:.10g}"), (below, "below {:.10g}"),
+    )  # fmt: skip
+    return " and ".join(text.format(limit) for limit, text in texts if limit is not None)
 
 
 def _require_finite(value: Any, where: object, remedy: str, path: str = "") -> None:
-    """Refuse NaN and infinity, which Python's JSON reads although JSON has no such numbers.
+    """Refuse NaN and infinity. Python's JSON parser accepts them although JSON has no such numbers.
 
     Raises:
-        PolarguideError: there is one.
+        PolarguideError: a number is not finite.
     """
     if isinstance(value, float) and not math.isfinite(value):
         place = f"{where} ({path.lstrip('.')})" if path else where

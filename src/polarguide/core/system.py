@@ -1,4 +1,4 @@
-"""Signals, memory and processes, what only some operating systems offer, and variables that would end a process."""
+"""Signals, locks, memory, processes, and validation of environment variables."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import re
 import signal
 import socket
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
@@ -28,21 +28,21 @@ MOST_PROCESSES = 65536
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
 NEARLY = 0.9
-"""Share of a memory limit from which on freed memory is given back."""
+"""Share of a memory limit above which freed memory is returned to the system."""
 GROWTH = 1.05
-"""Factor on the memory of the largest step, from which on freed memory is given back again."""
+"""Factor on the memory of the largest step above which freed memory is returned again."""
 SETTLED = 3
 """Number of steps that determine the memory of the largest step."""
 PARTLY = 0.5
-"""Of a limit, from which on ``MemoryBound.clear`` gives freed memory back."""
+"""Share of a memory limit above which ``MemoryBound.clear`` returns freed memory."""
 _NOT_BUSY = {"idle", "iowait", "guest", "guest_nice"}
-"""Times of processors that pass without work, or that are counted as time of users as well."""
+"""Processor times without work, and times that are counted as user time as well."""
 
 Item = TypeVar("Item")
 
 
 def _posix(module: str) -> Any | None:
-    """A module of the standard library that POSIX systems alone have."""
+    """Return a module of the standard library that only POSIX systems have, else None."""
     try:
         return importlib.import_module(module)
     except ImportError:
@@ -50,7 +50,7 @@ def _posix(module: str) -> Any | None:
 
 
 def stop_signals() -> list[int]:
-    """SIGTERM; and SIGHUP, of a terminal that goes away, unless it is ignored (nohup) or there is none."""
+    """Return SIGTERM, and SIGHUP unless it is ignored (nohup) or does not exist."""
     signals = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     return [
         number for number in signals if signal.getsignal(number) != signal.SIG_IGN or number == signal.SIGTERM
@@ -61,23 +61,23 @@ _interrupts: list[int] = []
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """A handler of signals that raises KeyboardInterrupt, as Python's own does, and takes note of it.
+    """Raise KeyboardInterrupt as Python's own signal handler does, and record the signal.
 
-    Packages lose it: what they import while it comes looks broken, and says nothing of the reason.
+    Packages may catch the exception during an import and raise another error.
     """
     _interrupts.append(number)
     signal.default_int_handler(number, frame)
 
 
 def interrupts() -> int:
-    """How many signals ``interrupt`` has taken in this process."""
+    """Return the number of signals that ``interrupt`` has handled in this process."""
     return len(_interrupts)
 
 
 class StopSignals:
-    """A context in which Ctrl-C, SIGTERM and SIGHUP ask work to stop; the object is a training's ``should_stop``.
+    """Context in which Ctrl-C, SIGTERM and SIGHUP request a stop; the object is a training's ``should_stop``.
 
-    Before it is called for the first time, and at a second Ctrl-C, they interrupt at once.
+    The signals interrupt at once before the first call of the object, and at a second Ctrl-C.
     """
 
     def __init__(self) -> None:
@@ -101,7 +101,7 @@ class StopSignals:
                 interrupt(number, frame)
             self._stopping = True
         elif number == signal.SIGTERM and process_count() > 1:
-            # torchrun ends the others when one process is lost: first one of them has to say what happened.
+            # torchrun ends the other processes when one is lost: leave that process time for its message.
             timer = threading.Timer(LAST_WORDS_SECONDS, os._exit, (128 + number,))
             timer.daemon = True
             timer.start()
@@ -111,7 +111,7 @@ class StopSignals:
 
 @contextlib.contextmanager
 def sigterm_kept() -> Iterator[None]:
-    """Keep the handler of SIGTERM, which some libraries replace as they are loaded."""
+    """Restore the handler of SIGTERM, which some libraries replace when they are loaded."""
     handler = signal.getsignal(signal.SIGTERM)
     yield
     if handler is not None and threading.current_thread() is threading.main_thread():
@@ -119,64 +119,48 @@ def sigterm_kept() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def exclusive_lock(path: Path) -> Iterator[None]:
-    """Hold a lock on a file. Child processes inherit it, and keep it if this process is killed.
-
-    Raises:
-        BlockingIOError: another process holds it.
-        OSError: the file cannot be opened, or is a link: what the link leads to is not ours to open.
-    """
-    fcntl = _posix("fcntl")
-    handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
-    with open(handle, "w") as file:
-        if fcntl is not None:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            os.set_inheritable(file.fileno(), True)
-        yield
-
-
-def hold_folder(folder: Path) -> Callable[[], None]:
-    """Lock a folder itself, without a file in it; returns what lets it go. Does nothing where folders have no locks.
-
-    Raises:
-        BlockingIOError: another process holds it.
-    """
-    fcntl = _posix("fcntl")
-    if fcntl is None:
-        return lambda: None
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(handle)
-        raise
-    except OSError:  # a disk of the network without locks
-        pass
-    return lambda: os.close(handle)
-
-
-@contextlib.contextmanager
 def only_writer(lock: Path, *, expected: str, found: str) -> Iterator[None]:
-    """Hold the lock of a folder.
+    """Hold the lock of a folder: a file in it, or the folder itself on systems that support this.
+
+    Child processes inherit the lock of a file, and hold it if this process is killed.
+
+    Args:
+        lock: the file or folder.
+        expected, found: fields of the error message.
 
     Raises:
-        PolarguideError: another process holds it; ``expected`` and ``found`` say so.
+        PolarguideError: another process holds the lock.
+        OSError: the file cannot be opened, or is a link, which may lead to a file of somebody else.
     """
-    with contextlib.ExitStack() as stack:
+    fcntl = _posix("fcntl")
+    is_folder = lock.is_dir()
+    if fcntl is None and is_folder:
+        yield
+        return
+    created = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+    handle = os.open(lock, os.O_RDONLY if is_folder else created, 0o666)
+    try:
         try:
-            stack.enter_context(exclusive_lock(lock))
+            if fcntl is not None:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise PolarguideError(
-                lock.parent,
+                lock if is_folder else lock.parent,
                 expected=expected,
                 found=found,
                 remedy="Wait until the other command has ended, or choose another folder with --out.",
             ) from None
+        except OSError:
+            if not is_folder:  # some network disks do not support locks of folders
+                raise
+        os.set_inheritable(handle, not is_folder)
         yield
+    finally:
+        os.close(handle)
 
 
 def peak_memory_mib() -> float | None:
-    """The most memory in MiB that this process has held at a time, or None where the system does not tell."""
+    """Return the peak memory of this process in MiB, or None if the system does not report it."""
     resource = _posix("resource")
     if resource is None:
         return None
@@ -185,25 +169,24 @@ def peak_memory_mib() -> float | None:
 
 
 def resident_memory() -> int:
-    """Bytes of memory that this process holds now."""
+    """Return the resident memory of this process in bytes."""
     return int(psutil.Process().memory_info().rss)
 
 
 def return_freed_memory() -> None:
-    """Give what has been freed back to the system, where the allocator is glibc's."""
+    """Return freed memory to the system if the allocator is that of glibc."""
     with contextlib.suppress(AttributeError, OSError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 class MemoryBound:
-    """Gives freed memory back to the system where this process comes to hold nearly as much as it may, or half of it
-    before other work.
+    """Memory limit of a process, near which freed memory is returned to the system.
 
-    An allocator that keeps what is freed (``keep_freed_memory``) holds ever more where sizes change, as with each
-    growth of the Gaussians: pieces of former sizes lie free between those in use.
+    The allocator keeps freed memory (``keep_freed_memory``). When sizes change, as with the number of Gaussians, free
+    blocks of old sizes remain between used ones.
 
     Args:
-        limit: bytes that the process may hold; without one, nothing is done.
+        limit: bytes that the process may hold; infinity: memory is never returned.
     """
 
     def __init__(self, limit: float = math.inf) -> None:
@@ -214,9 +197,9 @@ class MemoryBound:
         self._waits = 0
 
     def keep(self) -> None:
-        """Call once per step, when allocations of successive steps have similar sizes."""
+        """Return freed memory near the limit. Call it once per step, when steps allocate similar sizes."""
         resident = resident_memory()
-        if self._waits:  # steps take what they need again: under the most of it there is nothing to return
+        if self._waits:  # steps allocate up to the largest of them again, so nothing can be returned below it
             self._most = max(self._most, resident)
             self._waits -= 1
             self._bound = min(max(self._least, GROWTH * self._most), self._limit)
@@ -226,14 +209,14 @@ class MemoryBound:
             self._waits = SETTLED
 
     def clear(self) -> None:
-        """Call between two operations whose allocations have different sizes, such as a view's targets and a step."""
+        """Return freed memory above half of the limit. Call it between operations that allocate different sizes."""
         if resident_memory() > PARTLY * self._limit:
             return_freed_memory()
 
     def between(self, items: Iterable[Item]) -> Iterator[Item]:
-        """The items, with ``clear`` called before each and after the last.
+        """Yield the items, with ``clear`` called before each and after the last.
 
-        What is kept of one would otherwise lie between gaps that the work on those before it has left.
+        This avoids fragmentation: memory that is kept for an item does not lie between blocks freed by earlier items.
         """
         iterator = iter(items)
         while True:
@@ -249,10 +232,11 @@ UNBOUNDED = MemoryBound()
 
 
 def keep_freed_memory() -> None:
-    """Tell the allocator, for the rest of this process, to keep what is freed; only glibc's can.
+    """Configure glibc's allocator to keep freed memory for the rest of this process.
 
-    Each step of a training frees and asks for the same hundred megabytes, which glibc would hand to the system and
-    fetch again, page by page, cleared. A process that is ours alone calls this, never a module as it is imported.
+    Each training step frees and allocates the same hundred megabytes. By default glibc returns them to the system,
+    which
+    clears the pages again. Only the entry points of programs call this, not modules during import.
     """
     try:
         libc = ctypes.CDLL(None)
@@ -261,23 +245,23 @@ def keep_freed_memory() -> None:
         return
     libc.mallopt(M_TRIM_THRESHOLD, -1)  # never
     if not libc.mallopt(M_MMAP_THRESHOLD, 1 << 30):
-        libc.mallopt(M_MMAP_THRESHOLD, 1 << 25)  # the most that older versions take
+        libc.mallopt(M_MMAP_THRESHOLD, 1 << 25)  # the largest value of older versions
 
 
 def network_address() -> str | None:
-    """The address of this machine in its network; None where it is in none. Nothing is sent."""
+    """Return the address of this machine in its network, or None without a network. Nothing is sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(("192.0.2.1", 9))  # RFC 5737: nobody's
+            probe.connect(("192.0.2.1", 9))  # RFC 5737: an address for documentation
         except OSError:
             return None
         return str(probe.getsockname()[0])
 
 
 def free_memory(group: Path = Path("/sys/fs/cgroup")) -> int:
-    """Bytes of memory that this process may still take, as the system and its control group say.
+    """Return the bytes of memory that this process may still allocate, by the system and by its control group.
 
-    What a control group holds of files goes when memory is asked for, and counts as free.
+    The system drops cached files of a control group on demand, so they count as free.
     """
     available = int(psutil.virtual_memory().available)
     with contextlib.suppress(OSError, ValueError):
@@ -289,98 +273,95 @@ def free_memory(group: Path = Path("/sys/fs/cgroup")) -> int:
 
 
 def machine_busy_seconds() -> float:
-    """Processor seconds that the whole machine has been busy."""
+    """Return the busy processor time of the whole machine in seconds."""
     times = psutil.cpu_times()._asdict()
     return float(sum(seconds for name, seconds in times.items() if name not in _NOT_BUSY))
 
 
 def process_is_alive(pid: int) -> bool:
-    """Whether a process runs; a zombie, which has ended and waits to be asked about, does not."""
-    if os.name != "posix":  # there, signal 0 would end it
-        return True
+    """Return whether a process runs. A zombie does not."""
     try:
-        os.kill(pid, 0)
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except (ProcessLookupError, OverflowError):  # the latter of a number that no process has
+        return psutil.Process(pid).status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
+    except psutil.NoSuchProcess:
         return False
-    except (OSError, IndexError):  # not ours to signal, or a system without /proc
+    except psutil.AccessDenied:
         return True
-    return state not in "ZX"
 
 
 def process_rank() -> int:
-    """The number of this process among those that torchrun started; 0 without it, or for no number."""
+    """Return the rank of this process under torchrun, 0 without torchrun or for an invalid rank."""
     text = os.environ.get("RANK", "")
     return int(text) if _is_count(text) else 0
 
 
 def process_count() -> int:
-    """How many processes torchrun started for this training; 1 without it.
+    """Return the number of processes that torchrun started for this training, 1 without torchrun.
 
     Raises:
-        PolarguideError: the variables that torchrun sets hold something else.
+        PolarguideError: a variable of torchrun is invalid.
     """
-    counts = {name: os.environ.get(name, default) for name, default in (("WORLD_SIZE", "1"), ("RANK", "0"))}
-    for name, text in counts.items():
-        if not _is_count(text):
-            raise _no_rank(name, f"a whole number up to {MOST_PROCESSES}", repr(text))
-    world, rank = (int(text) for text in counts.values())
-    if not rank < max(1, world) <= MOST_PROCESSES:
-        raise _no_rank(
-            "RANK", f"one of up to {MOST_PROCESSES} processes, counted from 0", f"{rank} of {world}"
-        )
+    world_text = os.environ.get("WORLD_SIZE", "1")
+    rank_text = os.environ.get("RANK", "0")
+    for name, text in (("WORLD_SIZE", world_text), ("RANK", rank_text)):
+        _require_variable(name, _is_count(text), f"a whole number up to {MOST_PROCESSES}", repr(text))
+    world = max(1, int(world_text))
+    rank = int(rank_text)
+    _require_variable(
+        "RANK",
+        rank < world <= MOST_PROCESSES,
+        f"one of up to {MOST_PROCESSES} processes, counted from 0",
+        f"{rank} of {world}",
+    )
     if world > 1:
-        _require_meeting_place()
-    return max(1, world)
+        local, host, port = (
+            os.environ.get(name, "") for name in ("LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
+        )
+        _require_variable(
+            "LOCAL_RANK", _is_count(local), "the number of this process on its machine", repr(local)
+        )
+        _require_variable("MASTER_ADDR", bool(host), "the machine of the first process", "none")
+        right_port = _is_count(port) and 0 < int(port) < 65536
+        _require_variable("MASTER_PORT", right_port, "a port from 1 to 65535", repr(port))
+    return world
 
 
-def _require_meeting_place() -> None:
-    """Check what several processes need to find each other.
-
-    Raises:
-        PolarguideError: the variables that torchrun sets hold something else.
-    """
-    local, host, port = (os.environ.get(name, "") for name in ("LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT"))
-    if not _is_count(local):
-        raise _no_rank("LOCAL_RANK", "the number of this process on its machine", repr(local))
-    if not host:
-        raise _no_rank("MASTER_ADDR", "the machine of the first process", "none")
-    if not (_is_count(port) and 0 < int(port) < 65536):
-        raise _no_rank("MASTER_PORT", "a port from 1 to 65535", repr(port))
+def _require_variable(name: str, right: bool, expected: str, found: str) -> None:
+    """Raise PolarguideError unless a variable of torchrun is valid."""
+    if not right:
+        raise PolarguideError(
+            name,
+            expected=expected,
+            found=found[:100],
+            remedy="Unset WORLD_SIZE and RANK, or start the training with torchrun.",
+        )
 
 
 def _is_count(text: str) -> bool:
     return text.isascii() and text.isdigit() and len(text) < 10
 
 
-def _no_rank(name: str, expected: str, found: str) -> PolarguideError:
-    remedy = "Unset WORLD_SIZE and RANK, or start the training with torchrun."
-    return PolarguideError(name, expected=expected, found=found[:100], remedy=remedy)
-
-
 _SIZE = re.compile(r"[0-9]{1,18}(KB|Kb|kb|MB|Mb|mb)?")
 _SIZES = re.compile(r"OPENCV_(IO_MAX_IMAGE_[A-Z]+|IMGCODECS_[A-Z]+_MAX_FILE_SIZE)")
-"""Read by OpenCV as it is loaded, which ends the process where one is not a size."""
+"""Variables that OpenCV reads when it is loaded. An invalid size ends the process."""
 
 
 def check_variables() -> None:
-    """Validate variables that OpenCV and the kernels read when they are loaded: a wrong value would end the process.
+    """Validate variables that OpenCV and the kernels read when they are loaded. A wrong value would end the process.
 
     Raises:
-        PolarguideError: the kernels would start more threads than any machine has, or OpenCV would end the process.
+        PolarguideError: a variable is invalid, or the number of threads is too large.
     """
     threads = os.environ.get("POLARGUIDE_THREADS", "").strip()
+    wrong = {}
     if threads.isdecimal() and len(threads) < 1000 and int(threads) > MOST_THREADS:
-        raise _wrong("POLARGUIDE_THREADS", f"a number up to {MOST_THREADS}", threads)
+        wrong["POLARGUIDE_THREADS"] = f"a number up to {MOST_THREADS}"
     for name, text in os.environ.items():
         if _SIZES.fullmatch(name) and not _SIZE.fullmatch(text):
-            raise _wrong(name, "a whole number", text)
-
-
-def _wrong(name: str, expected: str, found: str) -> PolarguideError:
-    return PolarguideError(
-        f"the variable {name}",
-        expected=expected,
-        found=repr(found[:100]),
-        remedy=f"Correct it, or unset {name}.",
-    )
+            wrong[name] = "a whole number"
+    for name, expected in wrong.items():
+        raise PolarguideError(
+            f"the variable {name}",
+            expected=expected,
+            found=repr(os.environ[name][:100]),
+            remedy=f"Correct it, or unset {name}.",
+        )

@@ -1,4 +1,4 @@
-"""Texts from people and from files: numbers in them, what a terminal would obey, and CSV cells that are no formulas."""
+"""Text from users and files: numbers, safe output on terminals, and safe CSV cells."""
 
 from __future__ import annotations
 
@@ -12,25 +12,24 @@ import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import PurePath
 
-_MOST_DIGITS = 10  # Python itself refuses thousands of them
+_MOST_DIGITS = 10  # Python itself limits the number of digits
 
 
 def canonical(name: str) -> str:
-    """A name in the composed form of Unicode (NFC, UAX 15), in which names are compared.
+    """Return a name in the composed normal form of Unicode (NFC, UAX 15), in which names are compared.
 
-    File systems and programs store one name as different characters: an u-umlaut is one sign, or u and two dots.
+    File systems and programs store the same name as different code points: ü is one, or u and a diaeresis.
     """
     return unicodedata.normalize("NFC", name)
 
 
 def stem_of(path: PurePath) -> str:
-    """A file's name without its suffix, ``canonical``."""
+    """Return a file's name without its suffix, in the form of ``canonical``."""
     return canonical(path.stem)
 
 
 def decimal(text: str) -> float:
-    """A number as ``float`` reads it, without underscores (``1_0`` is more often a slip for 1.0 than ten) and digits of
-    other scripts.
+    """Parse a number like ``float``, but without underscores (``1_0`` is more often a typo of 1.0) and foreign digits.
 
     Raises:
         ValueError: the text is not a number.
@@ -41,12 +40,12 @@ def decimal(text: str) -> float:
 
 
 def whole_number(text: str) -> int | None:
-    """A whole number of plain digits; None for other texts, and for more digits than any count here has."""
+    """Parse a whole number of at most nine ASCII digits; None for other texts."""
     return int(text) if text.isascii() and text.isdigit() and len(text) < _MOST_DIGITS else None
 
 
 def number_or_nan(text: str) -> float:
-    """A number as ``decimal`` reads it; NaN if it is malformed, which every comparison refuses."""
+    """Parse a number like ``decimal``; NaN for other texts, so that every comparison with the number fails."""
     try:
         return decimal(text)
     except ValueError:
@@ -54,7 +53,7 @@ def number_or_nan(text: str) -> float:
 
 
 def decimals(text: str) -> tuple[float, ...]:
-    """The numbers of a list such as 1.9,1,1.6; none if it is something else."""
+    """Parse a comma-separated list of numbers such as 1.9,1,1.6; empty for other texts."""
     try:
         return tuple(decimal(part) for part in text.split(","))
     except ValueError:
@@ -68,10 +67,10 @@ def listed(names: Sequence[str], limit: int = 4) -> str:
 
 
 def command(*words: object) -> str:
-    """A command line of polarguide that a shell takes as it is printed, whatever blanks names have.
+    """Return a command line of polarguide with quoted names, ready for a shell.
 
     Args:
-        words: the verb and what follows it; capital letters alone, such as SCENE, are for people to replace.
+        words: the verb and its arguments; capital letters alone, such as SCENE, are placeholders.
     """
     return shlex.join(["polarguide", *map(str, words)])
 
@@ -80,7 +79,7 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
 
 
 def decimal_comma(cells: Iterable[str]) -> str:
-    """The first of several texts that is a number with a decimal comma, as ``0,9238``; empty where none is."""
+    """Return the first text that is a number with a decimal comma, such as ``0,9238``, else an empty text."""
     return next((cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell)), "")
 
 
@@ -88,11 +87,12 @@ def printable(text: str, *, lines: bool = False) -> str:
     """Escape control characters in a text, such as names of files, before it is printed.
 
     Args:
-        lines: whether it may have several lines.
+        text: the text.
+        lines: whether line breaks are kept.
     """
     with contextlib.suppress(
         UnicodeEncodeError
-    ):  # in the C locale, Python has made names in UTF-8 single bytes
+    ):  # in the C locale, Python decodes names in UTF-8 to single bytes
         text = text.encode("utf-8", "surrogateescape").decode("utf-8", "surrogateescape")
     return "".join(
         sign
@@ -106,14 +106,16 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 def csv_lines(rows: Iterable[Iterable[object]]) -> str:
-    """Rows of values as CSV; None is an empty cell, and texts that begin as formulas get an apostrophe in front."""
+    """Return rows of values as CSV. None is an empty cell, and an apostrophe precedes a text that looks like a
+    formula.
+    """
     file = io.StringIO()
-    csv.writer(file, lineterminator="\n").writerows([plain(value) for value in row] for row in rows)
+    csv.writer(file, lineterminator="\n").writerows([csv_value(value) for value in row] for row in rows)
     return file.getvalue()
 
 
-def plain(value: object) -> object:
-    """A value that spreadsheets do not take for a formula, nor terminals for a command: names come from files."""
+def csv_value(value: object) -> object:
+    """Return a value that is neither a formula for spreadsheets nor a control sequence for terminals."""
     if not isinstance(value, str):
         return value
     return printable(f"'{value}" if value.startswith(_FORMULA) else value, lines=True)

@@ -39,7 +39,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import check_out, holds_files, make_folder, read_file, require_inside, write_whole
 from polarguide.core.progress import Reporter
 from polarguide.core.records import decode, read_record, shortened, to_json
-from polarguide.core.system import hold_folder
+from polarguide.core.system import only_writer
 from polarguide.core.text import canonical, stem_of
 from polarguide.preparation.request import FileStamp, first_difference
 from polarguide.preparation.settings import PrepareSettings, known_intrinsics
@@ -217,19 +217,12 @@ class SceneFolder:
             PolarguideError: one is at work in it, or it cannot be created.
         """
         make_folder(self.root)
-        try:
-            let_go = hold_folder(self.root)
-        except BlockingIOError:
-            raise PolarguideError(
-                self.root,
-                expected="a folder that nobody else writes",
-                found="another polarguide prepare at work on it",
-                remedy="Wait until it has ended, or choose another folder with --out.",
-            ) from None
-        try:
+        with only_writer(
+            self.root,
+            expected="a folder that nobody else writes",
+            found="another polarguide prepare at work on it",
+        ):
             yield
-        finally:
-            let_go()
 
     def start(self) -> None:
         """Take note of the request."""

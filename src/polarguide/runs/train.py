@@ -18,7 +18,7 @@ from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import check_out, make_folder
 from polarguide.core.options import PathLike, SceneOptions, SessionOptions
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.core.records import first_difference
+from polarguide.core.records import first_differing_value
 from polarguide.core.system import MEBIBYTE, MemoryBound, peak_memory_mib, return_freed_memory
 from polarguide.raster import Backend, use_threads
 from polarguide.recipes import recipe_named
@@ -296,7 +296,7 @@ def check_same_run(old: RunConfiguration, new: RunConfiguration, out: Path) -> N
         a = getattr(old, field)
         b = getattr(new, field)
         if a != b and a is not None:
-            name, a, b = first_difference(field, a, b)
+            name, a, b = first_differing_value(field, a, b)
             raise PolarguideError(
                 f"{out}/{CONFIGURATION} ({name})",
                 expected="none recorded" if a is None else json.dumps(a, default=str)[:120],

@@ -1,4 +1,4 @@
-"""Cameras of a browser window: free ones, those at a photograph's pose, a path of keyframes, and clickable frusta."""
+"""Cameras of a browser's window: free cameras, photographs' poses, keyframes, and clickable frusta."""
 
 from __future__ import annotations
 
@@ -25,11 +25,13 @@ from polarguide.visualization.figures import Picture
 def free_camera(
     wxyz: Sequence[float], position: Sequence[float], fov: float, frame_size: tuple[int, int]
 ) -> Camera:
-    """A camera with square pixels and a centered principal point.
+    """Return a camera with square pixels and a centered principal point.
 
     Args:
-        wxyz: quaternion of the camera-to-world rotation, OpenCV's axes. position: in the world.
-        fov: vertical field of view in radians. frame_size: width and height in pixels.
+        wxyz: quaternion of the camera-to-world rotation, in OpenCV's axes.
+        position: camera center in the world.
+        fov: vertical field of view in radians.
+        frame_size: width and height in pixels.
     """
     width, height = frame_size
     w, x, y, z = (float(v) for v in wxyz)
@@ -39,66 +41,47 @@ def free_camera(
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, rotation, -rotation @ center)
 
 
-@dataclass(frozen=True)
-class Letterbox:
-    """The placement of a photograph in a window of another aspect ratio: as large as possible, centered.
+def letterboxed(photograph: Picture, frame_size: tuple[int, int]) -> Picture:
+    """Return a photograph in a window of another aspect ratio: as large as possible, centered, on gray.
 
-    Attributes:
-        scale: window pixels per pixel of the photograph. left, top: its corner in window pixels.
-        frame_size: width and height of the window.
+    Args:
+        photograph: uint8 [h, w, 3].
+        frame_size: width and height of the window in pixels.
     """
-
-    scale: float
-    left: float
-    top: float
-    frame_size: tuple[int, int]
-
-    def apply(self, picture: Picture) -> Picture:
-        """A picture of the photograph's size, resampled into the window with gray borders."""
-        matrix = np.array([[self.scale, 0, self.left], [0, self.scale, self.top]])
-        # The origin of warpAffine is the center of the corner pixel, that of our cameras its corner.
-        matrix[:, 2] += 0.5 * self.scale - 0.5
-        blend = cv2.INTER_LINEAR if self.scale >= 1 else cv2.INTER_AREA
-        placed = cv2.warpAffine(picture, matrix, self.frame_size, flags=blend, borderValue=(64, 64, 64))
-        return np.ascontiguousarray(placed, dtype=np.uint8)
-
-
-def letterbox(photograph: Camera, frame_size: tuple[int, int]) -> Letterbox:
-    """The placement of a photograph in a window of ``frame_size``, width and height."""
-    scale = min(frame_size[0] / photograph.width, frame_size[1] / photograph.height)
-    left = 0.5 * (frame_size[0] - scale * photograph.width)
-    top = 0.5 * (frame_size[1] - scale * photograph.height)
-    return Letterbox(scale, left, top, frame_size)
+    height, width = photograph.shape[:2]
+    scale = min(frame_size[0] / width, frame_size[1] / height)
+    left = 0.5 * (frame_size[0] - scale * width)
+    top = 0.5 * (frame_size[1] - scale * height)
+    # The origin of warpAffine is the center of the corner pixel; the origin of our cameras is its corner.
+    matrix = np.array([[scale, 0, left + 0.5 * scale - 0.5], [0, scale, top + 0.5 * scale - 0.5]])
+    blend = cv2.INTER_LINEAR if scale >= 1 else cv2.INTER_AREA
+    placed = cv2.warpAffine(photograph, matrix, frame_size, flags=blend, borderValue=(64, 64, 64))
+    return np.ascontiguousarray(placed, dtype=np.uint8)
 
 
 def drawn_camera(camera: Camera, view: View | None) -> Camera:
-    """The camera of a window's picture: a free one, or that of a view's pose in a window of this size."""
+    """Return the camera of a window's picture: the free camera, or a view's pose with the window's size."""
     if view is None:
         return camera
     return view.camera.extended(camera.width, camera.height)
 
 
-def window_fov(photograph: Camera, aspect: float) -> float:
-    """Vertical field of view in radians with which a window of ``aspect`` (width / height) contains a photograph."""
-    high = 0.5 * photograph.height / photograph.fy
-    wide = 0.5 * photograph.width / photograph.fx
-    return 2 * math.atan(max(high, wide / aspect))
-
-
-ARRIVAL = 5.0  # seconds within which a browser has to report a pose
-# Tolerances of rounding: 1 - |cos| of half the angle, and a share of the cameras' distance.
+ARRIVAL = 5.0  # seconds within which a browser must report a pose
+# Tolerances of rounding: 1 - |cos| of half the angle, and distance in units of the cameras' distance.
 TURNED = 1e-6
 MOVED = 1e-4
 
 
 @dataclass(eq=False)
 class ViewPose:
-    """The view at whose pose a session's camera is.
+    """The view whose pose a session's camera has.
 
     Attributes:
-        view: the view. wxyz, position: the pose that was sent to the browser. since: the time when it was sent.
-        written: viser's time stamp of the camera as we wrote it.
-        reached: whether the browser has reported this pose; until then it may report earlier poses.
+        view: the view.
+        wxyz, position: the pose that was sent to the browser.
+        since: the time when it was sent.
+        written: viser's time stamp of this change of the camera.
+        reached: whether the browser has reported this pose. Until then it may report earlier poses.
     """
 
     view: View
@@ -109,15 +92,17 @@ class ViewPose:
     reached: bool = False
 
     def is_kept(self, camera: Any, now: float, distance: float) -> bool:
-        """Whether a browser's camera has this pose, or may still be moving to it.
+        """Return whether a browser's camera has this pose, or may still be moving to it.
 
         Args:
-            camera: viser's. now: time in seconds. distance: distance of the cameras from the scene's center.
+            camera: viser's camera.
+            now: time in seconds.
+            distance: distance of the cameras from the scene's center.
         """
         turned = 1 - abs(float(np.dot(self.wxyz, camera.wxyz)))
         moved = float(np.linalg.norm(self.position - camera.position)) / distance
         here = turned < TURNED and moved < MOVED
-        # The callback of an earlier report may run after the pose was written, and then reads what we wrote.
+        # The callback of an earlier report may run after the pose was written, and then reads the written pose.
         self.reached |= here and camera.update_timestamp != self.written
         return here or (not self.reached and now - self.since < ARRIVAL)
 
@@ -130,12 +115,14 @@ def move_to_view(client: Any, view: View, scene_frame: SceneFrame, now: float) -
     # The orbit center lies on the optical axis, at the distance of the scene's center.
     ahead = target.rotation[2]
     distance = max(float((scene_frame.center - center) @ ahead), 0.1 * scene_frame.distance)
+    high = 0.5 * target.height / target.fy
+    wide = 0.5 * target.width / target.fx
     with client.atomic():
-        camera.fov = window_fov(target, camera.aspect)
+        camera.fov = 2 * math.atan(max(high, wide / camera.aspect))
         camera.up_direction = (-target.rotation[1]).numpy()
         camera.position = center.numpy()
         camera.look_at = (center + distance * ahead).numpy()
-    # Not what viser has stored by now: a message of the browser may have replaced it.
+    # viser's stored pose may already be replaced by a message of the browser.
     pose = np.array(quaternion(target.rotation.T)), center.numpy()
     return ViewPose(view, *pose, since=now, written=camera.update_timestamp)
 
@@ -144,48 +131,34 @@ FRAMES_PER_SECOND = 30
 MOST_KEYFRAMES = 50
 
 
-class Keyframes:
-    """Keyframes in the order in which they were added, and the smooth path through them.
+def keyframe(camera: Camera, frame_size: tuple[int, int]) -> Camera:
+    """Return a camera with another picture size, width and height, and the same vertical field of view."""
+    width, height = frame_size
+    focal = camera.fy * height / camera.height
+    return replace(camera, width=width, height=height, fx=focal, fy=focal, cx=0.5 * width, cy=0.5 * height)
 
-    Args:
-        frame_size: width and height of the pictures of the path.
-    """
 
-    def __init__(self, frame_size: tuple[int, int]) -> None:
-        self._size = frame_size
-        self.cameras: list[Camera] = []
+def keyframe_path(keyframes: list[Camera], seconds: float) -> list[Camera]:
+    """Return the smooth path with ``seconds`` between keyframes. Fewer than two keyframes are returned unchanged."""
+    if len(keyframes) < 2:
+        return keyframes
+    return interpolated(keyframes, 1 + round((len(keyframes) - 1) * seconds * FRAMES_PER_SECOND))
 
-    def add(self, camera: Camera) -> None:
-        """Append a keyframe, up to ``MOST_KEYFRAMES``; its vertical field of view is kept."""
-        if len(self.cameras) >= MOST_KEYFRAMES:
-            return
-        width, height = self._size
-        focal = camera.fy * height / camera.height
-        self.cameras.append(
-            replace(camera, width=width, height=height, fx=focal, fy=focal, cx=0.5 * width, cy=0.5 * height)
-        )
 
-    def path(self, seconds: float) -> list[Camera]:
-        """The path with ``seconds`` between keyframes; fewer than two keyframes are returned as they are."""
-        if len(self.cameras) < 2:
-            return list(self.cameras)
-        frames = 1 + round((len(self.cameras) - 1) * seconds * FRAMES_PER_SECOND)
-        return interpolated(self.cameras, frames)
-
-    def to_json(self, seconds: float) -> str:
-        """The path as JSON that ``polarguide render --path`` reads."""
-        records = [camera_record(camera) for camera in self.path(seconds)]
-        return json.dumps({"frames_per_second": FRAMES_PER_SECOND, "cameras": records})
+def path_json(path: list[Camera]) -> str:
+    """Return a path as JSON for ``polarguide render --path``."""
+    records = [camera_record(camera) for camera in path]
+    return json.dumps({"frames_per_second": FRAMES_PER_SECOND, "cameras": records})
 
 
 THUMBNAIL = 96  # pixels of the longer side
-# Shares of the cameras' distance: size of a frustum, and distance within which it is hidden.
+# In units of the cameras' distance: size of a frustum, and distance within which it is hidden.
 SIZE = 0.05
 NEAR = 0.4
 COLOR = (60, 90, 160)
 HELD_OUT_COLOR = (200, 120, 30)
 BOX_COLOR = (240, 200, 40)
-# The twelve edges of a box whose eight corners are ordered with the last axis fastest.
+# The twelve edges of a box. Its eight corners are ordered with the last axis fastest.
 EDGES = [(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit]
 
 
@@ -199,24 +172,26 @@ class Photograph:
 
 
 def photographs(scene: Scene) -> dict[str, Photograph]:
-    """All photographs of a scene, by name of the view."""
+    """Return all photographs of a scene by name of the view."""
     tests = set(scene.test_names)
-    return {view.name: Photograph(view, _thumbnail(view), view.name in tests) for view in scene.views}
-
-
-def _thumbnail(view: View) -> Picture:
-    picture = view.photograph().numpy()
-    scale = min(1.0, THUMBNAIL / max(picture.shape[:2]))
-    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return figures.radiance_to_rgb(torch.from_numpy(small))
+    found = {}
+    for view in scene.views:
+        picture = view.photograph().numpy()
+        scale = min(1.0, THUMBNAIL / max(picture.shape[:2]))
+        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        thumbnail = figures.radiance_to_rgb(torch.from_numpy(small))
+        found[view.name] = Photograph(view, thumbnail, view.name in tests)
+    return found
 
 
 class Frusta:
     """Clickable camera frusta with their photographs.
 
     Args:
-        scene: viser's scene handle of one session. photographs: to be shown. scene_frame: frame of the scene.
-        go: called with a view's name when its frustum is clicked.
+        scene: viser's scene handle of one session.
+        photographs: photographs to show.
+        scene_frame: frame of the scene.
+        go: callback with a view's name when its frustum is clicked.
     """
 
     def __init__(
@@ -260,7 +235,7 @@ class Frusta:
         self._update()
 
     def hide_near(self, position: np.ndarray | None) -> None:
-        """Hide the frusta near the camera position [3], which would cover the picture; all of them if it is None."""
+        """Hide the frusta near a camera position [3], which would cover the picture. None: hide all."""
         near = True if position is None else np.linalg.norm(self._centers - position, axis=1) < self._reach
         self._far = ~np.broadcast_to(near, len(self._handles))
         self._update()
@@ -272,7 +247,7 @@ class Frusta:
                 handle.visible = visible
 
     def show_box(self, crop: Crop | None) -> None:
-        """Draw the crop box, or remove it."""
+        """Draw the crop box. None: remove it."""
         if self._box is not None:
             self._box.remove()
             self._box = None

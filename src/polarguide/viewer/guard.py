@@ -1,8 +1,9 @@
-"""The guard between viser and the network: viser itself authenticates nobody, and trusts every message.
+"""Access control of the viewer. viser itself authenticates nobody, and trusts every message.
 
-A web page of somebody else, open in the same browser, may not talk to the viewer. viser has no hook for this, so the
-function that it listens with is wrapped while it starts. That is why its version is pinned, and why the viewer does not
-start where the wrapper was not used.
+Web pages of other sites that are open in the same browser must not connect to the viewer. viser has no hook for this.
+Therefore ``websockets``' function ``serve`` is wrapped while viser starts to listen. The version of viser is pinned,
+and
+the viewer does not start if viser did not call the wrapper.
 """
 
 from __future__ import annotations
@@ -23,21 +24,22 @@ from polarguide.viewer.messages import LARGEST, Refused
 
 WEB = ("http", "https")
 _PLACE = re.compile(r"(\[[^\[\]]*\]|[^\[\]:@]*)(:[0-9]*)?")
-"""NAME or [ADDRESS], and :PORT."""
+"""Host of a URL, NAME or [ADDRESS], with an optional port."""
 _NAME = re.compile(r"[\w-]+(\.[\w-]+)*")
-"""No pattern: ``*`` is the name of nobody."""
+"""Name of a host, without wildcards."""
 
 
 class Gate:
-    """Looks at the names in a request, never at ports, which tunnels change.
+    """Rules for the hosts and origins of requests. Ports are ignored, since tunnels change them.
 
     Args:
-        listening: the address that is listened at; where it is a name, requests may name it.
+        listening: host of the server, which requests may name.
         hosts: further host names under which the viewer may be opened.
-        origins: pages that may ask, as ``https://NAME`` or ``NAME``, besides those that the viewer itself sends.
+        origins: sites of pages that may connect, as ``https://NAME`` or ``NAME``, in addition to the viewer's own
+            pages.
 
     Raises:
-        PolarguideError: one of the names is not a host name or an address.
+        PolarguideError: a name is neither a host name nor an address.
     """
 
     def __init__(self, listening: str, hosts: Iterable[str] = (), origins: Iterable[str] = ()) -> None:
@@ -45,10 +47,14 @@ class Gate:
         self._origins = {_given("allow_origin", name) for name in origins}
 
     def refusal(self, headers: Any) -> str | None:
-        """Why a request with these headers (a ``websockets.Headers``) is refused, with the remedy; None: it is not.
+        """Return the reason and the remedy for refusing a request, or None for a valid request.
 
-        A name that is neither an address nor known here may be a stranger's that points to this machine (DNS
-        rebinding); the origin is the page that asks, which other programs than browsers do not send.
+        An unknown name may belong to a stranger and point to this machine (DNS rebinding). The origin is the page
+        that sends
+        the request; programs other than browsers send none.
+
+        Args:
+            headers: ``websockets.Headers`` of the request.
         """
         named = headers.get_all("Host")
         asking = headers.get_all("Origin")
@@ -68,21 +74,21 @@ class Gate:
 
 
 def host_of(url: str, schemes: tuple[str, ...] = ("",)) -> str | None:
-    """The host of SCHEME://HOST[:PORT] in lower case; None where it is something else, or has more to it."""
+    """Return the host of SCHEME://HOST[:PORT] in lower case, or None for other texts."""
     try:
         parts = urlsplit(url)
         host = parts.hostname
         _ = parts.port
     except ValueError:
         return None
-    if _PLACE.fullmatch(parts.netloc) is None:  # urlsplit passes over what follows the bracket of an address
+    if _PLACE.fullmatch(parts.netloc) is None:  # urlsplit ignores text after the bracket of an address
         return None
     more = parts.path.strip("/") or parts.query or parts.fragment or "@" in parts.netloc
     return host.rstrip(".") if host and parts.scheme in schemes and not more else None
 
 
 def _given(option: str, name: str) -> str:
-    """A name of the user's, as NAME or with its scheme."""
+    """Return the host of an option's value, NAME or a URL."""
     host = host_of(name if "://" in name else f"//{name}", schemes=("", *WEB))
     if host is None or not (_is_address(host) or _NAME.fullmatch(host)):
         raise PolarguideError(
@@ -101,10 +107,10 @@ def _is_address(host: str) -> bool:
 
 MOST_BROWSERS = 32
 MESSAGES_PER_SECOND = 200.0
-BURST = 400.0  # messages
-SENDING_SECONDS = 30.0  # a browser that takes nothing for so long is let go
-# viser's page goes to whatever server the address names (?websocket=, ?playbackPath=), and does what that one says, in
-# the name of this one: it may talk to nobody but where it came from. Not every browser applies 'self' to sockets.
+BURST = 400.0  # number of messages
+SENDING_SECONDS = 30.0  # timeout of a browser that receives nothing
+# viser's page connects to any server that its address names (?websocket=, ?playbackPath=), and obeys it. The policy
+# restricts it to its own origin. Not every browser applies 'self' to sockets.
 POLICY = (
     "frame-ancestors 'self'; connect-src 'self' ws://{host} wss://{host} blob: data:; object-src 'none'; "
     "base-uri 'none'; form-action 'none'"
@@ -117,27 +123,29 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
 }
 Check = Callable[[bytes | str], bytes | None]
-"""Gives a message as it may be read, None to pass it over, or raises ``Refused``."""
+"""Function that returns a valid message, None for a message to ignore, or raises ``Refused``."""
 
 _WRAPPING = threading.Lock()
-_QUIET = logging.getLogger("polarguide.viewer.connections")  # strangers' broken requests are no news
+_QUIET = logging.getLogger("polarguide.viewer.connections")  # broken requests of strangers are not logged
 _QUIET.propagate = False
 _QUIET.addHandler(logging.NullHandler())
 
 
 @contextlib.contextmanager
 def guarded(gate: Gate, check: Check) -> Iterator[None]:
-    """A context in which viser starts to listen behind a gate.
+    """Install the access control while viser starts to listen inside this context.
 
     Raises:
-        PolarguideError: viser did not listen through the gate; the caller has to end viser.
+        PolarguideError: viser did not listen through the wrapper; the caller must stop viser.
     """
     sockets = optional_import("websockets.asyncio.server", "the viewer")
     listen = sockets.serve
     opened = []
 
     def serve(handler: Any, *arguments: Any, **options: Any) -> Any:
-        if not str(getattr(handler, "__module__", "")).startswith("viser."):  # somebody else's, meanwhile
+        if not str(getattr(handler, "__module__", "")).startswith(
+            "viser."
+        ):  # a server of somebody else that starts at the same time
             return listen(handler, *arguments, **options)
         opened.append(True)
         options |= {
@@ -171,7 +179,7 @@ def _gated(process: Any, gate: Gate) -> Callable[[Any, Any], Any]:
         if response is not None:
             for name, value in HEADERS.items():
                 response.headers[name] = value
-            # The gate lets no Host pass but an address or a known name, and its port.
+            # The gate accepts only addresses and known names as Host, with their port.
             response.headers["Content-Security-Policy"] = POLICY.format(host=request.headers["Host"])
         return response
 
@@ -189,7 +197,7 @@ def _handled(handler: Any, check: Check) -> Callable[[Any], Any]:
         browsers += 1
         try:
             await handler(_Connection(connection, check))
-        except Exception:  # one browser's; the server goes on
+        except Exception:  # the server continues
             _QUIET.debug("a connection failed", exc_info=True)
             await connection.close(1011)
         finally:
@@ -199,7 +207,7 @@ def _handled(handler: Any, check: Check) -> Callable[[Any], Any]:
 
 
 class _Connection:
-    """A browser's connection: gives checked messages only, not too many at a time, and does not wait forever."""
+    """Connection of a browser with validated messages, a rate limit and a timeout."""
 
     def __init__(self, connection: Any, check: Check) -> None:
         self._connection = connection
@@ -211,11 +219,11 @@ class _Connection:
         return getattr(self._connection, name)
 
     async def recv(self) -> bytes:
-        """The next message that may be read."""
+        """Return the next valid message."""
         refused = False
         while True:
             raw = await self._connection.recv()
-            if refused:  # what was on its way already; then the connection says that it is closed
+            if refused:  # messages that were already sent; then recv raises ConnectionClosed
                 continue
             await self._pace()
             try:
@@ -228,14 +236,14 @@ class _Connection:
                 return message
 
     async def send(self, data: bytes) -> None:
-        """Send, or let the browser go if it takes nothing."""
+        """Send data; abort the connection if the browser does not receive it in time."""
         try:
             await asyncio.wait_for(self._connection.send(data), SENDING_SECONDS)
         except asyncio.TimeoutError:
             self._connection.transport.abort()
 
     async def _pace(self) -> None:
-        """Read no faster than a hand can move; the rest waits at its sender's."""
+        """Wait so that messages are read no faster than ``MESSAGES_PER_SECOND``."""
         now = time.monotonic()
         self._left = min(BURST, self._left + (now - self._since) * MESSAGES_PER_SECOND) - 1
         self._since = now

@@ -1,4 +1,4 @@
-"""Painting what is metal: Gaussians around a click, or a whole surface that hangs together; with undo."""
+"""Painting of materials on Gaussians: a disc around a click, or a connected surface; with undo."""
 
 from __future__ import annotations
 
@@ -23,20 +23,16 @@ from polarguide.geometry.vectors import dot, unit
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import splats
 from polarguide.training.metals.observations import shares
-from polarguide.viewer.messages import Accepts, choice, number, push
+from polarguide.viewer.panel import BRUSH, OFF, Panel
 from polarguide.viewer.presenting import Clicks
 from polarguide.visualization.figures import Picture
 
-OFF, SURFACE, BRUSH = TOOLS = ("off", "surface", "brush")
-NOTHING, DIELECTRIC, METAL = KINDS = ("not painted", "dielectric", "metal")
-SIZE = (0.5, 20.0)
-REACH = (0.5, 30.0)
 ASK = "Click on a surface"
 TINTS = np.array([(0, 0, 0), (40, 120, 255), (255, 190, 0), (0, 200, 120)], np.float32)
-"""Colors of nothing, dielectrics, metals, and dielectrics with an index of their own."""
+"""Colors of unpainted parts, dielectrics, metals, and dielectrics with an index of their own."""
 TINTED = 0.5
 LOOKED_AT = 360
-"""Rows of the pictures in which is looked up what a click hits."""
+"""Largest height in pixels of the pictures in which clicks are looked up."""
 SMALLEST = 0.01
 """Least number of pixels that a visible Gaussian fills in such a picture."""
 SHARE = 0.25
@@ -44,27 +40,29 @@ SHARE = 0.25
 NEIGHBORS = 16
 """Number of Gaussians over which normals and colors are averaged."""
 LINKS = 8
-"""Number of neighbors to which a path leads on."""
-CHUNK = 1 << 16  # Gaussians at a time
+"""Number of neighbors in the graph of a Gaussian."""
+CHUNK = 1 << 16  # number of Gaussians per batch
 TURN = 0.25
 """Standard deviation of the angle between neighboring normals, in radians."""
 COLOR = 0.3
-"""Standard deviation of the logarithm of neighboring colors. The reach of a click is in these units, squared,
-halved and summed along the surface.
+"""Standard deviation of the logarithm of neighboring colors.
+
+The reach of a click is in these units, squared, halved and summed along the surface.
 """
-DARK = 0.02  # radiance that is added before logarithms
+DARK = 0.02  # offset of radiance before the logarithm
 MOST_UNDONE = 50
 
 
 class Materials:
-    """What is painted of a model's Gaussians.
+    """Painted materials of a model's Gaussians.
 
     Attributes:
-        kinds: [N] uint8: 0 nothing, 1 dielectric, 2 metal, from 3 on the dielectrics of ``scene.json``.
+        kinds: [N] uint8: 0 unpainted, 1 dielectric, 2 metal, from 3 on the dielectrics of ``scene.json``.
 
     Args:
-        gaussians: Gaussians of the model. rasterize: rasterizer of its backend.
-        kinds: what was painted before, as ``kinds_of`` reads it; called once.
+        gaussians: Gaussians of the model.
+        rasterize: rasterizer of its backend.
+        kinds: returns the initial ``kinds``; called once.
     """
 
     def __init__(
@@ -77,22 +75,24 @@ class Materials:
         self._before: list[Tensor] = []
 
     def brush(self, camera: Camera, place: Sequence[float], size: float, kind: int) -> int:
-        """Paint what is seen in a disc of a picture; returns the number of Gaussians.
+        """Paint the Gaussians that are visible in a disc of a picture; returns their number.
 
         Args:
-            camera: of the picture. place: its middle, in shares of width and height. size: radius in percent of the
-                height. kind: the number of the material.
+            camera: camera of the picture.
+            place: center of the disc, in shares of width and height.
+            size: radius in percent of the height.
+            kind: number of the material.
         """
         inside, all_of_it = self._painted(camera, place, size)
         return self._paint((all_of_it > SMALLEST) & (inside >= 0.5 * all_of_it), kind)
 
     def surface(self, camera: Camera, place: Sequence[float], size: float, reach: float, kind: int) -> int:
-        """Paint the surface that hangs together with what is seen in a disc, see ``brush``.
+        """Paint the connected surface that is visible in a disc; see ``brush``.
 
-        A path leads from Gaussian to neighbor; each step is as long as they differ in normal and color.
+        A path leads from Gaussian to neighbor. The length of a step is their difference in normal and color.
 
         Args:
-            reach: the longest path.
+            reach: length of the longest path.
         """
         inside, _ = self._painted(camera, place, size)
         hit = (inside > SHARE * inside.max()).nonzero()[:, 0].numpy()
@@ -102,14 +102,14 @@ class Materials:
         return self._paint(torch.from_numpy(np.isfinite(lengths)), kind)
 
     def undo(self) -> bool:
-        """Take the last stroke back; False: there is none."""
+        """Undo the last stroke; returns False if there is none."""
         if self._before:
             self.kinds = self._before.pop()
             return True
         return False
 
     def picture(self, camera: Camera) -> Tensor:
-        """The number of the material that fills most of each pixel, if that is half of it: [H, W] uint8."""
+        """Return the number of the material that fills at least half of each pixel, else 0: [H, W] uint8."""
         numbers = [number for number in self.kinds.unique().tolist() if number]
         if not numbers:
             return torch.zeros(camera.height, camera.width, dtype=torch.uint8)
@@ -126,7 +126,9 @@ class Materials:
         return int(which.sum())
 
     def _painted(self, camera: Camera, place: Sequence[float], size: float) -> tuple[Tensor, Tensor]:
-        """Pixels that each Gaussian fills in a disc of a picture, and in the whole picture: [N] both."""
+        """Return the number of pixels that each Gaussian fills in a disc of a picture, and in the whole picture: [N]
+        both.
+        """
         scale = min(1.0, LOOKED_AT / camera.height)
         small = camera.scaled(
             scale, max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
@@ -144,8 +146,9 @@ class Materials:
 
     @cached_property
     def _graph(self) -> csr_matrix:
-        """How far each Gaussian is from its neighbors, in normal and color, both averaged over neighborhoods: those of
-        single Gaussians are noise.
+        """Distances of neighboring Gaussians in normal and color.
+
+        Both are averaged over neighborhoods, since those of single Gaussians are noisy.
         """
         gaussians = {name: values.cpu() for name, values in self._gaussians.items()}
         means = gaussians["means"]
@@ -156,8 +159,7 @@ class Materials:
         places = means.double().numpy()
         count = min(NEIGHBORS + 1, len(places))
         near = torch.from_numpy(cKDTree(places).query(places, k=count, workers=-1)[1].reshape(-1, count))
-        weights = gaussians["opacity_logits"].sigmoid().view(-1)
-        axes, colors = _averaged(axes, colors, weights, near)
+        axes, colors = _averaged(axes, colors, gaussians["opacity_logits"].sigmoid().view(-1), near)
         first = torch.arange(len(near)).repeat_interleave(min(LINKS, count - 1))
         second = near[:, 1 : LINKS + 1].reshape(-1)
         cosine = dot(axes[first], axes[second]).abs().clamp(max=1)
@@ -168,7 +170,7 @@ class Materials:
 
 
 def _averaged(axes: Tensor, colors: Tensor, weights: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit axes of either sign [N, 3] and colors [N, 3], averaged over neighbors [N, K] by weight [N]."""
+    """Return unit axes of either sign [N, 3] and colors [N, 3], averaged over neighbors [N, K] with weights [N]."""
     parts = []
     for some in near.split(CHUNK):
         counts = weights[some][..., None]
@@ -182,10 +184,13 @@ def _averaged(axes: Tensor, colors: Tensor, weights: Tensor, near: Tensor) -> tu
 def kinds_of(
     gaussians: Gaussians, rasterize: Rasterize, views: Sequence[View], numbers: Mapping[str, Tensor]
 ) -> Tensor:
-    """What pictures of materials say of each Gaussian, [N] uint8: what fills most of its pixels.
+    """Return the material of each Gaussian by pictures of materials: the one that fills most of its pixels, [N]
+    uint8.
 
     Args:
-        numbers: [H, W] uint8 by view.
+        gaussians, rasterize: the model.
+        views: views of the pictures.
+        numbers: numbers of materials [H, W] uint8 by view.
     """
     parameters = {name: gaussians[name].detach() for name in gaussians.names}
     named = sorted({0}.union(*(picture.unique().tolist() for picture in numbers.values())))
@@ -197,45 +202,14 @@ def kinds_of(
     return torch.tensor(named, dtype=torch.uint8)[weights.argmax(dim=1).cpu()]
 
 
-class PaintingControls:
-    """The controls of one session.
-
-    Attributes:
-        accepts: what a browser may set each control to, as of ``Panel``.
-
-    Args:
-        gui: viser's handle of the session's controls. kinds: of materials by name, with their numbers.
-    """
-
-    def __init__(self, gui: Any, kinds: Mapping[str, int]) -> None:
-        with gui.add_folder("Materials", expand_by_default=False):
-            hint = "A click paints a surface that hangs together, or what is in a disc"
-            self.tool = gui.add_dropdown("Paint", TOOLS, initial_value=OFF, hint=hint)
-            self.kind = gui.add_dropdown("As", tuple(kinds), initial_value=METAL)
-            self.size = gui.add_slider("Size", *SIZE, 0.5, 1.0, hint="Of the disc, in percent of the height")
-            hint = "How unlike neighbors a surface goes on over"
-            self.reach = gui.add_slider("Reach", *REACH, 0.5, 4.0, hint=hint)
-            self.undo = gui.add_button("Undo")
-            hint = "polarguide train --resume then goes on with them"
-            self.save = gui.add_button("Save materials to the run", hint=hint)
-        controls: list[tuple[Any, Accepts]] = [
-            (self.tool, choice(TOOLS)),
-            (self.kind, choice(tuple(kinds))),
-            (self.size, number(*SIZE)),
-            (self.reach, number(*REACH)),
-            (self.undo, push),
-            (self.save, push),
-        ]
-        self.accepts = {control._impl.uuid: accepts for control, accepts in controls}
-
-
 @dataclass(frozen=True, eq=False)
 class Paintable:
-    """What a viewer needs to let its visitors paint.
+    """Materials of a run that visitors can paint.
 
     Attributes:
-        materials: makes what a session paints. kinds: names of materials with their numbers.
-        save: writes it to the run, and returns a message.
+        materials: returns the initial materials of a session.
+        kinds: numbers of materials by name.
+        save: writes materials to the run and returns a message.
     """
 
     materials: Callable[[], Materials]
@@ -244,57 +218,46 @@ class Paintable:
 
 
 class Painting:
-    """One session's painting. Callbacks only record; the rendering thread calls ``act``.
+    """Painting of one session. Callbacks only record; the rendering thread calls ``act``.
 
     Args:
-        client: viser's handle. controls: controls of its panel. paintable: what can be painted.
-        changed: called when there is something to do. noted: with a note for the visitor.
-        caught: makes callbacks whose faults cost only this browser. busy: whether another tool takes clicks.
+        client: viser's handle.
+        panel: controls of the session.
+        paintable: materials that can be painted.
+        busy: returns whether another tool takes clicks.
     """
 
-    def __init__(
-        self,
-        client: Any,
-        controls: PaintingControls,
-        paintable: Paintable,
-        *,
-        changed: Callable[[], None],
-        noted: Callable[[str], None],
-        caught: Callable[[Callable[[], None]], Callable[[Any], None]],
-        busy: Callable[[], bool],
-    ) -> None:
-        self._controls = controls
+    def __init__(self, client: Any, panel: Panel, paintable: Paintable, *, busy: Callable[[], bool]) -> None:
+        self._panel = panel
         self._paintable = paintable
-        self._changed = changed
-        self._noted = noted
         self._busy = busy
         self._materials: Materials | None = None
-        self._clicks = Clicks(client, caught, self._click)
+        self._clicks = Clicks(client, panel, self._click)
         self._todo: list[Callable[[Materials, Camera], str]] = []
-        controls.tool.on_update(caught(self._tool_chosen))
-        controls.undo.on_click(caught(lambda: self._later(lambda painted, _: self._undone(painted))))
-        controls.save.on_click(caught(lambda: self._later(lambda painted, _: paintable.save(painted))))
+        panel.listen("tool", self._tool_chosen)
+        panel.listen("undo", lambda: self._later(self._undone))
+        panel.listen("save_materials", lambda: self._later(lambda painted, _: paintable.save(painted)))
 
     @property
     def waits(self) -> bool:
-        """Whether there is something to do."""
+        """Whether a recorded action is pending."""
         return bool(self._todo)
 
     def act(self, camera: Camera) -> None:
-        """Do what was asked for.
+        """Execute the recorded actions.
 
         Args:
-            camera: camera of the picture that was clicked into.
+            camera: camera of the clicked picture.
         """
         todo = self._todo
         self._todo = []
         for each in todo:
             if self._materials is None:
                 self._materials = self._paintable.materials()
-            self._noted(each(self._materials, camera))
+            self._panel.show_note(each(self._materials, camera))
 
     def tinted(self, picture: Picture, camera: Camera) -> Picture:
-        """A picture with what is painted in it."""
+        """Return a picture tinted with the painted materials."""
         if self._materials is None or not bool(self._materials.kinds.any()):
             return picture
         numbers = self._materials.picture(camera).numpy().clip(max=len(TINTS) - 1)
@@ -305,24 +268,24 @@ class Painting:
     def _later(self, do: Callable[[Materials, Camera], str]) -> None:
         if not self._todo:
             self._todo.append(do)
-            self._changed()
+            self._panel.changed()
 
     @staticmethod
-    def _undone(materials: Materials) -> str:
+    def _undone(materials: Materials, _: Camera) -> str:
         return "Undone" if materials.undo() else "Nothing is left to undo"
 
     def _tool_chosen(self) -> None:
-        paints = self._controls.tool.value != OFF
+        paints = self._panel["tool"].value != OFF
         self._clicks.want(paints)
-        self._noted(ASK if paints else "")
+        self._panel.show_note(ASK if paints else "")
 
     def _click(self, place: Sequence[float]) -> None:
-        tool = self._controls.tool.value
-        kind = self._controls.kind.value
+        tool = self._panel["tool"].value
+        kind = self._panel["kind"].value
         if tool == OFF or self._busy():
             return
-        size = float(self._controls.size.value)
-        reach = float(self._controls.reach.value)
+        size = float(self._panel["size"].value)
+        reach = float(self._panel["reach"].value)
         number = self._paintable.kinds[kind]
         at = (float(place[0]), float(place[1]))
 

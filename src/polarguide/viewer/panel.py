@@ -1,190 +1,290 @@
-"""The control panel of a session."""
+"""The control panel of a session: a table of its controls, and their current values."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
+
+import msgspec
 
 from polarguide.capture.presentation import STOPS, Crop, Presentation, Vector
+from polarguide.core.errors import PolarguideError
 from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
-from polarguide.viewer.painting import PaintingControls
-from polarguide.viewer.presenting import PresentingControls
-from polarguide.viewer.scenery import MEASURED, Appearance
+from polarguide.viewer.scenery import MEASURED, UNCHANGED, Appearance
 
 FREE_VIEW = "(free)"
 STEPS = ("previous", "next")
-NOTHING = Presentation()
 # Ranges of the controls.
-SIDES = ("Left, right", "Down, up", "Front, back")
+SIDES = {"left_right": "Left, right", "down_up": "Down, up", "front_back": "Front, back"}
+"""Labels of the sliders of the crop box by control."""
 EXPOSURE = (-STOPS, STOPS)
 STRENGTH = (0.0, 2.0)
 TURN = (-180, 180)
 SECONDS = (0.5, 10.0)
 CROP = (-150, 150)
-WIPE = 0, 100
+WIPE = (0, 100)
+KNOWN_LENGTH = (0.001, 1e8)
+"""Range of the known length in millimeters."""
+SIZE = (0.5, 20.0)
+REACH = (0.5, 30.0)
+# Choices of the controls.
+AS_PHOTOGRAPHED, GRAY_WORLD, PICKED = WHITES = ("as photographed", "gray world", "picked")
+OF_CHART = "color chart"
+PICKS = ("white", "level", "length")
+AS_SHOWN, OF_CAMERAS = UPS = ("as shown", "of cameras")
+OFF, SURFACE, BRUSH = TOOLS = ("off", "surface", "brush")
+UNPAINTED, DIELECTRIC, METAL = KINDS = ("not painted", "dielectric", "metal")
 
 
 @dataclass(frozen=True)
 class PanelOptions:
-    """The controls that a panel has.
+    """Options of a panel.
 
     Attributes:
-        layers: layers of the shading model. turns: whether the environment can be rotated.
+        layers: layers of the shading model.
+        turns: whether the environment can be rotated.
         views: names of the photographs.
-        trains: whether a training runs, which can be paused.
-        presentation: as it was saved. saves: whether it can be saved to the run, rather than downloaded.
-        kinds: materials that can be painted, with their numbers; none: there is nothing to paint on.
+        trains: whether the panel can pause a training.
+        presentation: the saved presentation.
+        saves: whether the presentation is saved to the run; otherwise the browser downloads it.
+        kinds: numbers of the materials that can be painted; empty: no painting.
     """
 
     layers: Sequence[str]
     turns: bool
     views: Sequence[str]
     trains: bool
-    presentation: Presentation = NOTHING
+    presentation: Presentation = UNCHANGED
     saves: bool = False
     kinds: Mapping[str, int] = field(default_factory=dict)
 
 
-class Panel:
-    """The controls of one session.
-
-    Names of views come from files, so they are shown as plain text only: Markdown in the browser may run code.
+class Control(NamedTuple):
+    """Description of a control.
 
     Attributes:
-        accepts: what a browser may set each control to, by viser's name of the control.
+        kind: name of viser's method without ``add_``.
+        label: text next to the control.
+        arguments: further positional arguments.
+        accepts: validation of the values that a browser sets; None: the control is read-only.
+        options: keyword arguments.
+    """
+
+    kind: str
+    label: str
+    arguments: tuple[Any, ...] = ()
+    accepts: Accepts | None = push
+    options: Mapping[str, Any] = {}
+
+
+def controls_of(options: PanelOptions) -> dict[str, dict[str, Control]]:
+    """Return the controls of a panel by folder and name. The folder without a label is the panel itself."""
+    presentation = options.presentation
+    layers = (*options.layers, *MEASURED)
+    views = (FREE_VIEW, *options.views)
+    whites = WHITES if presentation.chart is None else (*WHITES, OF_CHART)
+    white = AS_PHOTOGRAPHED if presentation.white_balance is None else PICKED
+    kinds = tuple(options.kinds)
+    painting = {
+        "tool": Control("dropdown", "Paint", (TOOLS,), choice(TOOLS), {
+            "initial_value": OFF, "hint": "A click paints a surface that hangs together, or what is in a disc"}),
+        "kind": Control("dropdown", "As", (kinds,), choice(kinds), {"initial_value": METAL}),
+        "size": Control("slider", "Size", (*SIZE, 0.5, 1.0), number(*SIZE), {
+            "hint": "Of the disc, in percent of the height"}),
+        "reach": Control("slider", "Reach", (*REACH, 0.5, 4.0), number(*REACH), {
+            "hint": "How unlike neighbors a surface goes on over"}),
+        "undo": Control("button", "Undo"),
+        "save_materials": Control("button", "Save materials to the run", options={
+            "hint": "polarguide train --resume then goes on with them"}),
+    }  # fmt: skip
+    return {
+        "": {
+            "pause": Control("checkbox", "Pause training", (False,), flag, {"visible": options.trains}),
+            "layer": Control("dropdown", "Layer", (layers,), choice(layers), {
+                "hint": f"From {MEASURED[0]} on, a photograph's pose is needed; stokes, dolp and aolp are predicted"}),
+            "exposure": Control("slider", "Exposure", (*EXPOSURE, 0.1, presentation.exposure or 0.0),
+                                number(*EXPOSURE), {"hint": "In stops"}),
+            "strength": Control("slider", "Reflection", (*STRENGTH, 0.05, 1.0), number(*STRENGTH), {
+                "visible": "specular" in layers}),
+            "turn": Control("slider", "Environment", (*TURN, 1, 0), number(*TURN), {
+                "hint": "Rotates the environment light, in degrees; the scene stays", "visible": options.turns}),
+        },
+        "Photographs": {
+            "view": Control("dropdown", "Go to", (views,), choice(views)),
+            "step": Control("button_group", "", (STEPS,), choice(STEPS)),
+            "frusta": Control("checkbox", "Show cameras", (True,), flag),
+            "wipe": Control("slider", "Wipe", (*WIPE, 1, 0), number(*WIPE), {
+                "hint": "In percent of the width, from the left: the run beside, else what was measured at this pose"}),
+        },
+        "Crop": {
+            "crop": Control("checkbox", "Crop", (presentation.crop is not None,), flag),
+            "box": Control("checkbox", "Show box", (False,), flag),
+            **{
+                name: Control("multi_slider", SIDES[name], (*CROP, 1, sides), pair(*CROP), {"min_range": 1})
+                for name, sides in zip(SIDES, _percent(presentation.crop), strict=True)
+            },
+        },
+        "White, up, scale": {
+            "white": Control("dropdown", "White", (whites,), choice(whites), {
+                "initial_value": white if presentation.chart is None else OF_CHART,
+                "hint": "For display; the data stay as they are"}),
+            "pick": Control("button_group", "Pick", (PICKS,), choice(PICKS), {
+                "hint": "Something white or gray; a level surface, whose normal becomes up; or the ends of a length"}),
+            "up": Control("button_group", "Up", (UPS,), choice(UPS), {
+                "hint": "As this picture has it, or as the cameras say"}),
+            "measured": Control("text", "Length", ("",), None, {"disabled": True}),
+            "length": Control("number", "Known, mm", (100.0,), number(*KNOWN_LENGTH), {
+                "min": KNOWN_LENGTH[0], "max": KNOWN_LENGTH[1]}),
+            "set_scale": Control("button", "Set scale", options={"hint": "The picked length is as long as known"}),
+            "save": Control("button", "Save to the run" if options.saves else "Download them", options={
+                "hint": "White, up, scale and crop, for pages, exports and renderings"}),
+        },
+        "Materials": painting if options.kinds else {},
+        "Picture and camera path": {
+            "screenshot": Control("button", "Save picture"),
+            "keyframes": Control("text", "Keyframes", ("0",), None, {"disabled": True}),
+            "add_keyframe": Control("button", "Add keyframe"),
+            "remove_keyframe": Control("button", "Remove last keyframe"),
+            "seconds": Control("slider", "Seconds per segment", (*SECONDS, 0.5, 2.0), number(*SECONDS)),
+            "play": Control("button", "Play"),
+            "save_path": Control("button", "Save path"),
+        },
+    }  # fmt: skip
+
+
+class Panel:
+    """Controls of one session by name: ``panel["layer"].value``.
+
+    Names of views come from files, so they are shown as plain text: Markdown in the browser may run code.
+
+    Attributes:
+        accepts: validation of the values that a browser sets, by viser's name of the control.
+        changed: callback after every change of the picture.
 
     Args:
         gui: viser's handle of the session's controls.
-        options: the controls to show.
-        changed: called after every change that affects the picture.
-        folded: whether the controls begin folded, behind the one word that opens them. On a phone viser's panel begins
-            open and covers half of the picture, and nothing that a server sends can fold it.
+        options: options of the panel.
+        changed: callback after every change of the picture.
+        drop: callback with the exception of another callback.
+        folded: whether the controls are in a closed folder. On a phone viser's panel is open at first and covers half
+            of
+            the picture, and a server cannot fold it.
     """
 
     def __init__(
-        self, gui: Any, options: PanelOptions, changed: Callable[[], None], *, folded: bool = False
+        self,
+        gui: Any,
+        options: PanelOptions,
+        changed: Callable[[], None],
+        drop: Callable[[Exception], None],
+        *,
+        folded: bool = False,
     ) -> None:
-        self._crop: list[Any] = []
-        # The box as it was saved, until a slider is moved; its sides are more exact than the sliders' steps.
+        self.accepts: dict[str, Accepts] = {}
+        self.changed = changed
+        self._drop = drop
+        self._controls: dict[str, Any] = {}
+        # The saved box has more exact sides than the sliders' steps. It applies until a slider moves.
         self._saved_crop = options.presentation.crop
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._status = gui.add_markdown("")
         self._lines = tuple[str, ...]()
         self._note = ""
         with gui.add_folder("Controls", expand_by_default=False) if folded else nullcontext():
-            self._add_controls(gui, options)
-        self.accepts = self._accepted([*options.layers, *MEASURED], options.views)
-        controls = (
-            *(self.layer, self.exposure, self.strength, self.turn, self.wipe),
-            *(self._use_crop, *self._crop),
-        )
-        for control in self._crop:
-            control.on_update(lambda _: self._forget_saved())
-        for control in controls:
-            control.on_update(lambda _: changed())
+            for folder, controls in controls_of(options).items():
+                unfolded = folder == "Photographs"
+                with (
+                    gui.add_folder(folder, expand_by_default=unfolded)
+                    if folder and controls
+                    else nullcontext()
+                ):
+                    for name, control in controls.items():
+                        self._add(gui, name, control)
+        for name in SIDES:
+            self.listen(name, self._forget_saved_crop)
+        for name in ("layer", "exposure", "strength", "turn", "wipe", "crop", "box", *SIDES):
+            self.listen(name, changed)
 
-    def _add_controls(self, gui: Any, options: PanelOptions) -> None:
-        self.pause = gui.add_checkbox("Pause training", False, visible=options.trains)
-        layers = options.layers
-        self.layer = gui.add_dropdown(
-            "Layer",
-            (*layers, *MEASURED),
-            hint=f"From {MEASURED[0]} on, a photograph's pose is needed; stokes, dolp and aolp are predicted",
-        )
-        self.exposure = gui.add_slider(
-            "Exposure", *EXPOSURE, 0.1, options.presentation.exposure or 0.0, hint="In stops"
-        )
-        self.strength = gui.add_slider("Reflection", *STRENGTH, 0.05, 1.0, visible="specular" in layers)
-        hint = "Rotates the environment light, in degrees; the scene stays"
-        self.turn = gui.add_slider("Environment", *TURN, 1, 0, hint=hint, visible=options.turns)
-        with gui.add_folder("Photographs"):
-            self.view = gui.add_dropdown("Go to", (FREE_VIEW, *options.views))
-            self.step = gui.add_button_group("", STEPS)
-            self.frusta = gui.add_checkbox("Show cameras", True)
-            hint = (
-                "In percent of the width, from the left: the run beside, else what was measured at this pose"
-            )
-            self.wipe = gui.add_slider("Wipe", *WIPE, 1, 0, hint=hint)
-        with gui.add_folder("Crop", expand_by_default=False):
-            self._use_crop = gui.add_checkbox("Crop", self._saved_crop is not None)
-            self.box = gui.add_checkbox("Show box", False)
-            for label, sides in zip(SIDES, _percent(self._saved_crop), strict=True):
-                self._crop.append(gui.add_multi_slider(label, *CROP, 1, sides, min_range=1))
-        self.presenting = PresentingControls(gui, options.presentation, saves=options.saves)
-        self.painting = PaintingControls(gui, options.kinds) if options.kinds else None
-        with gui.add_folder("Picture and camera path", expand_by_default=False):
-            self.screenshot = gui.add_button("Save picture")
-            self.keyframes = gui.add_text("Keyframes", "0", disabled=True)
-            self.add_keyframe = gui.add_button("Add keyframe")
-            self.remove_keyframe = gui.add_button("Remove last keyframe")
-            self.seconds = gui.add_slider("Seconds per segment", *SECONDS, 0.5, 2.0)
-            self.play = gui.add_button("Play")
-            self.save_path = gui.add_button("Save path")
+    def __getitem__(self, name: str) -> Any:
+        return self._controls[name]
 
-    def _forget_saved(self) -> None:
+    def _add(self, gui: Any, name: str, control: Control) -> None:
+        handle = getattr(gui, f"add_{control.kind}")(control.label, *control.arguments, **control.options)
+        self._controls[name] = handle
+        if control.accepts is not None:
+            self.accepts[handle._impl.uuid] = control.accepts
+
+    def listen(self, name: str, act: Callable[[], None]) -> None:
+        """Call a function when a visitor changes a control or presses a button."""
+        control = self._controls[name]
+        subscribe = control.on_click if hasattr(control, "on_click") else control.on_update
+        subscribe(self.caught(act))
+
+    def caught(self, act: Callable[[], None]) -> Callable[[Any], None]:
+        """Return a callback that shows a visitor's mistake as a note. Other errors close only this browser's
+        connection.
+        """
+
+        def called(_: Any) -> None:
+            try:
+                act()
+            except PolarguideError as error:
+                self.show_note(f"Expected {error.expected}")
+            except Exception as error:
+                self._drop(error)
+
+        return called
+
+    def _forget_saved_crop(self) -> None:
         self._saved_crop = None
 
-    def _accepted(self, layers: Sequence[str], views: Sequence[str]) -> dict[str, Accepts]:
-        pushed = (self.screenshot, self.add_keyframe, self.remove_keyframe, self.play, self.save_path)
-        controls = [
-            (self.layer, choice(layers)),
-            (self.exposure, number(*EXPOSURE)),
-            (self.strength, number(*STRENGTH)),
-            (self.turn, number(*TURN)),
-            (self.wipe, number(*WIPE)),
-            (self.view, choice([FREE_VIEW, *views])),
-            (self.step, choice(STEPS)),
-            (self.seconds, number(*SECONDS)),
-            *((control, flag) for control in (self.pause, self.frusta, self.box, self._use_crop)),
-            *((control, pair(*CROP)) for control in self._crop),
-            *((control, push) for control in pushed),
-        ]
-        painting = {} if self.painting is None else self.painting.accepts
-        own = {control._impl.uuid: accepts for control, accepts in controls}
-        return own | self.presenting.accepts | painting
-
     def show_note(self, note: str) -> None:
-        """Show another note below the status, of which the same holds."""
+        """Show a note below the status. It must not contain names from files."""
         self._note = note
         self.show_status(*self._lines)
 
     def show_status(self, *lines: str) -> None:
-        """Show status lines; they must not contain names from files."""
+        """Show status lines. They must not contain names from files."""
         self._lines = lines
         text = "  \n".join((*lines, f"**{self._note}**") if self._note else lines)
         if self._status.content != text:
             self._status.content = text
 
     def crop(self, up_axis: Vector | None = None) -> Crop | None:
-        """The crop box along an axis (None: as the cameras say), or None if it is off."""
-        if not self._use_crop.value:
+        """Return the crop box with an up axis (None: that of the cameras), or None without cropping."""
+        if not self["crop"].value:
             return None
         if self._saved_crop is not None:
             return self._saved_crop
-        sides = [control.value for control in self._crop]
-        low = (sides[0][0] / 100, sides[1][0] / 100, sides[2][0] / 100)
-        high = tuple(max(side[1], side[0] + 1) / 100 for side in sides)  # a message may make them equal
+        left_right, down_up, front_back = (self[name].value for name in SIDES)
+        low = (left_right[0] / 100, down_up[0] / 100, front_back[0] / 100)
+        # A message may make both ends equal.
+        high = tuple(max(side[1], side[0] + 1) / 100 for side in (left_right, down_up, front_back))
         return Crop(low, (high[0], high[1], high[2]), up_axis)
 
-    def appearance(self, chosen: Presentation = NOTHING) -> Appearance:
-        """The current choice of the user, with the white and the up axis that were chosen."""
+    def presentation(self, chosen: Presentation) -> Presentation:
+        """Return a presentation with the exposure and the crop box of the panel."""
+        crop = self.crop(chosen.up_axis)
+        exposure = float(self["exposure"].value) or None
+        return msgspec.structs.replace(
+            chosen, exposure=exposure, crop=crop, whole=chosen.whole and crop is None
+        )
+
+    def appearance(self, chosen: Presentation) -> Appearance:
+        """Return the appearance of the picture by the panel and the visitor's presentation."""
         return Appearance(
-            layer=self.layer.value,
-            exposure=float(self.exposure.value),
-            strength=float(self.strength.value),
-            turn=float(self.turn.value),
-            crop=self.crop(chosen.up_axis),
-            white_balance=chosen.white_balance,
-            chart=chosen.chart,
-            up_axis=chosen.up_axis,
-            wipe=float(self.wipe.value) / 100,
+            layer=self["layer"].value,
+            strength=float(self["strength"].value),
+            turn=float(self["turn"].value),
+            wipe=float(self["wipe"].value) / 100,
+            presentation=self.presentation(chosen),
         )
 
 
 def _percent(crop: Crop | None) -> list[tuple[int, int]]:
-    """Where the sliders of a crop box stand."""
+    """Return the positions of the sliders of a crop box."""
     if crop is None:
         return [(-40, 40)] * 3
     percents = []

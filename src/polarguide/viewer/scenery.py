@@ -1,4 +1,4 @@
-"""The scene that a viewer shows, and its pictures as a visitor wants them."""
+"""The scene that a viewer shows, and the drawing of its pictures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import View
-from polarguide.capture.presentation import Chart, Crop, Presentation, Vector, colored
+from polarguide.capture.presentation import Presentation, colored
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame
@@ -21,7 +21,7 @@ from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
 from polarguide.shading.result import POLARIZED, RenderResult, polarized_layers
 from polarguide.training.loop import TrainingLoop
-from polarguide.viewer.cameras import drawn_camera, letterbox
+from polarguide.viewer.cameras import drawn_camera, letterboxed
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture
 from polarguide.visualization.layers import (
@@ -38,10 +38,13 @@ class Scenery:
     """Gaussians to be rendered: the source of a viewer's pictures.
 
     Attributes:
-        gaussians: the Gaussians. light: learned, by name.
-        shading: as it is now. rasterize: rasterizer of the backend. sh_degree: degree of the base color's harmonics.
-        status: a line about it.
-        footprints: [N] of a finished training, see ``raster.magnification``.
+        gaussians: the Gaussians.
+        light: learned light by name.
+        shading: shading of the current stage.
+        rasterize: rasterizer of the backend.
+        sh_degree: degree of the base color's harmonics.
+        status: a line of text about it.
+        footprints: [N] footprints of a finished training, see ``raster.magnification``.
     """
 
     gaussians: Gaussians
@@ -62,13 +65,14 @@ class Scenery:
         within: Callable[[Tensor], Tensor] | None = None,
         turn: Tensor | None = None,
     ) -> RenderResult:
-        """All layers, on the CPU.
+        """Render all layers, on the CPU.
 
         Args:
-            camera: with the size of the picture. depth: whether depth is one of them.
+            camera: the camera, with the size of the picture.
+            depth: whether to render depth.
             surface: whether normals and depth are those of the surface at the pixel's median depth.
-            within: which places [N, 3] of the scene are shown, [N] bool; None: all.
-            turn: rotation [3, 3] of the light from afar, where it is radiance; None: as learned.
+            within: returns which places [N, 3] of the scene are shown, [N] bool; None: all.
+            turn: rotation [3, 3] of a radiance environment; None: as learned.
         """
         gaussians: Parameters = self.gaussians
         footprints = self.footprints
@@ -87,7 +91,7 @@ class Scenery:
         ).to("cpu")
 
     def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
-        """The Stokes vectors that a result predicts; None without both layers and a normal."""
+        """Predict Stokes vectors, or None without both layers and a normal."""
         if not result.is_polarized:
             return None
         return self.shading.predicted_stokes(result, camera)
@@ -101,7 +105,7 @@ class Scenery:
 
 
 def run_scenery(run: OpenedRun) -> Scenery:
-    """A trained run."""
+    """Return the scenery of a trained run."""
     model = run.model
     status = f"{run.recipe.name}, {run.steps:,} steps; {model.size}"
     return Scenery(
@@ -116,7 +120,7 @@ def run_scenery(run: OpenedRun) -> Scenery:
 
 
 def training_scenery(loop: TrainingLoop) -> Scenery:
-    """A training as it is between two steps, Gaussians shaded as in its present stage."""
+    """Return the scenery of a training between two steps, with the shading of its current stage."""
     steps = loop.settings.steps
     state = loop.state
     stage = loop.schedule.at(min(state.step, steps - 1)).stage
@@ -133,49 +137,49 @@ def training_scenery(loop: TrainingLoop) -> Scenery:
 
 
 OF_POLARIZATION = {f"{name}, measured": name for name in POLARIZED}
-"""Layers that need pictures which determine the polarization, and what is predicted of the same."""
+"""Predicted layer by measured layer. Measured layers need pictures that determine the polarization."""
 BESIDE = {
     **dict.fromkeys(("final", "base"), "photograph"),
     **{of: name for name, of in OF_POLARIZATION.items()},
 }
-"""What was measured of a layer, for a wipe between the two."""
+"""Measured layer by rendered layer, for a wipe between the two."""
 MEASURED = ("photograph", *OF_POLARIZATION, "error")
-"""Layers that only a photograph's pose has."""
+"""Layers that exist only at a photograph's pose."""
 LEGEND = 0.25, 128, 512
-"""Width of the key to a layer's colors: as a share of the picture, and at least and at most in pixels."""
+"""Width of the legend: share of the picture, minimum and maximum in pixels."""
+
+
+UNCHANGED = Presentation()
+"""Presentation with default values, which changes nothing."""
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """A visitor's choices.
+    """A visitor's choice of a picture.
 
     Attributes:
         layer: a name in ``LAYERS``, ``POLARIZED`` or ``MEASURED``.
-        exposure: stops by which radiance is brightened.
-        strength: factor on the specular layer; predicted polarization is that of the layers as they were learned.
-        turn: degrees of the far environment, counter-clockwise seen from above.
-        crop: what is shown of the scene; None: all.
-        wipe: share of the picture's width, from the left, that shows the run beside in place of the layer; without one
-            what was measured (``BESIDE``), at a photograph's pose.
-        white_balance, chart: as of ``Presentation``. up_axis: the axis of turning; None: as the cameras say.
+        strength: factor on the specular layer. Predicted polarization is always that of the learned layers.
+        turn: rotation of the far environment in degrees, counter-clockwise seen from above.
+        wipe: share of the picture's width, from the left, that shows the other run in place of the layer; without
+            another
+            run, the measured layer (``BESIDE``) at a photograph's pose.
+        presentation: color, exposure, up axis and crop box. Without a crop box all of the scene is shown.
     """
 
     layer: str = "final"
-    exposure: float = 0.0
     strength: float = 1.0
     turn: float = 0.0
-    crop: Crop | None = None
-    white_balance: Vector | None = None
-    chart: Chart | None = None
-    up_axis: Vector | None = None
     wipe: float = 0.0
+    presentation: Presentation = UNCHANGED
 
 
 class Painter:
-    """Draws a scene as a visitor wants it.
+    """Painter of a scene's pictures.
 
     Args:
-        around: the frame of the scene's cameras. beside: another run of it, for wipes; None: what was measured.
+        around: the frame of the scene's cameras.
+        beside: another run of the scene, for wipes; None: wipes show measured layers.
     """
 
     def __init__(self, around: SceneFrame, beside: Scenery | None = None) -> None:
@@ -192,33 +196,31 @@ class Painter:
         *,
         settled: bool = True,
     ) -> Picture | None:
-        """A picture.
+        """Draw a picture.
 
         Args:
-            scenery: the scene. camera: with the window's size; of the pose alone, where there is a view.
-            appearance: what to draw.
-            view: the photograph at whose pose it is drawn.
-            settled: whether the camera rests; the colors of depths follow the picture only then.
+            scenery: the scene.
+            camera: camera with the window's size; only its size counts if there is a view.
+            appearance: choice of the picture.
+            view: the photograph whose pose the camera has.
+            settled: whether the camera rests. Only then the range of the colors of depth is updated.
 
         Returns:
-            uint8 [H, W, 3] of the camera's size; None where there is no such layer.
+            uint8 [H, W, 3] of the camera's size; None if the layer does not exist.
         """
-        layer = appearance.layer
-        if layer in MEASURED and (view is None or (layer in OF_POLARIZATION and not view.is_determined)):
-            return None
-        if view is not None and layer in MEASURED:
-            place = letterbox(view.camera, (camera.width, camera.height))
-            return self._with_scale(place.apply(self._measured(scenery, view, appearance)), layer)
-        camera = drawn_camera(camera, view)
-        picture = self._modeled(scenery, camera, appearance, settled=settled)
-        if picture is not None and appearance.wipe > 0:
-            picture = self._wiped(picture, scenery, camera, view, appearance)
-        return None if picture is None else self._with_scale(picture, layer)
+        if appearance.layer in MEASURED:
+            picture = self._measured(scenery, view, appearance, (camera.width, camera.height))
+        else:
+            camera = drawn_camera(camera, view)
+            picture = self._modeled(scenery, camera, appearance, settled=settled)
+            if picture is not None and appearance.wipe > 0:
+                picture = self._wiped(picture, scenery, camera, view, appearance)
+        return None if picture is None else self._with_scale(picture, appearance.layer)
 
     def _modeled(
         self, scenery: Scenery, camera: Camera, appearance: Appearance, *, settled: bool
     ) -> Picture | None:
-        """A picture of a layer; None where there is no such layer."""
+        """Draw a rendered layer, or return None if the layer does not exist."""
         result = self._result(scenery, camera, appearance)
         if appearance.layer in POLARIZED and (stokes := scenery.stokes(result, camera)) is not None:
             result = result.with_layers(**polarized_layers(stokes))
@@ -227,15 +229,16 @@ class Painter:
     def _wiped(
         self, picture: Picture, scenery: Scenery, camera: Camera, view: View | None, appearance: Appearance
     ) -> Picture:
-        """A picture of a layer with the other run, or what was measured, to the left; as it is where there is none."""
+        """Draw the other run, or the measured layer, over the left part of a picture. Without them, return the
+        picture.
+        """
         other = BESIDE.get(appearance.layer)
+        left = None
         if self._beside is not None:
             left = self._modeled(self._beside, camera, appearance, settled=False)
-        elif view is None or other is None or (other in OF_POLARIZATION and not view.is_determined):
-            left = None
-        else:
-            place = letterbox(view.camera, (picture.shape[1], picture.shape[0]))
-            left = place.apply(self._measured(scenery, view, replace(appearance, layer=other)))
+        elif other is not None:
+            measured = replace(appearance, layer=other)
+            left = self._measured(scenery, view, measured, (camera.width, camera.height))
         if left is None:
             return picture
         column = round(min(appearance.wipe, 1.0) * picture.shape[1])
@@ -245,7 +248,7 @@ class Painter:
         return wiped
 
     def _with_scale(self, picture: Picture, layer: str) -> Picture:
-        """A picture with the key to the colors of its layer at its lower left, where there is one."""
+        """Draw the legend of a layer's colors over the lower left corner of a picture."""
         scale = (
             figures.scale_bar(0.0, figures.LARGE_ERROR, "inferno", middle="difference, sRGB")
             if layer == "error"
@@ -254,7 +257,7 @@ class Painter:
         share, least, most = LEGEND
         width = min(max(round(share * picture.shape[1]), least), most)
         if scale is None or picture.shape[1] < 2 * least:
-            return picture  # it would hide what it explains
+            return picture  # the legend would hide the picture
         return figures.with_key(picture, scale, width)
 
     def point(
@@ -265,23 +268,24 @@ class Painter:
         view: View | None,
         place: tuple[float, float],
     ) -> SurfacePoint | None:
-        """The surface at a place of the picture that ``paint`` draws, in shares of its width and height."""
+        """Return the surface at a place of a picture, given in shares of its width and height."""
         camera = drawn_camera(camera, view)
-        plain = Appearance(layer="depth", crop=appearance.crop)
-        result = self._result(scenery, camera, plain)
+        result = self._result(scenery, camera, replace(appearance, layer="depth", strength=1.0, turn=0.0))
         return surface_at(result, camera, place[0] * camera.width, place[1] * camera.height)
 
     def _result(self, scenery: Scenery, camera: Camera, appearance: Appearance) -> RenderResult:
-        crop = appearance.crop
+        crop = appearance.presentation.crop
         turn = None
         strength = 1.0 if appearance.layer in POLARIZED else appearance.strength
         within = None if crop is None else lambda means: crop.inside(means, self.around)
         if appearance.turn % 360:
-            presented = Presentation(up_axis=appearance.up_axis)
-            turn = presented.upright(self.around).turn(appearance.turn)
-        surface = appearance.layer in ("normal", "depth")
+            turn = appearance.presentation.upright(self.around).turn(appearance.turn)
         result = scenery.render(
-            camera, depth=appearance.layer == "depth", surface=surface, within=within, turn=turn
+            camera,
+            depth=appearance.layer == "depth",
+            surface=appearance.layer in ("normal", "depth"),
+            within=within,
+            turn=turn,
         )
         if not {"specular", "diffuse"} <= result.layers.keys() or strength == 1.0:
             return result
@@ -296,25 +300,24 @@ class Painter:
         if values is None:
             return None
         if layer in RADIANCE:
-            return figures.radiance_to_rgb(_exposed(values, appearance))
+            return figures.radiance_to_rgb(colored(values, appearance.presentation.color))
         if layer == "depth" and (settled or self._depths is None):
             self._depths = depth_range(values, result.alpha > 0.5)
         return layer_picture(result, layer, camera, self._depths)
 
-    def _measured(self, scenery: Scenery, view: View, appearance: Appearance) -> Picture:
-        """A picture of the photograph's size."""
-        brighter = 2.0**appearance.exposure
-        if appearance.layer == "photograph":
-            return figures.radiance_to_rgb(_exposed(view.photograph(), appearance))
-        if appearance.layer == "error":
+    def _measured(
+        self, scenery: Scenery, view: View | None, appearance: Appearance, frame_size: tuple[int, int]
+    ) -> Picture | None:
+        """Draw a measured layer at a photograph's pose in a window, or return None if it is unknown."""
+        layer = appearance.layer
+        if view is None or (layer in OF_POLARIZATION and not view.is_determined):
+            return None
+        if layer == "photograph":
+            picture = figures.radiance_to_rgb(colored(view.photograph(), appearance.presentation.color))
+        elif layer == "error":
+            brighter = 2.0 ** (appearance.presentation.exposure or 0.0)
             final = self._result(scenery, view.camera, appearance).final
-            return figures.error_to_rgb(final * brighter, view.photograph() * brighter)
-        return polarization_picture(OF_POLARIZATION[appearance.layer], view.stokes())
-
-
-def _exposed(radiance: Tensor, appearance: Appearance) -> Tensor:
-    """Radiance [H, W, 3] as bright and in the color that is wanted, linear."""
-    white = appearance.white_balance
-    chart = appearance.chart
-    exposure = appearance.exposure
-    return colored(radiance, Presentation(white_balance=white, chart=chart, exposure=exposure).color)
+            picture = figures.error_to_rgb(final * brighter, view.photograph() * brighter)
+        else:
+            picture = polarization_picture(OF_POLARIZATION[layer], view.stokes())
+        return letterboxed(picture, frame_size)

@@ -1,4 +1,4 @@
-"""The web server of the viewer over a run, or over a training; one thread renders for all sessions."""
+"""Web server of the viewer for a run or a training. One thread renders for all sessions."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from polarguide.core.options import LOOPBACK, VisitorOptions
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import network_address
 from polarguide.geometry.scene_frame import scene_frame
-from polarguide.results.rendering.picking import gray_world
+from polarguide.results.rendering.picking import gray_world_gains
 from polarguide.runs.model import layers_of
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.painted import FOLDER, read_painted, write_painted
@@ -41,16 +41,16 @@ from polarguide.shading.model import ShadingModel
 from polarguide.training.loop import TrainingLoop
 from polarguide.viewer.cameras import Photograph, photographs
 from polarguide.viewer.guard import Gate, guarded
-from polarguide.viewer.messages import Accepts, checked
-from polarguide.viewer.painting import KINDS, Materials, Paintable, kinds_of
-from polarguide.viewer.panel import NOTHING, PanelOptions
-from polarguide.viewer.scenery import Scenery, run_scenery, training_scenery
+from polarguide.viewer.messages import Accepts, checked_message
+from polarguide.viewer.painting import Materials, Paintable, kinds_of
+from polarguide.viewer.panel import KINDS, PanelOptions
+from polarguide.viewer.scenery import UNCHANGED, Scenery, run_scenery, training_scenery
 from polarguide.viewer.session import Session
 
-REFRESH = 1.0  # least seconds between two pictures of a training,
-SHARE = 10.0  # which are also at least this multiple of the time that the last one took
+REFRESH = 1.0  # least time in seconds between two pictures of a training
+SHARE = 10.0  # least time in units of the duration of the last picture
 TICK = 0.02
-REACH = 1e4  # how far a camera goes from the scene, as a multiple of the cameras' distance
+REACH = 1e4  # largest distance of a camera in units of the cameras' distance
 
 
 EVERYWHERE = ("0.0.0.0", "::")
@@ -58,30 +58,33 @@ EVERYWHERE = ("0.0.0.0", "::")
 
 
 def viewing_address(host: str, port: int) -> str:
-    """The URL under which a browser on the same machine reaches the viewer."""
+    """Return the URL of the viewer for a browser on the same machine."""
     name = {"0.0.0.0": "127.0.0.1", "::": "[::1]", "::1": "[::1]"}.get(host, host)
     return f"http://{name}:{port}"
 
 
 class Viewer:
-    """A web viewer.
+    """Web viewer of a scene.
 
-    Pictures are rendered in ``serve`` only, by the thread that calls it, so that a training and its viewer take turns.
+    Only ``serve`` renders, in the thread that calls it, so that a training and its viewer take turns.
 
     Args:
-        current: returns the scene as it is now.
+        current: returns the current scene.
         photographs: photographs of the scene by name, at least one; sessions start at the first one.
-        shading: model of the recipe. trains: whether the panel can pause a training.
-        host, port: address to listen at; another port is used if this one is taken.
-        visitors: who may look besides pages of this machine.
-        presentation: as it was saved. save: writes a choice to the run, and returns a message in plain text; None:
-            visitors can download it. That is all they can do where other machines may look.
-        paintable: what can be painted, where nobody else may look; None: nothing.
+        shading: model of the recipe.
+        trains: whether the panel can pause a training.
+        host, port: address of the server; the next free port is taken if this one is in use.
+        visitors: further hosts and origins that may connect.
+        presentation: the saved presentation.
+        save: writes a presentation to the run and returns a message in plain text; None: browsers download it. Other
+            machines can never save.
+        paintable: materials that can be painted if nobody else can connect; None: no painting.
         title: plain text.
-        warn: called with the reason why a browser was disconnected. beside: another run, for wipes.
+        warn: callback with the reason for closing a connection.
+        beside: another run, for wipes.
 
     Raises:
-        PolarguideError: viser is not installed or not as it was tested, or the server cannot listen at the address.
+        PolarguideError: viser is not installed or has another version, or the server cannot listen at the address.
     """
 
     def __init__(
@@ -94,7 +97,7 @@ class Viewer:
         host: str = LOOPBACK[0],
         port: int = 8080,
         visitors: VisitorOptions = VisitorOptions(),
-        presentation: Presentation = NOTHING,
+        presentation: Presentation = UNCHANGED,
         save: Callable[[Presentation], str] | None = None,
         paintable: Paintable | None = None,
         title: str = "polarguide",
@@ -102,7 +105,7 @@ class Viewer:
         beside: Scenery | None = None,
     ) -> None:
         viser = optional_import("viser", "the viewer")
-        # viser warns of pictures for a browser that has just disconnected.
+        # viser warns about pictures for a browser that has just disconnected.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         self._current = current
         self._photographs = photographs
@@ -117,7 +120,6 @@ class Viewer:
         self._options = PanelOptions(
             layers_of(shading), turns, tuple(photographs), trains, presentation, saves, kinds
         )
-        self._gray: Vector | None = None
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         self._wake = threading.Event()
@@ -129,7 +131,7 @@ class Viewer:
         reach = float(around.center.abs().max()) + REACH * around.distance
         gate = Gate(host, visitors.allow_host, visitors.allow_origin)
         with contextlib.ExitStack() as stack:
-            with guarded(gate, lambda raw: checked(raw, self._control, reach)):
+            with guarded(gate, lambda raw: checked_message(raw, self._control, reach)):
                 self._server = _listening(viser, host, port, title)
                 stack.callback(self.close)
             stack.pop_all()
@@ -157,7 +159,7 @@ class Viewer:
                 self._scene_frame,
                 self._options,
                 self._wake.set,
-                gray_world=self._gray_world,
+                gray_world=lambda: self._gray,
                 save=None if self._save is None else self._saved,
                 paintable=self._paintable,
                 drop=drop,
@@ -171,16 +173,16 @@ class Viewer:
             self._sessions[client.client_id] = session
         self._wake.set()
 
-    def _gray_world(self) -> Vector:
-        """Gains of the photographs' mean, computed on first use."""
-        if self._gray is None:
-            photographs = self._photographs.values()
-            views = [p.view for p in photographs if not p.held_out] or [p.view for p in photographs]
-            self._gray = gray_world(views)
-        return self._gray
+    @functools.cached_property
+    def _gray(self) -> Vector:
+        """Gains that make the photographs' mean gray."""
+        photographs = self._photographs.values()
+        return gray_world_gains(
+            [p.view for p in photographs if not p.held_out] or [p.view for p in photographs]
+        )
 
     def _saved(self, presentation: Presentation) -> str:
-        """Save, so that browsers which come later begin with it."""
+        """Save a presentation, also as the initial one of new sessions."""
         assert self._save is not None
         try:
             text = self._save(presentation)
@@ -192,13 +194,13 @@ class Viewer:
         return text
 
     def _control(self, name: str) -> Accepts | None:
-        """Applies a control of any session; viser itself searches only the sender's."""
+        """Return the validation of a control of any session. viser itself searches only the sender's controls."""
         with self._lock:
             tables = [session.panel.accepts for session in self._sessions.values()]
         return next((table[name] for table in tables if name in table), None)
 
     def _drop(self, client_id: int, error: Exception) -> None:
-        """Let a browser go; the server and a training go on."""
+        """Close the connection of a browser. The server and a training continue."""
         with self._lock:
             removed = self._sessions.pop(client_id, None) is not None
         text = f"the viewer let a browser go: {type(error).__name__}: {error}"
@@ -214,10 +216,10 @@ class Viewer:
             self._sessions.pop(client.client_id, None)
 
     def serve(self, timeout: float = 0.0) -> bool:
-        """Render the picture that has been due for longest, if one is due.
+        """Render the picture that has been due for longest.
 
         Args:
-            timeout: seconds to wait for one.
+            timeout: longest time in seconds to wait for one.
 
         Returns:
             Whether a picture was rendered.
@@ -225,37 +227,33 @@ class Viewer:
         deadline = time.monotonic() + timeout
         while True:
             self._wake.clear()
-            due = self._due()
-            if due is not None:
-                session, kind = due
-                began = time.monotonic()
-                try:
-                    session.draw(self._current(), kind)
-                except Exception as error:  # in what one browser asked for
-                    self._drop(session.client_id, error)
-                self._cost = time.monotonic() - began
+            if self._draw_next():
                 return True
             left = deadline - time.monotonic()
             if left <= 0:
                 return False
-            # Sharp pictures after a rest and paths that are played become due without an event.
+            # Sharp pictures and animations become due without an event.
             self._wake.wait(min(left, TICK if self._sessions else 1.0))
 
-    def _due(self) -> tuple[Session, str] | None:
+    def _draw_next(self) -> bool:
+        """Render the picture that has been due for longest; returns whether one was due."""
         with self._lock:
             sessions = sorted(self._sessions.values(), key=lambda session: session.pacing.last_frame)
         for session in sessions:
+            began = time.monotonic()
             try:
                 kind = session.due()
-            except Exception as error:
+                if kind is None:
+                    continue
+                session.draw(self._current(), kind)
+            except Exception as error:  # caused by a request of one browser
                 self._drop(session.client_id, error)
-                continue
-            if kind is not None:
-                return session, kind
-        return None
+            self._cost = time.monotonic() - began
+            return True
+        return False
 
     def refresh(self) -> None:
-        """Render a changed scene anew, but rarely enough not to slow a training down."""
+        """Request new pictures of a changed scene, but rarely enough not to slow a training down."""
         now = time.monotonic()
         if now - self._refreshed < max(REFRESH, SHARE * self._cost):
             return
@@ -275,11 +273,11 @@ def _listening(viser: Any, host: str, port: int, title: str) -> Any:
         raise PolarguideError(
             "the port", expected="a port from 1 to 65535", found=str(port), remedy="Choose another port."
         )
-    try:  # viser itself would wait forever
+    try:  # viser would wait forever
         family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as listener:
             listener.bind(address)
-    except (OSError, UnicodeError) as error:  # the latter of a name that no network can have
+    except (OSError, UnicodeError) as error:  # UnicodeError: a name that no network can have
         raise PolarguideError(
             f"the viewer's host {host!r}",
             expected="an address of this machine",
@@ -290,7 +288,7 @@ def _listening(viser: Any, host: str, port: int, title: str) -> Any:
         return viser.ViserServer(host=host, port=port, label=title, verbose=False)
 
 
-PATIENCE = 0.2  # seconds between two looks at whether a paused training should end
+PATIENCE = 0.2  # time in seconds between two checks for the end of a paused training
 
 
 def view_run(
@@ -302,16 +300,18 @@ def view_run(
     reporter: Reporter = SILENT,
     beside: OpenedRun | None = None,
 ) -> None:
-    """Serve a run to browsers: its layers from any side, beside the photographs. KeyboardInterrupt ends it.
+    """Serve a run to browsers: its layers from any side, next to the photographs. KeyboardInterrupt ends it.
 
     Args:
-        run: the run; its scene is read. beside: another of the same scene, which a wipe shows from the left.
-        host: address to listen at. port: the next free one is taken if it is in use.
-        visitors: who may look besides pages of this machine.
+        run: the run; its scene is read.
+        host: address of the server.
+        port: port of the server; the next free one is taken if it is in use.
+        visitors: further hosts and origins that may connect.
         reporter: receives the address.
+        beside: another run of the same scene, which a wipe shows on the left.
 
     Raises:
-        PolarguideError: the address cannot be listened at, or the run beside is of another scene.
+        PolarguideError: the server cannot listen at the address, or the other run has another scene.
     """
     if beside is not None and beside.configuration.scene_digest != run.configuration.scene_digest:
         raise PolarguideError(
@@ -340,7 +340,7 @@ def view_run(
 
 
 def paintable_run(run: OpenedRun) -> Paintable | None:
-    """What can be painted over a run; None where its recipe tells no metals."""
+    """Return the materials that can be painted over a run, or None if its recipe has no metals."""
     if "metalness" not in run.model.shading.parameters:
         return None
     model = run.model
@@ -366,9 +366,9 @@ def paintable_run(run: OpenedRun) -> Paintable | None:
 
 
 def save_to_run(run: OpenedRun, chosen: Presentation) -> str:
-    """Write white, up, scale and crop to the run's ``presentation.json``, and say so in plain text.
+    """Write color, up axis, scale and crop box to the run's ``presentation.json``; returns a message in plain text.
 
-    What its scene says just so is left to the scene. The run's own credit stays.
+    Values that equal the scene's are left to the scene. The run's own credit stays.
     """
     own = read_presentation(run.folder)
     above = read_presentation(run.scene_folder)
@@ -395,10 +395,10 @@ def watched(
     visitors: VisitorOptions = VisitorOptions(),
     reporter: Reporter = SILENT,
 ) -> Iterator[Look]:
-    """A viewer over a training; yields what is to be called between steps.
+    """Open a viewer for a training; yields the function to call between steps.
 
     Raises:
-        PolarguideError: several processes train, or the address cannot be listened at.
+        PolarguideError: several processes train, or the server cannot listen at the address.
     """
     if loop.ranks.world > 1:
         raise PolarguideError(
@@ -434,7 +434,12 @@ def watched(
 def _opened(
     current: Callable[[], Scenery], scene: Scene, reporter: Reporter, host: str, *, name: str, **options: Any
 ) -> Iterator[Viewer]:
-    """A viewer with options of ``Viewer``; the reporter is told where to look, and warned of other machines."""
+    """Open a viewer, report its address, and warn about other machines.
+
+    Args:
+        current, scene, reporter, host, name: the scene, its name, and the address.
+        options: further arguments of ``Viewer``.
+    """
     viewer = Viewer(
         current, photographs(scene), host=host, title=f"polarguide {name}", warn=reporter.warn, **options
     )
@@ -448,7 +453,7 @@ def _opened(
 
 
 def from_elsewhere(host: str, port: int) -> list[str]:
-    """Lines for people at other machines: the address, and the way that opens it to nobody else."""
+    """Return lines with the address for other machines, and with a private tunnel."""
     here = network_address() if host in EVERYWHERE else host
     lines = [] if here is None else [f"from other machines: {viewing_address(here, port)}"]
     tunnel = shlex.join(["ssh", "-L", f"{port}:127.0.0.1:{port}", here or platform.node()])

@@ -1,4 +1,4 @@
-"""A session: one connected browser, with its controls, its camera, and the pictures that it receives."""
+"""A session of the viewer: one connected browser with its controls, camera and pictures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from polarguide.capture.presentation import PRESENTATION_FILE, Presentation, Vector
@@ -16,21 +15,24 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame
 from polarguide.viewer.cameras import (
     FRAMES_PER_SECOND,
+    MOST_KEYFRAMES,
     Frusta,
-    Keyframes,
     Photograph,
     ViewPose,
     drawn_camera,
     free_camera,
+    keyframe,
+    keyframe_path,
     move_to_view,
+    path_json,
 )
 from polarguide.viewer.painting import Paintable, Painting
 from polarguide.viewer.panel import FREE_VIEW, Panel, PanelOptions
 from polarguide.viewer.presenting import Presenting
 from polarguide.viewer.scenery import Painter, Scenery
-from polarguide.visualization.figures import Picture, png_bytes
+from polarguide.visualization.figures import png_bytes
 
-REST = 0.25  # seconds without a change after which a sharp picture is rendered
+REST = 0.25  # seconds without a change before a sharp picture
 BUDGET = 0.1  # seconds per picture while the camera moves
 FIRST_HEIGHT = 360
 LEAST_HEIGHT = 90
@@ -39,12 +41,12 @@ GREATEST_WIDTH = 3840
 
 
 class FramePacing:
-    """Coarse pictures while the camera or a control changes, one sharp picture afterwards.
+    """Schedule of pictures: coarse ones while the camera or a control changes, a sharp one afterwards.
 
-    The height of coarse pictures adapts to the time that they take. Times are seconds of one monotonic clock.
+    The height of coarse pictures adapts to their rendering time. Times are seconds of one monotonic clock.
 
     Attributes:
-        version: number of changes so far; a picture that is rendered now shows this version.
+        version: number of changes so far, which the next picture shows.
     """
 
     def __init__(self) -> None:
@@ -55,22 +57,22 @@ class FramePacing:
         self._height = float(FIRST_HEIGHT)
 
     def mark_changed(self, now: float) -> None:
-        """Record that the camera or a control has changed at the time ``now``."""
+        """Record a change of the camera or of a control at the time ``now``."""
         self._changed = now
         self.version += 1
 
     def mark_outdated(self) -> None:
-        """Record that the scene has changed: a sharp picture is due, without coarse ones before it."""
+        """Record a change of the scene: a sharp picture is due, without coarse ones before it."""
         self.version += 1
 
     def due(self, now: float) -> str | None:
-        """The kind of picture that is due: "coarse", "sharp", or None if the last picture is up to date."""
+        """Return the kind of picture that is due: "coarse", "sharp", or None if the last picture is up to date."""
         if now - self._changed >= REST:
             return None if self._sharp == self.version else "sharp"
         return None if self._drawn == self.version else "coarse"
 
     def frame_size(self, window: tuple[int, int], kind: str) -> tuple[int, int]:
-        """Width and height in pixels of the next picture of this kind, given those of the window."""
+        """Return the width and height in pixels of the next picture of a kind in a window of a given size."""
         limit = GREATEST_HEIGHT if kind == "sharp" else round(self._height)
         height = max(1, min(window[1], limit))
         width = max(1, round(window[0] * height / max(1, window[1])))
@@ -79,13 +81,13 @@ class FramePacing:
         return min(width, GREATEST_WIDTH), height
 
     def end_frame(self, version: int, kind: str, seconds: float, now: float) -> None:
-        """Record that a picture was rendered in so many seconds."""
+        """Record the duration of a rendered picture."""
         self._drawn = version
         self.last_frame = now
         if kind == "sharp":
             self._sharp = version
             return
-        # Time is at most proportional to the number of pixels. Shrink at once, grow step by step.
+        # The time is at most proportional to the number of pixels. Shrink at once, grow step by step.
         factor = (BUDGET / max(seconds, 1e-4)) ** 0.5
         self._height *= max(0.25, factor) if factor < 1 else min(1.1, factor)
         self._height = min(float(GREATEST_HEIGHT), max(float(LEAST_HEIGHT), self._height))
@@ -94,7 +96,7 @@ class FramePacing:
 PATH_FILE = "camera_path.json"
 PICTURE_FILE = "polarguide.png"
 JPEG_QUALITY = 75
-BETWEEN_FILES = 0.5  # least seconds between two files of a kind, or two paths that are played
+BETWEEN_FILES = 0.5  # least seconds between two files of a kind, or two animations
 NO_LAYER = "This layer is not available here: go to a photograph, or choose another layer"
 
 
@@ -108,11 +110,16 @@ class Session:
     Callbacks only record changes; the rendering thread calls ``draw``.
 
     Args:
-        client: viser's handle. photographs: by name. scene_frame: frame of the scene.
-        options: options of the panel. wake: called when a picture may be due.
-        gray_world: gives the gains of the photographs' mean.
-        save: writes a presentation to the run, and returns a message; None: the browser downloads it.
-        drop: called with what a callback has raised, to let the browser go. beside: as of ``Painter``.
+        client: viser's handle.
+        photographs: photographs by name.
+        scene_frame: frame of the scene.
+        options: options of the panel.
+        wake: callback when a picture may be due.
+        gray_world: returns the gains that make the photographs' mean gray.
+        save: writes a presentation to the run and returns a message; None: the browser downloads it.
+        paintable: materials that can be painted.
+        drop: callback with the exception of another callback, to close the connection.
+        beside: another run, for wipes.
     """
 
     def __init__(
@@ -131,52 +138,57 @@ class Session:
     ) -> None:
         self._client = client
         self._photographs = photographs
-        self._drop = drop
         self._scene_frame = scene_frame
         self._wake = wake
         self._lock = threading.Lock()
         self._painter = Painter(scene_frame, beside)
         self.pacing = FramePacing()
         self._view_pose: ViewPose | None = None
-        self._last_pose: ViewPose | None = None  # of the view that was asked for last, left or not
+        self._last_pose: ViewPose | None = (
+            None  # pose of the last requested view, even if the camera has left it
+        )
         self._screenshot = False
         self._written_at = dict[str, float]()
         self._playing: tuple[float, list[Camera]] | None = None
         first = next(iter(photographs.values())).view.camera
         self._size = first.width, first.height
-        self._keyframes = Keyframes(self._size)
-        upright = client.camera.image_width < client.camera.image_height  # as phones are held
-        self.panel = Panel(client.gui, options, lambda: self._caught(self._changed)(None), folded=upright)
+        self._keyframes: list[Camera] = []
+        upright = client.camera.image_width < client.camera.image_height  # as on a phone
+        self.panel = panel = Panel(client.gui, options, self._changed, drop, folded=upright)
         self._save = save
         self._presenting = Presenting(
             client,
-            self.panel.presenting,
+            panel,
             options.presentation,
             gray_world=gray_world,
             save=self._save_presentation,
             distance=scene_frame.distance,
-            changed=self._changed,
-            noted=lambda: self.panel.show_note(self._presenting.note),
-            caught=self._caught,
         )
         self._painting = None
-        if paintable is not None and self.panel.painting is not None:
-            self._painting = Painting(
-                client,
-                self.panel.painting,
-                paintable,
-                changed=self._changed,
-                noted=self.panel.show_note,
-                caught=self._caught,
-                busy=lambda: self._presenting.picks,
-            )
+        if paintable is not None and options.kinds:
+            self._painting = Painting(client, panel, paintable, busy=lambda: self._presenting.picks)
         self._frusta = Frusta(
             client.scene,
             list(photographs.values()),
             scene_frame,
-            lambda name: self._caught(lambda: self.go(name))(None),
+            lambda name: panel.caught(lambda: self.go(name))(None),
         )
-        self._connect()
+        client.camera.on_update(panel.caught(self._moved))
+        callbacks = {
+            "view": lambda: self._selected(panel["view"].value),
+            "step": lambda: self._step(1 if panel["step"].value == "next" else -1),
+            "frusta": lambda: self._frusta.show(panel["frusta"].value),
+            "pause": self._wake,
+            "screenshot": self._request_screenshot,
+            "add_keyframe": self._add_keyframe,
+            "remove_keyframe": self._remove_keyframe,
+            "seconds": self._show_count,
+            "play": self._play,
+            "save_path": self._save_path,
+        }
+        for name, act in callbacks.items():
+            panel.listen(name, act)
+        panel.caught(self._changed)(None)  # show the saved box
 
     @property
     def client_id(self) -> int:
@@ -186,37 +198,10 @@ class Session:
     @property
     def paused(self) -> bool:
         """Whether this session pauses the training."""
-        return bool(self.panel.pause.value)
-
-    def _connect(self) -> None:
-        panel = self.panel
-        self._client.camera.on_update(self._caught(self._moved))
-        panel.view.on_update(self._caught(lambda: self._selected(panel.view.value)))
-        panel.step.on_click(self._caught(lambda: self._step(1 if panel.step.value == "next" else -1)))
-        panel.frusta.on_update(self._caught(lambda: self._frusta.show(panel.frusta.value)))
-        panel.box.on_update(self._caught(self._changed))
-        panel.pause.on_update(self._caught(self._wake))
-        panel.screenshot.on_click(self._caught(self._request_screenshot))
-        panel.add_keyframe.on_click(self._caught(self._add_keyframe))
-        panel.remove_keyframe.on_click(self._caught(self._remove_keyframe))
-        panel.seconds.on_update(self._caught(self._show_count))
-        panel.play.on_click(self._caught(self._play))
-        panel.save_path.on_click(self._caught(self._save_path))
-        self._caught(self._changed)(None)  # the box that was saved
-
-    def _caught(self, act: Callable[[], None]) -> Callable[[Any], None]:
-        """A callback whose errors close this browser's connection and affect no other."""
-
-        def called(_: Any) -> None:
-            try:
-                act()
-            except Exception as error:
-                self._drop(error)
-
-        return called
+        return bool(self.panel["pause"].value)
 
     def _soon_again(self, what: str) -> bool:
-        """Whether the same was requested less than ``BETWEEN_FILES`` ago; such a request is ignored."""
+        """Return whether the same was requested less than ``BETWEEN_FILES`` ago, and record the request otherwise."""
         now = time.monotonic()
         with self._lock:
             soon = now - self._written_at.get(what, -BETWEEN_FILES) < BETWEEN_FILES
@@ -228,18 +213,13 @@ class Session:
         with self._lock:
             self.pacing.mark_changed(time.monotonic())
         crop = self.panel.crop(self._presenting.chosen.up_axis)
-        self._frusta.show_box(crop if self.panel.box.value else None)
+        self._frusta.show_box(crop if self.panel["box"].value else None)
         self._wake()
 
     def _save_presentation(self) -> str:
         if self._soon_again("presentation"):
             return "Saved just now"
-        chosen = self._presenting.chosen
-        chosen = msgspec.structs.replace(
-            chosen,
-            crop=self.panel.crop(chosen.up_axis),
-            exposure=float(self.panel.exposure.value) or None,
-        )
+        chosen = self.panel.presentation(self._presenting.chosen)
         if self._save is not None:
             return self._save(chosen)
         content = to_json(chosen.to_record())
@@ -247,7 +227,7 @@ class Session:
         return "Put it into the run's folder"
 
     def _moved(self) -> None:
-        """The browser reports the pose of its camera."""
+        """Handle a new camera pose from the browser."""
         camera = self._client.camera
         with self._lock:
             now = time.monotonic()
@@ -257,7 +237,7 @@ class Session:
                 pose = None
             if pose is not self._view_pose:
                 self._view_pose = pose
-                self.panel.view.value = FREE_VIEW if pose is None else pose.view.name
+                self.panel["view"].value = FREE_VIEW if pose is None else pose.view.name
                 if pose is None:
                     self._presenting.turn_upright()
         self._wake()
@@ -270,7 +250,7 @@ class Session:
             pose = move_to_view(self._client, view, self._scene_frame, time.monotonic())
             self._view_pose = self._last_pose = pose
             self.pacing.mark_changed(time.monotonic())
-        self.panel.view.value = name
+        self.panel["view"].value = name
         self._wake()
 
     def _selected(self, name: str) -> None:
@@ -289,32 +269,36 @@ class Session:
 
     def _add_keyframe(self) -> None:
         camera = self._view_pose.view.camera if self._view_pose else self._camera(self._size)
-        self._keyframes.add(camera)
+        if len(self._keyframes) < MOST_KEYFRAMES:
+            self._keyframes.append(keyframe(camera, self._size))
         self._show_count()
 
     def _remove_keyframe(self) -> None:
-        del self._keyframes.cameras[-1:]
+        del self._keyframes[-1:]
         self._show_count()
 
     def _show_count(self) -> None:
-        count = len(self._keyframes.cameras)
-        seconds = max(0, count - 1) * float(self.panel.seconds.value)
-        self.panel.keyframes.value = f"{count}" + (f", {seconds:g} s" if count > 1 else "")
+        count = len(self._keyframes)
+        seconds = max(0, count - 1) * float(self.panel["seconds"].value)
+        self.panel["keyframes"].value = f"{count}" + (f", {seconds:g} s" if count > 1 else "")
+
+    def _path(self) -> list[Camera]:
+        return keyframe_path(self._keyframes, float(self.panel["seconds"].value))
 
     def _save_path(self) -> None:
-        if self._keyframes.cameras and not self._soon_again("path"):
-            text = self._keyframes.to_json(float(self.panel.seconds.value))
+        if self._keyframes and not self._soon_again("path"):
+            text = path_json(self._path())
             self._client.send_file_download(PATH_FILE, text.encode(), save_immediately=True)
 
     def _play(self) -> None:
         if self._soon_again("play"):
             return
-        path = self._keyframes.path(float(self.panel.seconds.value))
+        path = self._path()
         if len(path) > 1:
             with self._lock:
                 self._view_pose = self._last_pose = None
                 self._playing = time.monotonic(), path
-            self.panel.view.value = FREE_VIEW
+            self.panel["view"].value = FREE_VIEW
             self._wake()
 
     def _camera(self, frame_size: tuple[int, int]) -> Camera:
@@ -322,7 +306,7 @@ class Session:
         return free_camera(camera.wxyz, camera.position, camera.fov, frame_size)
 
     def _follow_path(self) -> None:
-        """Move the browser's camera to the current pose of the path that is played."""
+        """Move the browser's camera to the current pose of the animation."""
         if self._playing is None:
             return
         began, path = self._playing
@@ -340,7 +324,7 @@ class Session:
         self.pacing.mark_changed(time.monotonic())
 
     def due(self) -> str | None:
-        """The kind of picture that is due: "coarse", "sharp", or None."""
+        """Return the kind of picture that is due: "coarse", "sharp", or None."""
         with self._lock:
             self._follow_path()
             waits = self._presenting.waits or (self._painting is not None and self._painting.waits)
@@ -361,14 +345,21 @@ class Session:
         sharp = kind == "sharp"
         if (place := self._presenting.take_click()) is not None:
             appearance = self.panel.appearance(self._presenting.chosen)
-            self._presenting.found(self._painter.point(scenery, viewpoint, appearance, view, place))
+            hit = self._painter.point(scenery, viewpoint, appearance, view, place)
+            self.panel.caught(lambda: self._presenting.found(hit))(None)
         appearance = self.panel.appearance(self._presenting.chosen)
         picture = self._painter.paint(scenery, viewpoint, appearance, view, settled=sharp)
         if self._painting is not None and picture is not None:
             drawn = drawn_camera(viewpoint, view)
             self._painting.act(drawn)
             picture = self._painting.tinted(picture, drawn)
-        self._send(picture, frame_size, sharp=sharp)
+        image = picture
+        if image is None:
+            image = np.full((frame_size[1], frame_size[0], 3), 64, dtype=np.uint8)
+        coding: dict[str, Any] = (
+            {"format": "png"} if sharp else {"format": "jpeg", "jpeg_quality": JPEG_QUALITY}
+        )
+        self._client.scene.set_background_image(image, **coding)
         self._frusta.hide_near(None if view else viewpoint.center.numpy())
         if screenshot and picture is not None:
             self._client.send_file_download(PICTURE_FILE, png_bytes(picture), save_immediately=True)
@@ -377,11 +368,3 @@ class Session:
             self.pacing.end_frame(version, kind, now - began, now)
         note = f"{frame_size[0]} x {frame_size[1]} in {1000 * (now - began):.0f} ms"
         self.panel.show_status(scenery.status, NO_LAYER if picture is None else note)
-
-    def _send(self, picture: Picture | None, frame_size: tuple[int, int], *, sharp: bool) -> None:
-        if picture is None:
-            picture = np.full((frame_size[1], frame_size[0], 3), 64, dtype=np.uint8)
-        if sharp:
-            self._client.scene.set_background_image(picture, format="png")
-        else:
-            self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import io
 import math
-import struct
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -13,6 +12,8 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from polarguide.core.files import write_whole
@@ -25,11 +26,11 @@ Picture = NDArray[np.uint8]
 BACKGROUND = 255
 INK = (32, 32, 32)
 FONT = cv2.FONT_HERSHEY_SIMPLEX
-FONT_SCALE = 0.6
-SMALLEST_FONT_SCALE = 0.35
+FONT_SIZE = 18
+SMALLEST_FONT_SIZE = 10
 LINE_HEIGHT = 28
 READ_AT = 384
-"""Width of a tile up to which type keeps its size; a sheet of larger ones is read from farther away."""
+"""Width of a tile up to which the font size is constant. The type grows with larger tiles."""
 
 
 def contact_sheet(
@@ -75,41 +76,43 @@ def contact_sheet(
         check_picture(picture, "contact sheet")
     if not pictures:
         raise ValueError("contact sheet: expected at least one picture, found none")
-    width, height = _tile_size(pictures, minimum_width, maximum_width)
+    # A whole factor keeps the pixels of an enlarged picture square and equal.
+    widest = max(picture.shape[1] for picture in pictures)
+    width = min(widest * max(1, math.ceil(minimum_width / widest)), maximum_width)
+    height = _height_at(width, pictures)
+    below = _height_at(width, footer) + gutter if any(cell is not None for cell in footer) else 0
     larger = max(1.0, width / READ_AT)
     line = round(LINE_HEIGHT * larger)
-    margin = max((_text_width(label, FONT_SCALE * larger) for label in row_labels), default=0)
+    font = ImageFont.load_default(FONT_SIZE * larger)
+    margin = math.ceil(
+        max((font.getlength(label.encode("ascii", "replace")) for label in row_labels), default=0)
+    )
     left = gutter + (margin + gutter if margin else 0)
     top = gutter + (line if any(column_labels) else 0)
-    sheet: Picture = np.full(
-        (top + len(rows) * (height + gutter), left + columns * (width + gutter), 3), BACKGROUND, np.uint8
-    )
+    across = left + columns * (width + gutter)
+    bottom = top + len(rows) * (height + gutter)
+    sheet = Image.new("RGB", (across, bottom + below + (line if caption else 0)), "white")
     for j, label in enumerate(column_labels):
         _write(sheet, label, left + j * (width + gutter), gutter + line // 2, width, larger)
-    for i, (row, label) in enumerate(zip(rows, row_labels, strict=True)):
+    for i, label in enumerate(row_labels):
+        _write(sheet, label, gutter, top + i * (height + gutter) + height // 2, margin, larger)
+    for i, row in enumerate([*rows, footer]):
         y = top + i * (height + gutter)
-        _write(sheet, label, gutter, y + height // 2, margin, larger)
         for j, cell in enumerate(row):
             if cell is not None:
-                _place(sheet[y : y + height, left + j * (width + gutter) :][:, :width], cell)
-    if any(cell is not None for cell in footer):
-        sheet = np.concatenate((sheet, _strip(footer, sheet.shape[1], width, left, gutter)))
-    if not caption:
-        return sheet
-    strip: Picture = np.full((line, sheet.shape[1], 3), BACKGROUND, np.uint8)
-    _write(strip, caption, gutter, line // 2, sheet.shape[1] - 2 * gutter, larger)
-    return np.concatenate((sheet, strip))
+                check_picture(cell, "contact sheet")
+                _place(
+                    sheet,
+                    cell,
+                    (left + j * (width + gutter), y, width, height if y < bottom else below - gutter),
+                )
+    _write(sheet, caption, gutter, bottom + below + line // 2, across - 2 * gutter, larger)
+    return np.array(sheet)
 
 
-def _strip(cells: Sequence[Picture | None], across: int, width: int, left: int, gutter: int) -> Picture:
-    """One more row, as high as its pictures need, ``across`` pixels wide."""
-    height = max(round(width * cell.shape[0] / cell.shape[1]) for cell in cells if cell is not None)
-    strip: Picture = np.full((height + gutter, across, 3), BACKGROUND, np.uint8)
-    for j, cell in enumerate(cells):
-        if cell is not None:
-            check_picture(cell, "contact sheet")
-            _place(strip[:height, left + j * (width + gutter) :][:, :width], cell)
-    return strip
+def _height_at(width: int, pictures: Sequence[Picture | None]) -> int:
+    """Return the height of the tallest of some pictures at a width."""
+    return max(1, max(round(width * p.shape[0] / p.shape[1]) for p in pictures if p is not None))
 
 
 def check_picture(picture: Picture, name: str) -> None:
@@ -118,45 +121,25 @@ def check_picture(picture: Picture, name: str) -> None:
         raise ValueError(f"{name}: expected uint8 [H, W, 3], found {picture.dtype} {list(picture.shape)}")
 
 
-def _tile_size(pictures: Sequence[Picture], minimum: int, maximum: int) -> tuple[int, int]:
-    """Width and height of every tile: as wide as the bounds want, as high as the tallest needs."""
-    widest = max(picture.shape[1] for picture in pictures)
-    # A whole factor keeps the pixels of an enlarged picture square and equal.
-    width = min(widest * max(1, math.ceil(minimum / widest)), maximum)
-    return width, max(1, max(round(width * p.shape[0] / p.shape[1]) for p in pictures))
+def _place(sheet: Image.Image, picture: Picture, tile: tuple[int, int, int, int]) -> None:
+    """Fit a picture into a tile (left, top, width, height), centered."""
+    left, top, width, height = tile
+    scale = min(width / picture.shape[1], height / picture.shape[0])
+    size = [max(1, round(side * scale)) for side in (picture.shape[1], picture.shape[0])]
+    fitted = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST)
+    sheet.paste(Image.fromarray(fitted), (left + (width - size[0]) // 2, top + (height - size[1]) // 2))
 
 
-def _place(tile: Picture, picture: Picture) -> None:
-    """Fit a picture into a tile, centered."""
-    scale = min(tile.shape[1] / picture.shape[1], tile.shape[0] / picture.shape[0])
-    width = max(1, round(picture.shape[1] * scale))
-    height = max(1, round(picture.shape[0] * scale))
-    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST
-    fitted = cv2.resize(picture, (width, height), interpolation=how)
-    y = (tile.shape[0] - height) // 2
-    x = (tile.shape[1] - width) // 2
-    tile[y : y + height, x : x + width] = fitted
-
-
-def _text_width(text: str, scale: float) -> int:
-    return cv2.getTextSize(text, FONT, scale, 1)[0][0] if text else 0
-
-
-def _write(sheet: Picture, text: str, x: int, y: int, width: int, larger: float) -> None:
+def _write(sheet: Image.Image, text: str, x: int, y: int, width: int, larger: float) -> None:
     """Draw text centered in ``width`` pixels from ``x``, around the line ``y``; smaller if it has to be.
 
     Args:
         larger: how many times as large as on small tiles.
     """
-    if not text:
-        return
     text = text.encode("ascii", "replace").decode()
-    scale = FONT_SCALE * larger
-    while _text_width(text, scale) > width and scale > SMALLEST_FONT_SCALE * larger:
-        scale -= 0.05
-    (drawn, height), _ = cv2.getTextSize(text, FONT, scale, 1)
-    origin = (x + max(0, (width - drawn) // 2), y + height // 2)
-    cv2.putText(sheet, text, origin, FONT, scale, INK, round(larger), cv2.LINE_AA)
+    length = max(1.0, ImageFont.load_default(FONT_SIZE * larger).getlength(text))
+    size = larger * max(SMALLEST_FONT_SIZE, FONT_SIZE * min(1.0, width / length))
+    ImageDraw.Draw(sheet).text((x + width / 2, y), text, INK, ImageFont.load_default(size), anchor="mm")
 
 
 COLOR_MAPS = {
@@ -165,14 +148,12 @@ COLOR_MAPS = {
     "magma": cv2.COLORMAP_MAGMA,
     "inferno": cv2.COLORMAP_INFERNO,
 }
-"""Names that ``scalar_to_rgb`` knows."""
-PNG_HEADER = 33
-"""Bytes of a PNG file's signature and first chunk."""
+"""Color maps of ``scalar_to_rgb`` by name."""
 NOTHING: Mapping[str, str] = MappingProxyType({})
 
 
 def radiance_to_rgb(linear: Tensor) -> Picture:
-    """Linear radiance [H, W, 3] as a display shows it: clipped to [0, 1], sRGB. NaN is black."""
+    """Return linear radiance [H, W, 3] as a display shows it: clipped to [0, 1], sRGB. NaN is black."""
     return _to_uint8(shown(linear.detach().nan_to_num(nan=0.0)))
 
 
@@ -253,7 +234,7 @@ def aolp_to_rgb(aolp: Tensor, dolp: Tensor | None = None) -> Picture:
 
 
 LARGE_ERROR = 0.25
-"""Difference of shown pictures that is brightest."""
+"""Difference of full brightness."""
 
 
 def error_to_rgb(pred_linear: Tensor, true_linear: Tensor, high: float = LARGE_ERROR) -> Picture:
@@ -279,32 +260,27 @@ def angle_wheel(scale: float = 1.0) -> Picture:
     Args:
         scale: factor on the size.
     """
-    high = round(110 * scale)
-    wide = round(256 * scale)
     radius = 74 * scale
-    size = max(0.45 * scale, SMALLEST_FONT_SCALE)
-    drawn: Picture = np.full((high, wide, 3), BACKGROUND, np.uint8)
     center_x = round(128 * scale)
     center_y = round(100 * scale)
-    y, x = np.mgrid[0:high, 0:wide]
+    drawn: Picture = np.full((round(110 * scale), round(256 * scale), 3), BACKGROUND, np.uint8)
+    y, x = np.mgrid[0 : drawn.shape[0], 0 : drawn.shape[1]]
     angle = np.arctan2(center_y - y, x - center_x)
     distance = np.hypot(center_y - y, x - center_x)
     inside = (distance <= radius) & (y <= center_y)
-    colors = aolp_to_rgb(torch.from_numpy(angle), torch.from_numpy(distance / radius))
-    drawn[inside] = colors[inside]
-    for degrees in (0, 45, 90, 135, 180):
+    drawn[inside] = aolp_to_rgb(torch.from_numpy(angle), torch.from_numpy(distance / radius))[inside]
+    image = Image.fromarray(drawn)
+    font = ImageFont.load_default(max(14 * scale, SMALLEST_FONT_SIZE))
+    for degrees, anchor in ((0, "lm"), (45, "lb"), (90, "mb"), (135, "rb"), (180, "rm")):
         text = f"{degrees}" if degrees or scale < 1 else "0 deg"
-        (width, height), _ = cv2.getTextSize(text, FONT, size, 1)
-        cosine = math.cos(math.radians(degrees))
-        sine = math.sin(math.radians(degrees))
-        left = center_x + (radius + 6 * scale) * cosine - width * (1 - cosine) / 2
-        low = center_y - (radius + 6 * scale) * sine + (0 if sine > 0.5 else height / 2)
-        cv2.putText(drawn, text, (round(left), round(low)), FONT, size, INK, 1, cv2.LINE_AA)
-    return drawn
+        turned = (radius + 6 * scale) * np.exp(1j * math.radians(degrees))
+        place = (center_x + turned.real, center_y - turned.imag)
+        ImageDraw.Draw(image).text(place, text, INK, font, anchor=anchor)
+    return np.array(image)
 
 
 def normal_ball(high: int = 64, width: int = 256) -> Picture:
-    """A ball seen from the camera, in the colors of ``normal_to_rgb``: [high, width, 3]."""
+    """Return a ball seen from the camera, in the colors of ``normal_to_rgb``: [high, width, 3]."""
     drawn: Picture = np.full((high, width, 3), BACKGROUND, np.uint8)
     y, x = np.mgrid[0:high, 0:width]
     radius = high * 30 / 64
@@ -318,15 +294,12 @@ def normal_ball(high: int = 64, width: int = 256) -> Picture:
 
 
 def shares_to_rgb(shares: Tensor) -> Picture:
-    """Red, green and blue [H, W, 3] from 0 to 1 as they are, without a transfer; mid gray where not finite."""
+    """Convert red, green and blue [H, W, 3] from 0 to 1 without a transfer; mid gray where not finite."""
     return _to_uint8(shares.detach().nan_to_num(0.5, 0.5, 0.5))
 
 
 def with_key(picture: Picture, key: Picture, width: int) -> Picture:
-    """A picture with a key to its colors over its lower left corner, on a white border.
-
-    The key is ``width`` pixels wide, less what is empty at its sides.
-    """
+    """Draw a legend of ``width`` pixels over the lower left corner of a picture, on a white border."""
     scale = width / key.shape[1]
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     drawn_on = np.flatnonzero((key != BACKGROUND).any(axis=(0, 2)))
@@ -342,14 +315,14 @@ def with_key(picture: Picture, key: Picture, width: int) -> Picture:
 
 
 def with_name(picture: Picture, name: str) -> Picture:
-    """A picture with a name in its upper left corner, white on a dark rim, a thirtieth of its shorter side high."""
-    drawn = picture.copy()
+    """Draw a name into the upper left corner of a picture, white on a dark rim."""
     size = min(picture.shape[:2])
-    scale = size / 30 / cv2.getTextSize("x", FONT, 1.0, 1)[0][1]
-    thick = max(1, round(size / 400))
-    for color, width in (((0, 0, 0), 3 * thick), ((255, 255, 255), thick)):
-        cv2.putText(drawn, name, (size // 40, size // 16), FONT, scale, color, width, cv2.LINE_AA)
-    return drawn
+    image = Image.fromarray(picture)
+    font = ImageFont.load_default(size / 16)
+    rim = max(1, round(size / 400))
+    place = (size // 40, size // 16)
+    ImageDraw.Draw(image).text(place, name, "white", font, anchor="ls", stroke_width=rim, stroke_fill="black")
+    return np.array(image)
 
 
 def color_patch(color: int, text: str) -> Picture:
@@ -359,12 +332,12 @@ def color_patch(color: int, text: str) -> Picture:
 
 def _bar(colors: Picture, left: str, middle: str = "", right: str = "") -> Picture:
     """Colors [22, 256, 3], and below them what stands at their two ends and between."""
-    drawn: Picture = np.full((44, 256, 3), 255, np.uint8)
-    drawn[:22] = colors
-    for text, share in ((left, 0.0), (middle, 0.5), (right, 1.0)):
-        (width, _), _ = cv2.getTextSize(text, FONT, 0.5, 1)
-        cv2.putText(drawn, text, (round((256 - width) * share), 39), FONT, 0.5, INK, 1, cv2.LINE_AA)
-    return drawn
+    image = Image.new("RGB", (256, 44), "white")
+    image.paste(Image.fromarray(colors))
+    font = ImageFont.load_default(16)
+    for text, x, anchor in ((left, 0, "ls"), (middle, 128, "ms"), (right, 256, "rs")):
+        ImageDraw.Draw(image).text((x, 39), text, INK, font, anchor=anchor)
+    return np.array(image)
 
 
 def write_png(
@@ -374,46 +347,35 @@ def write_png(
 
     Args:
         path: path of the file. rgb8: the picture. alpha8: [H, W] uint8 how opaque it is; None: wholly.
-        about: texts in ASCII by keyword, which go into the file, see ``with_texts``.
+        about: texts in ASCII by keyword, which go into the file.
 
     Raises:
         ValueError: not such a picture.
         PolarguideError: the file cannot be written.
     """
     check_picture(rgb8, "picture")
-    write_whole(Path(path), with_texts(png_bytes(rgb8, alpha8), about))
+    write_whole(Path(path), png_bytes(rgb8, alpha8, about))
 
 
-def png_bytes(rgb8: Picture, alpha8: Picture | None = None) -> bytes:
-    """A uint8 RGB [H, W, 3] picture as a PNG file, with how opaque it is [H, W] where that is given.
-
-    Raises:
-        ValueError: the picture cannot be encoded.
-    """
-    stored = rgb8[..., ::-1] if alpha8 is None else np.dstack((rgb8[..., ::-1], alpha8))
-    encoded, data = cv2.imencode(".png", stored)
-    if not encoded:
-        raise ValueError("picture: it could not be encoded as PNG")
-    return data.tobytes()
-
-
-def with_texts(png: bytes, about: Mapping[str, str]) -> bytes:
-    """A PNG file with texts in ASCII by keyword, as chunks tEXt after its header (PNG specification, 11.3.3.2)."""
-    chunks = b""
+def png_bytes(rgb8: Picture, alpha8: Picture | None = None, about: Mapping[str, str] = NOTHING) -> bytes:
+    """Return a picture as a PNG file; see ``write_png``."""
+    texts = PngInfo()
     for keyword, text in about.items():
-        data = b"tEXt" + keyword.encode("ascii") + b"\0" + text.encode("ascii")
-        chunks += struct.pack(">I", len(data) - 4) + data + struct.pack(">I", zlib.crc32(data))
-    return png[:PNG_HEADER] + chunks + png[PNG_HEADER:]
+        texts.add_text(keyword, text)
+    file = io.BytesIO()
+    pixels = rgb8 if alpha8 is None else np.dstack((rgb8, alpha8))
+    Image.fromarray(pixels).save(file, "png", pnginfo=texts, compress_level=1)
+    return file.getvalue()
 
 
 def _to_uint8(values: Tensor) -> Picture:
-    """[0, 1] to [0, 255], rounded half up, so that the middle is 128."""
+    """Convert [0, 1] to [0, 255], rounded half up, so that the middle is 128."""
     scaled = torch.floor(values.to("cpu", torch.float64) * 255 + 0.5)
     return scaled.clamp(0, 255).to(torch.uint8).numpy()
 
 
 def color_gradient(color_map: str) -> str:
-    """A color map of the figures as the stops of a CSS gradient."""
+    """Return a color map as the stops of a CSS gradient."""
     levels = np.linspace(0, 255, 9).round().astype(np.uint8)[None]
     colors = cv2.applyColorMap(levels, COLOR_MAPS[color_map])[0, :, ::-1]
     return ", ".join(f"rgb({r} {g} {b})" for r, g, b in colors.tolist())

@@ -20,14 +20,14 @@ RADIANCE = frozenset(("final", "base", "reflection", "specular", "diffuse"))
 
 
 DOLP_HIGH = 0.5
-"""DoLP that is brightest: dielectrics at Brewster's angle have more, most of what is seen has less."""
+"""DoLP of full brightness. Dielectrics exceed it near Brewster's angle only."""
 AOLP_FULL_DOLP = 0.1
-"""DoLP from which the AoLP is shown at full brightness; below it, noise turns the angle."""
+"""DoLP above which the AoLP has full brightness. Below it, noise dominates the angle."""
 STOKES_HIGH = 0.5
-"""S1 and S2, as shares of S0, at which the picture of Stokes vectors is fully colored."""
+"""S1 / S0 and S2 / S0 of full color."""
 _SHARES = ("strength", "roughness", "metalness", "alpha")
 Depths = tuple[float, float]
-"""Nearest and farthest depth of a scale of colors."""
+"""Nearest and farthest depth of a color scale."""
 
 
 def layer_picture(
@@ -39,12 +39,14 @@ def layer_picture(
     exposed: bool = False,
     color: Tensor | None = None,
 ) -> Picture | None:
-    """One layer as an 8-bit picture, or None where the recipe has no such layer.
+    """Return a layer as an 8-bit picture, or None if the recipe lacks it.
 
     Args:
-        result, camera: the rendering. name: name of the layer. depths: nearest and farthest, for depth's colors.
-        exposed: show radiance darker where more than 1 % of the pixels would clip.
-        color: color of the presentation, [3, 3], of layers of radiance.
+        result, camera: the rendering.
+        name: name of the layer.
+        depths: range of the colors of depth.
+        exposed: whether radiance is darkened so that at most 1 % of the pixels clip.
+        color: color matrix of the presentation, [3, 3], for layers of radiance.
     """
     if name in POLARIZED:
         return polarization_picture(name, result.layers["stokes"]) if "stokes" in result.layers else None
@@ -64,7 +66,7 @@ def layer_picture(
 
 
 def polarization_picture(name: str, stokes: Tensor) -> Picture:
-    """Stokes vectors [3, H, W, C], predicted or measured, as one of ``POLARIZED``; of their luminance.
+    """Return Stokes vectors [3, H, W, C], predicted or measured, as one of ``POLARIZED``, by their luminance.
 
     ``stokes``: S1 / S0 in red and S2 / S0 in green, mid gray at 0.
     """
@@ -80,16 +82,14 @@ def polarization_picture(name: str, stokes: Tensor) -> Picture:
 
 
 def depth_picture(depth: Tensor, depths: Depths) -> Picture:
-    """Depths [H, W] in colors, even steps of which are equal ratios: what is near and what is far has both detail.
-    Black where there is none.
-    """
+    """Return depths [H, W] in colors on a logarithmic scale; black without a depth."""
     near, far = (math.log(end) for end in depths)
     logs = torch.where(depth > 0, depth.double().clamp(min=1e-12).log(), math.nan)
     return figures.scalar_to_rgb(logs, near, far)
 
 
 def layer_scale(name: str, depths: Depths | None = None) -> Picture | None:
-    """The color scale of a layer, 256 pixels wide; None for radiance, and for depth without a range."""
+    """Return the legend of a layer, 256 pixels wide, or None for radiance, and for depth without a range."""
     name = name.partition(",")[0]
     if name in _SHARES:
         return figures.scale_bar(0.0, 1.0, "viridis")
@@ -106,35 +106,34 @@ def layer_scale(name: str, depths: Depths | None = None) -> Picture | None:
 
 
 def clipping_exposure(values: Tensor) -> float:
-    """The factor, 1 or less, with which under 1 % of the pixels of radiance [H, W, 3] exceed 1 in some channel."""
+    """Return the factor, at most 1, with which under 1 % of the pixels of radiance [H, W, 3] exceed 1."""
     brightest = values.detach().nan_to_num(0.0, 0.0, 0.0).amax(dim=-1).flatten().sort().values
     limit = float(brightest[max(0, brightest.numel() - 1 - brightest.numel() // 128)])
     return min(1.0, 1.0 / limit) if limit > 0 else 1.0
 
 
 _SAMPLES = 1_000_000
-"""Depths that are sorted; PyTorch takes no more than 16 millions."""
+"""Largest number of depths to sort. PyTorch accepts at most 16 million."""
 
 
 def depth_range(depth: Tensor, mask: Tensor) -> Depths:
-    """Nearest and farthest depth worth a color where ``mask``, of one shape: those of all but 2 % on either side."""
+    """Return the range of depths where ``mask``, of one shape, without 2 % on either side."""
     values = depth[mask & (depth > 0)]
     if values.numel() == 0:
         return 1.0, 2.0
     values = values[:: max(1, values.numel() // _SAMPLES)]
     near = max(float(values.quantile(0.02)), 1e-6)
-    far = float(values.quantile(0.98))
-    return near, max(far, 1.001 * near)
+    return near, max(float(values.quantile(0.98)), 1.001 * near)
 
 
 def true_depths(view: View) -> Tensor | None:
-    """The true depths of a view's surfaces, 0 where there is none; None if they are unknown."""
+    """Return the true depths of a view's surfaces, 0 without a surface; None: unknown."""
     truth = view.ground_truth
     return None if truth is None or truth.depth is None else truth.depth
 
 
 def true_name(name: str) -> str:
-    """What the truth of a layer is called: that of the picture is the photograph."""
+    """Return the name of a layer's ground truth: the photograph for the final layer."""
     return "photograph" if name == "final" else f"{name}, true"
 
 
@@ -159,8 +158,8 @@ def reference_pictures(
 def ground_truth_pictures(
     view: View, color: Tensor | None = None, depths: Depths | None = None
 ) -> dict[str, Picture]:
-    """The photograph as ``final``, and the ground truth of the other layers, as 8-bit pictures; of the depth where
-    ``depths`` are given.
+    """Return the photograph as ``final`` and the ground truth of other layers as 8-bit pictures, depth only with
+    ``depths``.
     """
     pictures = {"final": figures.radiance_to_rgb(colored(view.photograph(), color))}
     ground_truth = view.ground_truth

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import io
 import json
 from functools import lru_cache
 from typing import Any
 
 import cv2
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, select_autoescape
+from PIL import Image
 
 from polarguide.visualization.figures import Picture, check_picture
 
@@ -50,8 +52,11 @@ def page(package: str, name: str, *, script: str = "", more: str = "", **values:
         more: what else may run, beside the script; further directives after a semicolon.
         values: what the template names; ``title`` at least.
     """
-    policy = content_policy(script, more=more)
-    return templates(package).get_template(name).render(policy=policy, script=script, **values)
+    return (
+        templates(package)
+        .get_template(name)
+        .render(policy=content_policy(script, more=more), script=script, **values)
+    )
 
 
 def script_json(data: Any) -> str:
@@ -91,18 +96,10 @@ JPEG_QUALITY = 90
 def data_uri(picture: Picture, layer: str, side: int) -> str:
     """A picture uint8 RGB [H, W, 3] as a data URI, its longer side at most ``side`` pixels."""
     check_picture(picture, layer)
-    factor = side / max(picture.shape[:2])
-    resized = picture
-    if factor < 1:
-        size = (max(1, round(picture.shape[1] * factor)), max(1, round(picture.shape[0] * factor)))
-        resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(picture.dtype)
-    if layer in LOSSLESS:
-        kind = "png"
-        options = [cv2.IMWRITE_PNG_COMPRESSION, 9]
-    else:
-        kind = "jpeg"
-        options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    encoded, data = cv2.imencode(f".{kind}", resized[..., ::-1], options)
-    if not encoded:
-        raise ValueError(f"{layer}: the picture could not be encoded")
-    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}"
+    factor = min(1.0, side / max(picture.shape[:2]))
+    size = [max(1, round(factor * length)) for length in (picture.shape[1], picture.shape[0])]
+    resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    kind = "png" if layer in LOSSLESS else "jpeg"
+    file = io.BytesIO()
+    Image.fromarray(resized).save(file, kind, optimize=True, quality=JPEG_QUALITY)
+    return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode()}"

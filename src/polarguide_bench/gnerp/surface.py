@@ -10,7 +10,7 @@ from torch import Tensor
 from polarguide.core.errors import optional_import
 from polarguide.geometry.camera import Camera, seen_at
 from polarguide.geometry.scene_frame import scene_frame
-from polarguide.results.rendering.mesh import COARSE, Box, Surface, box_around, surface_of
+from polarguide.results.rendering.mesh import COARSE, Box, Surface, box_around, zero_surface
 from polarguide_bench.gnerp.model import FieldModel
 
 
@@ -33,7 +33,7 @@ def implicit_surface(cameras: Mapping[str, Camera], model: FieldModel, *, resolu
     box = box_around([near], around.center, reach, resolution)
     places, distance = _sampled(box, model)
     counts = _in_pictures(cameras, places)
-    return surface_of(box, distance, counts)
+    return zero_surface(box, distance, counts)
 
 
 def _sampled(box: Box, model: FieldModel) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import tyro
 
-from polarguide.cli.console import say, use_threads
+from polarguide.cli.console import ConsoleReporter, say, set_threads
 from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.files import read_rows, stored
 from polarguide.core.options import EXPORT_PACKAGES, SceneOptions, check_finite
@@ -24,7 +24,6 @@ from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.collection import NO_FILES, source_stamp
 from polarguide_bench.options import BatchOptions
-from polarguide_bench.verbs.console import JobReporter
 
 if TYPE_CHECKING:
     from polarguide_bench.batch import Capture
@@ -59,7 +58,7 @@ def batch(
         watch: Look for new captures every so many seconds, until Ctrl-C, as at a capture station. A capture begins once
             nothing in its folder has changed from one look to the next.
     """
-    use_threads(settings.threads)
+    set_threads(settings.threads)
     for kind in settings.formats:
         for package in EXPORT_PACKAGES.get(kind, ()):
             require_package(package, f"--formats {kind}")
@@ -67,7 +66,7 @@ def batch(
     def process(lines: Sequence[_Line]) -> None:
         running = importlib.import_module("polarguide_bench.batch")
         captures = [_capture(running.Capture, line, running.is_scene(line.path), options) for line in lines]
-        rows = running.run_batch(captures, out, settings, reporter=JobReporter())
+        rows = running.run_batch(captures, out, settings, reporter=ConsoleReporter())
         say(f"page: {out / 'index.html'}   table: {out / 'results.csv'}")
         failed = [row for row in rows if row.state == "failed"]
         if failed:

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 import polarguide
-from polarguide.cli.console import say, use_threads
+from polarguide.cli.console import ConsoleReporter, say, set_threads
 from polarguide.core.errors import PolarguideError
 from polarguide.core.text import whole_number
 from polarguide.training.settings import Background, Materials, TrainSettings
 from polarguide_bench.options import BenchOptions, CompareOptions, LayoutName
-from polarguide_bench.verbs.console import JobReporter
 
 if TYPE_CHECKING:
     from polarguide_bench.results import Results
@@ -58,7 +57,7 @@ def compare_recipes(
         steps: Optimizer steps of every run, without it 5,000, and RECIPE=STEPS for each recipe that takes its own
             number: 5000 gnerp=10000.
     """
-    use_threads(options.threads)
+    set_threads(options.threads)
     common, steps_of = chosen_steps(steps)
     results = polarguide.compare(
         scenes,
@@ -67,7 +66,7 @@ def compare_recipes(
         settings=replace(settings, steps=common),
         options=options,
         steps_of=steps_of,
-        reporter=JobReporter(),
+        reporter=ConsoleReporter(),
     )
     print_results(results, out)
 
@@ -139,7 +138,7 @@ def ablate_recipe(
         only: Names of the ablations to take, such as without-normals; all if none is given.
         reference: Recipes to add as first rows, such as 3dgs-dr.
     """
-    use_threads(options.threads)
+    set_threads(options.threads)
     results = polarguide.ablate(
         scenes,
         base,
@@ -148,7 +147,7 @@ def ablate_recipe(
         reference=reference,
         settings=replace(settings, steps=steps),
         options=options,
-        reporter=JobReporter(),
+        reporter=ConsoleReporter(),
     )
     print_results(results, out)
 
@@ -167,9 +166,9 @@ def bench(
     Args:
         out: Output folder.
     """
-    use_threads(options.threads)
+    set_threads(options.threads)
     run_bench = importlib.import_module("polarguide_bench.bench").run_bench
-    results = run_bench(out, options, reporter=JobReporter())
+    results = run_bench(out, options, reporter=ConsoleReporter())
     if results is None:
         say(f"scenes: {out / 'scenes'}")
     else:

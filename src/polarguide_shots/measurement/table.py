@@ -32,7 +32,7 @@ from polarguide.core.files import (
     write_whole,
     writing,
 )
-from polarguide.core.records import decode, first_difference, read_record, shortened, to_json
+from polarguide.core.records import decode, read_record, shortened, to_json
 from polarguide.core.system import only_writer
 from polarguide.core.text import csv_lines
 from polarguide_shots.measurement.fields import FORMAT, KEYS, Status, Value
@@ -237,7 +237,7 @@ class Table(contextlib.AbstractContextManager["Table"]):
                 self._mend()
                 return
             if before is not None and _holds_measurements(lines):
-                name, was, is_now = first_difference("", before, now)
+                name, was, is_now = first_differing_value("", before, now)
                 raise PolarguideError(
                     f"{path} ({name[1:]})",
                     expected=shortened(was, 200),

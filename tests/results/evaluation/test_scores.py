@@ -208,7 +208,7 @@ def test_errors_by_object_are_part_of_the_record(tmp_path, views):
     wrong = {"cup": {key: value for key, value in objects["cup"].items() if key != "stokes_error"}}
     path, materials = tmp_path / "metrics.json", {"metal": {**ERRORS, "psnr": "x"}}
     Fault(expected="the field stokes_error").raised_by(record.write_metrics, path, **given, objects=wrong)
-    Fault("psnr)", "a number or null", "text").raised_by(
+    Fault("psnr)", "a number or null", '"x"').raised_by(
         record.write_metrics, path, **given, materials=materials
     )
 

@@ -29,7 +29,7 @@ from polarguide.gaussians.ply import read_ply
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import srgb_decode
 from polarguide.results.rendering.chart import LAB, XYZ_OF_SRGB, chart_of
-from polarguide.results.rendering.present import described
+from polarguide.results.rendering.present import presentation_lines
 from polarguide.results.rendering.relight import read_panorama
 
 # Of a camera whose green is strong and whose channels overlap.
@@ -126,7 +126,7 @@ def test_a_chart_of_a_scene_reaches_pictures_splats_mesh_points_and_light_of_its
     for file in (charted / "polar").glob("v000_*.png"):
         cv2.imwrite(str(file), drawn)
     places = ",".join(f"{value:g}" for value in corners.ravel())
-    said = described(polarguide.present(charted, chart=f"v000,{places}"))
+    said = presentation_lines(polarguide.present(charted, chart=f"v000,{places}"))
     assert "color chart: 24 patches in v000, CIEDE2000 0.0, up to 0.0" in said
     before = exported(run_folder, tmp_path / "before")
     polarguide.present(run_folder, chart=str(charted), exposure="0.5")

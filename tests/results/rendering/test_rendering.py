@@ -28,10 +28,10 @@ from polarguide.results.rendering.mesh import (
     seen_points,
 )
 from polarguide.results.rendering.relight import (
+    cubemap_of_panorama,
     needs_radiance,
     panorama,
     read_panorama,
-    texels_of,
     turned_cubemap,
     write_exr,
 )
@@ -55,7 +55,7 @@ def smooth_texels(resolution: int = 32) -> torch.Tensor:
 def test_a_panorama_becomes_the_light_it_was(shading: DeferredShading) -> None:
     texels = smooth_texels()
     picture = panorama(texels, shading.radiance_cubemap, AROUND, 256)
-    back = texels_of(picture, shading.radiance_cubemap, AROUND, 32)
+    back = cubemap_of_panorama(picture, shading.radiance_cubemap, AROUND, 32)
     torch.testing.assert_close(shading.radiance(back), shading.radiance(texels), atol=0.01, rtol=0.01)
 
 

@@ -70,12 +70,10 @@ class ErrorSheet:
     """
 
     def __init__(self, views: int) -> None:
-        step = max(1, math.ceil(views / MOST_VIEWS))
-        self._chosen = range(0, views, step)
+        self._chosen = range(0, views, max(1, math.ceil(views / MOST_VIEWS)))
         self._added = 0
-        self._rows: list[tuple[str, dict[str, Picture]]] = []
-        # Measured (None: not known) and predicted Stokes vectors, and where they count: scales depend on all views.
-        self._stokes: list[tuple[Tensor | None, Tensor | None, Tensor]] = []
+        # Name, pictures, measured and predicted Stokes vectors, and where they count: scales depend on all views.
+        self._rows: list[tuple[str, dict[str, Picture], Tensor | None, Tensor | None, Tensor]] = []
 
     def add(self, view: View, target: ViewTarget, result: RenderResult, stokes: Tensor | None) -> None:
         """Add the next view, if it is one of those that are drawn; ``stokes`` [3, H, W, 3] as it is predicted."""
@@ -96,9 +94,8 @@ class ErrorSheet:
             pictures["normal"] = _heat(angles, target.surface.mask, NORMAL_HIGH)
         keep = target.valid if target.polarized is None else target.polarized
         predicted = None if stokes is None else stokes.cpu().nan_to_num()
-        self._rows.append((view.name, pictures))
         measured = view.stokes() if view.is_determined else None
-        self._stokes.append((measured, predicted, keep.mask.cpu()))
+        self._rows.append((view.name, pictures, measured, predicted, keep.mask.cpu()))
 
     def write(self, path: Path) -> None:
         """Write the sheet; nothing where no view was added."""
@@ -106,11 +103,13 @@ class ErrorSheet:
             return
         ends = {**dict.fromkeys(("final", "specular", "diffuse"), PICTURE_HIGH), "normal": NORMAL_HIGH}
         headings = dict(COLUMNS)
-        if any(measured is not None and predicted is not None for measured, predicted, _ in self._stokes):
+        if any(measured is not None and predicted is not None for _, _, measured, predicted, _ in self._rows):
             brightest, ends["stokes"] = self._draw_polarization()
             headings["measured"] = f"AoLP x DoLP / {brightest:g}"
-        keys = [key for key in COLUMNS if any(key in pictures for _, pictures in self._rows)]
-        rows: list[list[Picture | None]] = [[pictures.get(key) for key in keys] for _, pictures in self._rows]
+        keys = [key for key in COLUMNS if any(key in pictures for _, pictures, *_ in self._rows)]
+        rows: list[list[Picture | None]] = [
+            [pictures.get(key) for key in keys] for _, pictures, *_ in self._rows
+        ]
         bars = {
             key: figures.scale_bar(0.0, end, MAP, "deg" if key == "normal" else "")
             for key, end in ends.items()
@@ -119,7 +118,7 @@ class ErrorSheet:
         bars["photograph"] = figures.color_patch(NOT_COUNTED, "gray: not counted")
         sheet = contact_sheet(
             rows,
-            [name for name, _ in self._rows],
+            [name for name, *_ in self._rows],
             [headings[key] for key in keys],
             footer=[bars[key] for key in keys],
         )
@@ -127,11 +126,11 @@ class ErrorSheet:
 
     def _draw_polarization(self) -> tuple[float, float]:
         """Add the pictures of the polarization; the DoLP that is fully bright, and the end of the errors' scale."""
-        counted = [measured[:, keep] for measured, _, keep in self._stokes if measured is not None]
+        counted = [measured[:, keep] for _, _, measured, _, keep in self._rows if measured is not None]
         degrees = torch.cat([optics.dolp(optics.luminance(values)) for values in counted])
         brightest = min(max(_tenth_above(degrees), BRIGHTEST[0]), BRIGHTEST[1])
         high = _tenth_above(torch.cat([_size(values) for values in counted]))
-        for (_, pictures), (measured, predicted, keep) in zip(self._rows, self._stokes, strict=True):
+        for _, pictures, measured, predicted, keep in self._rows:
             if measured is None:
                 continue
             pictures["measured"] = _polarization(measured, brightest)
@@ -384,13 +383,10 @@ def _speed(run: ScoredRun, *, normals: bool = True, depth: bool = False) -> floa
     return frames_per_second(draw, run.scene.test_views)
 
 
-def _device(device: torch.device) -> str:
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else _native.simd()
-    return f"{device} ({name}, {_native.thread_count()} threads)"
-
-
 def _provenance(run: ScoredRun) -> dict[str, Any]:
     configuration = run.configuration
+    device = run.model.device
+    processor = torch.cuda.get_device_name(device) if device.type == "cuda" else _native.simd()
     return {
         "recipe": configuration.recipe,
         "seed": configuration.settings.seed,
@@ -401,7 +397,7 @@ def _provenance(run: ScoredRun) -> dict[str, Any]:
             "torch": torch.__version__,
             "python": platform.python_version(),
         },
-        "device": _device(run.model.device),
+        "device": f"{device} ({processor}, {_native.thread_count()} threads)",
         "downscale": configuration.downscale,
         "scene_hash": run.scene.digest,
         "scene": run.scene.name,

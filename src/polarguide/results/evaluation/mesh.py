@@ -72,15 +72,18 @@ def missing_package() -> str | None:
 
 def surface_scores(surface: Surface, views: Sequence[View]) -> dict[str, float]:
     """The scores of a mesh against views with true depths, of which some belong to the foreground."""
-    low, high, spacing = _object_box(views)
+    foreground = np.concatenate([true_points(view)[0] for view in views])
+    low = foreground.min(axis=0)
+    high = foreground.max(axis=0)
+    steps = [depth[front] / view.camera.fx for view in views for depth, front, _ in [_known(view)]]
+    spacing = float(torch.cat(steps).median())
     diagonal = float(np.linalg.norm(high - low))
     reach = BEHIND * diagonal
     finer = int(np.clip(np.ceil(spacing / (TRUE_SPACING * diagonal)), 1, FINEST)) if diagonal > 0 else 1
     points = [true_points(view, finer) for view in views]
     front, whole = (np.concatenate(parts) for parts in zip(*points, strict=True))
     inside = ((surface.vertices > low - reach) & (surface.vertices < high + reach)).all(axis=1)
-    used = inside | judged(surface.vertices, views, reach)
-    samples, areas = _sampled(surface, used, SPACING * diagonal)
+    samples, areas = _sampled(surface, inside | judged(surface.vertices, views, reach), SPACING * diagonal)
     counted = judged(samples, views, reach)
     judged_area = float(areas[counted].sum())
     scores: dict[str, float] = {}
@@ -123,13 +126,6 @@ def _inner(depth: Tensor, front: Tensor) -> Tensor:
     """Pixels [H, W] all of whose neighbors belong to the foreground, at similar depths."""
     inner = minimum_filter(front.numpy(), size=3, mode="nearest")
     return torch.from_numpy(inner & ~jumps(depth))
-
-
-def _object_box(views: Sequence[View]) -> tuple[Points, Points, float]:
-    """The corners [3] of the box of the foreground's true points, and the median distance of neighboring ones."""
-    points = np.concatenate([true_points(view)[0] for view in views])
-    steps = [depth[front] / view.camera.fx for view in views for depth, front, _ in [_known(view)]]
-    return points.min(axis=0), points.max(axis=0), float(torch.cat(steps).median())
 
 
 def _enlarged(values: Tensor, factor: int, mode: str) -> Tensor:

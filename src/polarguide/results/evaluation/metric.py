@@ -104,7 +104,7 @@ def _loaded(entry: EntryPoint) -> tuple[Metric, ...]:
     for metric in metrics:
         if not isinstance(metric, Metric):
             raise _unusable(entry, "metrics", repr(metric))
-        if not callable(metric.measure) or metric.of != "view" or not _is_name(metric.key):
+        if not callable(metric.measure) or metric.of != "view" or not str(metric.key).isidentifier():
             raise _unusable(entry, "a metric of views with a measure, its key a name", repr(metric.key))
         for name in ("label", "unit", "digits", "better", "shown", "timed", "factor"):
             where = f"plug-in {entry.name} ({entry.value}), {metric.key} ({name})"
@@ -112,10 +112,6 @@ def _loaded(entry: EntryPoint) -> tuple[Metric, ...]:
     return tuple(
         replace(metric, measure=_Guarded(entry, metric.measure)) for metric in metrics if metric.measure
     )
-
-
-def _is_name(key: object) -> bool:
-    return isinstance(key, str) and key.isidentifier()
 
 
 class _Guarded:

@@ -60,12 +60,16 @@ def decibels(error: float) -> float:
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
-def squared_error(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None) -> Tensor:
+def squared_error(
+    pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, *, aligned: bool = False
+) -> Tensor:
     """Mean squared error of shown pictures.
 
     Args:
         pred_linear, true_linear: [H, W, C] linear radiance.
         keep: [H, W] bool or a selection, the pixels that count; None counts all.
+        aligned: first multiply each channel by the one factor that brings it closest to the true picture in linear
+            least squares, so that a wrong overall brightness or tint costs nothing.
 
     Returns:
         [], NaN where no pixel counts.
@@ -73,7 +77,15 @@ def squared_error(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None) -
     Raises:
         ValueError: shapes that do not fit.
     """
-    return _shown_error(*_selected_values(pred_linear, true_linear, keep))
+    _check_pair(pred_linear, true_linear)
+    selection = _selected(keep, pred_linear)
+    pred = selection.pick(pred_linear.to(torch.float64))
+    true = selection.pick(true_linear.to(pred_linear.device, torch.float64))
+    if aligned:
+        energy = (pred * pred).sum(0)
+        lit = energy > 0
+        pred = pred * torch.where(lit, (pred * true).sum(0) / torch.where(lit, energy, 1.0), 1.0)
+    return ((shown(pred) - shown(true)) ** 2).mean()
 
 
 def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: Keep = None) -> Tensor:
@@ -168,20 +180,8 @@ def normal_within_11(pred: Tensor, true: Tensor, keep: Keep = None) -> Tensor:
 
 
 def layer_error(contribution: Tensor, true_s0: Tensor, keep: Keep, *, aligned: bool = False) -> Tensor:
-    """Mean squared error of one layer: what it adds to the final picture against half its true S0, both shown.
-
-    Args:
-        contribution: [H, W, 3] linear, the layer as it is added to the final picture (an S0/2).
-        true_s0: [H, W, 3] linear, the true S0 of the lobe.
-        keep: [H, W] bool or a selection, the pixels that count; None counts all.
-        aligned: first multiply each channel by the one factor that brings it closest to the true layer in linear
-            least squares, so that a wrong overall brightness or tint costs nothing.
-
-    Returns:
-        [], as ``squared_error``.
-    """
-    pred, true = _selected_values(contribution, true_s0 / 2, keep)
-    return _shown_error(pred * _channel_scales(pred, true) if aligned else pred, true)
+    """``squared_error`` of what a layer adds to the final picture (S0/2) against the true S0 of its lobe [H, W, 3]."""
+    return squared_error(contribution, true_s0 / 2, keep, aligned=aligned)
 
 
 def reflective_mask(specular: Tensor, s0: Tensor, mask: Tensor) -> Tensor:
@@ -198,29 +198,11 @@ def reflective_mask(specular: Tensor, s0: Tensor, mask: Tensor) -> Tensor:
     return mask & (specular.to(torch.float64).sum(-1) > REFLECTIVE_SHARE * s0.to(torch.float64).sum(-1))
 
 
-def _channel_scales(pred: Tensor, true: Tensor) -> Tensor:
-    """[C] least-squares factors of [P, C] values; 1 for a channel that is black."""
-    energy = (pred * pred).sum(0)
-    live = energy > 0
-    return torch.where(live, (pred * true).sum(0) / torch.where(live, energy, 1.0), 1.0)
-
-
-def _shown_error(pred: Tensor, true: Tensor) -> Tensor:
-    return ((shown(pred) - shown(true)) ** 2).mean()
-
-
 def _selected_angles(pred: Tensor, true: Tensor, keep: Keep) -> Tensor:
     if not isinstance(keep, Selection):
         directed = has_direction(true)
         keep = directed if keep is None else directed & keep.to(directed.device)
     return _selected(keep, pred).pick(normal_angles_deg(pred, true))
-
-
-def _selected_values(pred: Tensor, true: Tensor, keep: Keep) -> tuple[Tensor, Tensor]:
-    """The pixels that count as [P, C] float64, on the device of the prediction."""
-    _check_pair(pred, true)
-    selection = _selected(keep, pred)
-    return selection.pick(pred.to(torch.float64)), selection.pick(true.to(pred.device, torch.float64))
 
 
 def _selected(keep: Keep, picture: Tensor) -> Selection:

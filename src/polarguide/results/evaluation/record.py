@@ -10,6 +10,7 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
+from types import GenericAlias
 from typing import Annotated, Any, TypedDict
 
 import msgspec
@@ -19,7 +20,14 @@ from polarguide.core.files import write_text
 from polarguide.core.records import decode, read_record, shortened
 from polarguide.results.evaluation.metric import Metric
 from polarguide.results.evaluation.scores import ViewScores, summarize
-from polarguide.results.evaluation.table import HIGHEST_PSNR, METRICS, PLUGGED, RUN_METRICS, VIEW_METRICS
+from polarguide.results.evaluation.table import (
+    HIGHEST_PSNR,
+    METRICS,
+    OBJECT_METRICS,
+    PLUGGED,
+    RUN_METRICS,
+    VIEW_METRICS,
+)
 
 PACKAGE = Path(__file__).parents[2]
 COMMIT = "_commit.txt"
@@ -45,16 +53,12 @@ def code_digest(package: Path = PACKAGE, *, training: bool = False) -> str:
     """
     compiled = [path for path in package.glob("_native.*") if path.suffix != ".pyi"]
     bench = package.with_name(BENCH)
-    own = _modules(package)
-    neighbors = _modules(bench)
+    own = [*package.rglob("*.py")]
+    neighbors = [*bench.rglob("*.py")]
     if training:
         own = [path for path in own if path.relative_to(package).parts[0] not in NOT_TRAINING]
         neighbors = [path for path in neighbors if path.relative_to(bench).parts[0] in BENCH_TRAINING]
     return _digest(package.parent, [*own, *neighbors, *compiled])
-
-
-def _modules(package: Path) -> list[Path]:
-    return [*package.rglob("*.py")]
 
 
 def _digest(folder: Path, files: Sequence[Path]) -> str:
@@ -132,20 +136,20 @@ _VIEW_REASONS = ("lpips", "flip", "stokes_error")
 _RUN_REASONS = (*_VIEW_REASONS, "fps", "train_seconds", "peak_memory_mib", "mesh_fscore_1")
 
 
-class ObjectErrors(msgspec.Struct, kw_only=True):
-    """Errors over the pixels of an object, or of all objects of a class of material, in all test views."""
-
-    pixels: int
-    views: int
-    psnr: _Decibels
-    normal_mae_deg: float | None
-    specular_psnr: _Decibels
-    diffuse_psnr: _Decibels
-    stokes_error: float | None
-    material: str | None = None
-    metal_share: float | None = None
-
-
+_OBJECT = msgspec.defstruct(
+    "Object",
+    [
+        ("pixels", int),
+        ("views", int),
+        *_fields(tuple(metric for metric in METRICS if metric.key in OBJECT_METRICS)),
+        ("material", str | None, None),
+        ("metal_share", float | None, None),
+    ],
+    kw_only=True,
+)
+"""Errors over the pixels of an object, or of all objects of a class of material, in all test views."""
+_PARTS = GenericAlias(dict, (str, _OBJECT))
+"""Such errors by name."""
 _VIEW = msgspec.defstruct("View", _fields(VIEW_METRICS, *_VIEW_REASONS))
 _RUN = msgspec.defstruct(
     "Run",
@@ -153,8 +157,8 @@ _RUN = msgspec.defstruct(
         *_fields(METRICS, *_RUN_REASONS),
         ("views", Annotated[dict[str, Any], msgspec.Meta(min_length=1)]),
         ("provenance", Provenance),
-        ("objects", dict[str, ObjectErrors], msgspec.field(default_factory=dict)),
-        ("materials", dict[str, ObjectErrors], msgspec.field(default_factory=dict)),
+        ("objects", _PARTS, msgspec.field(default_factory=dict)),
+        ("materials", _PARTS, msgspec.field(default_factory=dict)),
     ],
     kw_only=True,
 )

@@ -43,20 +43,17 @@ def error_maps(target: ViewTarget, layers: Layers) -> dict[str, ErrorMap]:
         lobe = getattr(target, name)
         maps[f"{name}_psnr"] = _squared(layers[name], None if lobe is None else lobe / 2, target.foreground)
     normal = layers["normal"]
-    true = target.normal
-    surface = target.surface
-    maps["normal_mae_deg"] = None
-    if normal is not None and true is not None and surface is not None:
-        angles = torch.where(surface.mask, normal_angles_deg(normal, true), 0.0)
-        maps["normal_mae_deg"] = ErrorMap(angles, surface.mask.to(torch.float64))
+    if normal is not None and target.normal is not None and target.surface is not None:
+        keep = target.surface.mask
+        angles = torch.where(keep, normal_angles_deg(normal, target.normal), 0.0)
+        maps["normal_mae_deg"] = ErrorMap(angles, keep.to(torch.float64))
     stokes = layers.get("polarization")
     measured = target.polarization
-    keep = target.polarized
-    maps["stokes_error"] = None
-    if stokes is not None and measured is not None and keep is not None:
+    if stokes is not None and measured is not None and target.polarized is not None:
         errors = ((stokes - measured).abs().sum(dim=-1), measured.abs().sum(dim=-1))
-        maps["stokes_error"] = ErrorMap(*(torch.where(keep.mask, values, 0.0) for values in errors))
-    return {key: error for key in OBJECT_METRICS if (error := maps[key]) is not None}
+        keep = target.polarized.mask
+        maps["stokes_error"] = ErrorMap(*(torch.where(keep, values, 0.0) for values in errors))
+    return {key: error for key in OBJECT_METRICS if (error := maps.get(key)) is not None}
 
 
 def _squared(pred: Tensor | None, true: Tensor | None, keep: Selection | None) -> ErrorMap | None:
@@ -189,8 +186,10 @@ def score_view(
     if by_object is not None:
         by_object.add(target, layers)
     measures = {m.key: m.measure(target, layers) for m in VIEW_METRICS if m.measure is not None}
-    numbers = _numbers({"nonfinite_pixels": broken.sum(), **measures})
-    lost_pixels = int(numbers.pop("nonfinite_pixels"))
+    measured = {key: value.to(torch.float64) for key, value in measures.items() if value is not None}
+    # The only place where scoring waits for the device.
+    lost_pixels, *values = torch.stack([broken.sum().to(torch.float64), *measured.values()]).cpu().tolist()
+    numbers = dict(zip(measured, values, strict=True))
     scores: ViewScores = {}
     for metric in VIEW_METRICS:
         value = numbers.get(metric.key, math.nan)
@@ -201,10 +200,10 @@ def score_view(
     if flip_reason is not None:
         scores["flip_reason"] = flip_reason
     if scores["stokes_error"] is None:
-        measured = _NO_POLARIZATION if target.polarization is not None else _UNDETERMINED
-        scores["stokes_error_reason"] = _NO_LAYERS if stokes is None else measured
+        unmeasured = _NO_POLARIZATION if target.polarization is not None else _UNDETERMINED
+        scores["stokes_error_reason"] = _NO_LAYERS if stokes is None else unmeasured
     if lost_pixels:
-        scores["nonfinite_pixels"] = lost_pixels
+        scores["nonfinite_pixels"] = int(lost_pixels)
     return scores
 
 
@@ -230,13 +229,6 @@ def summarize(per_view: Mapping[str, ViewScores]) -> dict[str, float | str | Non
             reasons = (scores.get(f"{key}_reason") for scores in per_view.values())
             means[f"{key}_reason"] = next((reason for reason in reasons if reason), None)
     return means
-
-
-def _numbers(measures: Mapping[str, Tensor | None]) -> dict[str, float]:
-    """The values of tensors []; the only place where scoring waits for their device."""
-    present = {key: value.to(torch.float64) for key, value in measures.items() if value is not None}
-    values: list[float] = torch.stack(list(present.values())).cpu().tolist()
-    return dict(zip(present, values, strict=True))
 
 
 def _plain(layer: Tensor | None) -> Tensor | None:

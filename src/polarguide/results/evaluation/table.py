@@ -252,12 +252,12 @@ def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> li
 
 def explained(record: Mapping[str, Any]) -> list[str]:
     """Explanations of metrics that a table calls "n/a", a line each."""
-    lines = []
-    for metric in METRICS:
-        more = str(record.get(f"{metric.key}_reason") or "").partition(": ")[2]
-        if more and metric.shown == "tables" and record.get(metric.key) is None:
-            lines.append(f"{metric.label}: {more}")
-    return lines
+    reasons = {
+        metric.label: str(record.get(f"{metric.key}_reason") or "").partition(": ")[2]
+        for metric in METRICS
+        if metric.shown == "tables" and record.get(metric.key) is None
+    }
+    return [f"{label}: {more}" for label, more in reasons.items() if more]
 
 
 def _worst_view(record: Mapping[str, Any], metric: Metric) -> list[tuple[str, str]]:

@@ -215,9 +215,10 @@ class ViewTarget:
         """
         valid = torch.ones(photograph.shape[:2], dtype=torch.bool) if invalid is None else ~invalid
         mask = getattr(ground_truth, "mask", None)
-        names = ("normal", "specular", "diffuse")
-        maps = {name: None if mask is None else getattr(ground_truth, name, None) for name in names}
-        there = {name: None if values is None else _there(values, device) for name, values in maps.items()}
+        maps = {
+            name: None if mask is None else getattr(ground_truth, name, None)
+            for name in ("normal", "specular", "diffuse")
+        }
         foreground = None if mask is None else mask.to(torch.bool) & valid
         reflective = surface = None
         if foreground is not None and maps["specular"] is not None:
@@ -230,16 +231,16 @@ class ViewTarget:
             near = (valid if foreground is None else foreground) & (depth > 0)
             smooth = valid & without_jumps(depth)
         return cls(
-            photograph=_there(photograph, device),
+            photograph=photograph.detach().to(device, torch.float64),
             valid=Selection.of(valid, device),
             windows=Selection.of(window_centers(valid), device),
             foreground=_chosen(foreground, device),
             reflective=_chosen(reflective, device),
             surface=_chosen(surface, device),
-            normal=there["normal"],
-            specular=there["specular"],
-            diffuse=there["diffuse"],
-            depth=None if depth is None else _there(depth, device),
+            normal=_there(maps["normal"], device),
+            specular=_there(maps["specular"], device),
+            diffuse=_there(maps["diffuse"], device),
+            depth=_there(depth, device),
             near=_chosen(near, device),
             smooth=_chosen(smooth, device),
         )
@@ -252,9 +253,9 @@ class ViewTarget:
         truth = view.ground_truth
         polarization = polarized = None
         if view.is_determined:
-            polarization = _there(torch.cat(view.stokes()[1:].unbind(0), dim=-1), device)
+            polarization = torch.cat(view.stokes()[1:].unbind(0), dim=-1)
             counts = ~(view.invalid | view.saturated)
-            polarized = Selection.of(counts if masks is None else counts & masks[view.name], device)
+            polarized = counts if masks is None else counts & masks[view.name]
         owner = dielectric = None
         if facts.objects and truth is not None and truth.object_ids is not None:
             owner = torch.full_like(truth.object_ids, len(facts.objects), dtype=torch.int64)
@@ -267,12 +268,12 @@ class ViewTarget:
         alone = masks[view.name] if masks is not None and facts.object_only else None
         return replace(
             target,
-            polarization=polarization,
-            polarized=polarized,
+            polarization=_there(polarization, device),
+            polarized=_chosen(polarized, device),
             owner=None if owner is None else owner.to(device),
             dielectric=_chosen(dielectric, device),
-            mask=None if alone is None else _there(alone, device),
-            beyond=None if alone is None else Selection.of(outside(alone) & ~view.invalid, device),
+            mask=_there(alone, device),
+            beyond=_chosen(None if alone is None else outside(alone) & ~view.invalid, device),
             extent=facts.extent,
         )
 
@@ -294,8 +295,8 @@ def jumps(depth: Tensor) -> NDArray[np.bool_]:
     return np.asarray(high > JUMP * low)
 
 
-def _there(values: Tensor, device: torch.device) -> Tensor:
-    return values.detach().to(device).to(torch.float64)
+def _there(values: Tensor | None, device: torch.device) -> Tensor | None:
+    return None if values is None else values.detach().to(device).to(torch.float64)
 
 
 def _chosen(pixels: Tensor | None, device: torch.device) -> Selection | None:

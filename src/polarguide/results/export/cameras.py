@@ -16,7 +16,7 @@ from polarguide.visualization import figures
 TRANSFORMS = "transforms.json"
 
 
-def write_cameras(run: OpenedRun, presented: Presented, folder: Path, reporter: Reporter) -> list[Path]:
+def export_cameras(run: OpenedRun, presented: Presented, folder: Path, reporter: Reporter) -> list[Path]:
     """Write ``sparse/0`` (COLMAP), ``transforms.json`` and ``images/``: the photographs as the run was trained on them.
 
     The cameras are pinholes, so that photographs as a lens took them do not belong to them: a picture in ``images/`` is

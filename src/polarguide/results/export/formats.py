@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -33,7 +34,7 @@ from polarguide.core.options import (
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.optics.color import srgb_encode
 from polarguide.results.export.adapters import ply_fields
-from polarguide.results.export.cameras import write_cameras
+from polarguide.results.export.cameras import export_cameras
 from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
 from polarguide.results.export.model.build import BASE_COLORS, Charted, charted_subject, textured_model
 from polarguide.results.export.model.gltf import write_glb
@@ -105,10 +106,10 @@ def export(
     refuse_scene(folder)
     writers: dict[str, Callable[[], list[Path]]] = {
         "ply": lambda: _plys(run, presented, folder, fields),
-        "spz": lambda: [_spz(run, presented, folder / "splats.spz", spz_version)],
-        "sog": lambda: [_sog(run, presented, folder / "splats.sog")],
+        "spz": lambda: _spz(run, presented, folder, spz_version),
+        "sog": lambda: _sog(run, presented, folder),
         "splat-glb": lambda: _splat_glb(run, presented, folder),
-        "splat-usdz": lambda: _splat_usdz(run, presented, folder / "splats.usdz"),
+        "splat-usdz": lambda: _splat_usdz(run, presented, folder),
         "mesh": lambda: _mesh(run, presented, folder, resolution, reporter),
         "glb": lambda: _model(run, presented, folder, resolution, model, reporter, "glb"),
         "obj": lambda: _model(run, presented, folder, resolution, model, reporter, "obj"),
@@ -116,7 +117,7 @@ def export(
         "stl": lambda: _stl(run, presented, folder / "model.stl", resolution, model, reporter),
         "points": lambda: _points(run, presented, folder),
         "environment": lambda: _environment(run, presented, folder, reporter),
-        "cameras": lambda: write_cameras(run, presented, folder, reporter),
+        "cameras": lambda: export_cameras(run, presented, folder, reporter),
         "all": lambda: _all(run, presented, folder, resolution, spz_version, model, reporter),
     }
     check_choice("format", format, writers)
@@ -125,8 +126,9 @@ def export(
     check_choice("fields", fields, get_args(PlyFields))
     check_choice("axes", axes, get_args(Axes))
     if fields != "release" and format != "ply":
-        expected = "release, but for --format ply"
-        raise PolarguideError("fields", expected=expected, found=fields, remedy="Leave it out.")
+        raise PolarguideError(
+            "fields", expected="release, but for --format ply", found=fields, remedy="Leave it out."
+        )
     # Formats without Gaussians print no number of them.
     heard = SILENT if format in ("environment", "cameras") else reporter
     presented = Presented(run, axes=axes, masked=model.masked, reporter=heard)
@@ -154,13 +156,12 @@ def _ply(
     with temporary_folder(path.with_suffix(".whole")) as folder:
         whole = folder / path.name
         model = run.model
-        color = presented.presentation.color
         write_run_ply(
             whole,
             model.state,
             model.shading,
             presented.centers,
-            color=color,
+            color=presented.presentation.color,
             linear=linear,
             own_fields=ply_fields(model.shading, model.state.gaussians) if own_fields else {},
         )
@@ -169,24 +170,32 @@ def _ply(
     return path
 
 
-def _spz(run: OpenedRun, presented: Presented, path: Path, version: int) -> Path:
-    """From a PLY that is then deleted. In units of the scene: its positions are multiples of 1/4096 of a unit."""
-    with temporary_folder(path.with_suffix(".ply")) as place:
-        ply = _ply(
-            run, presented, place / "splats.ply", replace(presented.placement, scale=1.0, metric=False)
-        )
-        write_spz(path, ply, version)
-    return path
+def _from_ply(
+    run: OpenedRun,
+    presented: Presented,
+    path: Path,
+    write: Callable[[Path, Path], None],
+    placement: Placement | None = None,
+) -> list[Path]:
+    """Write a file by a function of its path and of a temporary PLY."""
+    with temporary_folder(path.with_suffix(".ply")) as parts:
+        write(path, _ply(run, presented, parts / "splats.ply", placement))
+    return [path]
 
 
-def _sog(run: OpenedRun, presented: Presented, path: Path) -> Path:
-    """From a PLY that is then deleted."""
+def _spz(run: OpenedRun, presented: Presented, folder: Path, version: int) -> list[Path]:
+    """In units of the scene: positions of the format are multiples of 1/4096 of a unit."""
+    placement = replace(presented.placement, scale=1.0, metric=False)
+    return _from_ply(run, presented, folder / "splats.spz", partial(write_spz, version=version), placement)
+
+
+def _sog(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
     credit = presented.presentation.credit
-    about = {"extras": {**presented.origin.record(), **presented.placement.record()}}
-    with temporary_folder(path.with_suffix(".ply")) as place:
-        ply = _ply(run, presented, place / "splats.ply")
-        write_sog(path, ply, {**({"copyright": credit} if credit else {}), **about})
-    return path
+    asset = {
+        **({"copyright": credit} if credit else {}),
+        "extras": {**presented.origin.record(), **presented.placement.record()},
+    }
+    return _from_ply(run, presented, folder / "splats.sog", partial(write_sog, asset=asset))
 
 
 def _splat_glb(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
@@ -200,13 +209,11 @@ def _splat_glb(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]
     return [*paths.values()]
 
 
-def _splat_usdz(run: OpenedRun, presented: Presented, path: Path) -> list[Path]:
-    """From a PLY that is then deleted; colors are encoded, as USD leaves open."""
+def _splat_usdz(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
+    """Colors are encoded: USD leaves their space open."""
     place = presented.upright(run)
-    with temporary_folder(path.with_suffix(".ply")) as parts:
-        ply = _ply(run, presented, parts / "splats.ply", place)
-        write_splat_usdz(path, ply, asset_record(place, presented.origin))
-    return [path]
+    about = asset_record(place, presented.origin)
+    return _from_ply(run, presented, folder / "splats.usdz", partial(write_splat_usdz, about=about), place)
 
 
 def _mesh(
@@ -247,8 +254,7 @@ def _charted(
 ) -> Charted:
     view = presented.surface_view(run)
     with temporary_folder(folder / kind) as parts:
-        inside = presented.subject.inside
-        return charted_subject(run, view, inside, options, resolution, parts, reporter)
+        return charted_subject(run, view, presented.subject.inside, options, resolution, parts, reporter)
 
 
 def _textured(
@@ -320,8 +326,8 @@ def _all(
         for chosen in (lit, unlit):
             _textured(run, presented, parts, subject, chosen, reporter, "glb")
         _ply(run, presented, parts / "splats.ply")
-        _spz(run, presented, parts / "splats.spz", spz_version)
-        _sog(run, presented, parts / "splats.sog")
+        _spz(run, presented, parts, spz_version)
+        _sog(run, presented, parts)
         _splat_glb(run, presented, parts)
         if radiant:
             _environment(run, presented, parts, reporter)

@@ -120,13 +120,17 @@ def write_splat_usdz(path: Path, ply: Path, about: dict[str, Any]) -> None:
 
     def fill(stage: Any, _: Path) -> None:
         field = kind.Define(stage, f"{ROOT}/splats")
-        field.CreatePositionsAttr(vt.Vec3fArray.FromNumpy(gaussians["means"].numpy()))
-        field.CreateExtentAttr(vt.Vec3fArray.FromNumpy(corners.numpy()))
-        field.CreateScalesAttr(vt.Vec3fArray.FromNumpy(scales.numpy()))
+        vectors = {
+            "Positions": gaussians["means"],
+            "Extent": corners,
+            "Scales": scales,
+            "RadianceSphericalHarmonicsCoefficients": harmonics,
+        }
+        for name, values in vectors.items():
+            getattr(field, f"Create{name}Attr")(vt.Vec3fArray.FromNumpy(values.numpy()))
         field.CreateOrientationsAttr(vt.QuatfArray.FromNumpy(turns.contiguous().numpy()))
         field.CreateOpacitiesAttr(vt.FloatArray.FromNumpy(torch.sigmoid(gaussians["opacity_logits"]).numpy()))
         field.CreateRadianceSphericalHarmonicsDegreeAttr(3)
-        field.CreateRadianceSphericalHarmonicsCoefficientsAttr(vt.Vec3fArray.FromNumpy(harmonics.numpy()))
 
     _package(path, about, fill)
 

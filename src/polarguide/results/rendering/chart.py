@@ -8,7 +8,7 @@ stated as CIEDE2000 of each patch by the matrix that the others give.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -29,6 +29,8 @@ LAB: Floats = np.array([
     (50.63, 51.28, -14.12), (49.57, -29.71, -28.32), (95.19, -1.03, 2.93), (81.29, -0.57, 0.44),
     (66.89, -0.75, -0.06), (50.76, -0.13, 0.14), (35.63, -0.46, -0.48), (20.64, 0.07, -0.46),
 ])  # fmt: skip
+_ORDERS = [[(begin + step * k) % 4 for k in range(4)] for begin in range(4) for step in (1, -1)]
+"""The eight ways to go around four corners."""
 COLUMNS = 6
 ROWS = 4
 XYZ_OF_SRGB: Floats = np.array(
@@ -36,28 +38,28 @@ XYZ_OF_SRGB: Floats = np.array(
 )
 """Linear sRGB to XYZ under D50, adapted after Bradford (Lindbloom, "RGB/XYZ matrices")."""
 HALF_PATCH = 0.25
-"""Of the distance of two patches, to each side of a center: what is surely of the patch."""
+"""Half width of the evaluated square of a patch, in units of the distance of two patches."""
 LEAST_PIXELS = 16
-"""Of a patch, so that noise and the mosaic's colors do not decide."""
+"""Least number of pixels of a patch, against noise and the mosaic's colors."""
 LEAST_PATCHES = 18
-"""Twice the unknowns of the matrix in patches: a row of grays or a column may clip or lie in shade."""
+"""Least number of patches, twice the unknowns of the matrix."""
 WORST_FIT = 6.0
-"""Mean CIEDE2000: matrices of cameras leave 1 to 4; beyond, corners, chart or light are others."""
+"""Largest mean CIEDE2000. Cameras reach 1 to 4; a larger error means wrong corners, another chart or uneven light."""
 
 
 def chart_of(view: View, corners: Sequence[float]) -> Chart:
-    """What a chart in a photograph says of the camera and the light.
+    """Return the color matrix of a photograph with a color chart.
 
     Args:
-        view: whose photograph shows the chart. corners: x, y of the centers of the four corner patches in pixels, four
-            times, around the chart, from any of them: the order that fits best is taken.
+        view: view whose photograph shows the chart.
+        corners: x, y in pixels of the centers of the four corner patches, around the chart, from any of them.
 
     Raises:
-        PolarguideError: patches clip, are too small or too few, or no order fits.
+        PolarguideError: patches clip, are too small or too few, or no order of the corners fits.
     """
     quad = np.array(corners, dtype=np.float64).reshape(4, 2)
     fits = []
-    for order in _orders():
+    for order in _ORDERS:
         colors = _patches(view, quad[order])
         used = np.asarray(np.isfinite(colors).all(axis=1))
         fits.append((_distance(_linear(colors[used], used), colors[used], used), colors, used))
@@ -82,15 +84,8 @@ def chart_of(view: View, corners: Sequence[float]) -> Chart:
     return Chart((red, green, blue), float(errors.mean()), float(errors.max()), int(used.sum()), view.name)
 
 
-def _orders() -> Iterator[list[int]]:
-    """The eight ways to go around four corners."""
-    for begin in range(4):
-        for step in (1, -1):
-            yield [(begin + step * k) % 4 for k in range(4)]
-
-
 def _patches(view: View, quad: Floats) -> Floats:
-    """Mean linear colors of the patches, [24, 3]; NaN where one clips, is invalid or too small."""
+    """Return the mean linear colors of the patches, [24, 3]; NaN for clipped, invalid and too small patches."""
     ends = np.array([(0, 0), (COLUMNS - 1, 0), (COLUMNS - 1, ROWS - 1), (0, ROWS - 1)], np.float32)
     to_chart = cv2.getPerspectiveTransform(quad.astype(np.float32), ends)
     camera = view.camera
@@ -113,7 +108,7 @@ def _patches(view: View, quad: Floats) -> Floats:
 
 
 def _linear(colors: Floats, used: NDArray[np.bool_]) -> Floats:
-    """The matrix [3, 3] of least squares in linear sRGB; zero where there are too few patches."""
+    """Return the least-squares matrix [3, 3] in linear sRGB, or zeros if there are too few patches."""
     if len(colors) < LEAST_PATCHES:
         return np.zeros((3, 3))
     wanted = _skimage().lab2xyz(LAB, illuminant="D50")[used] @ np.linalg.inv(XYZ_OF_SRGB).T
@@ -125,7 +120,7 @@ def _lab(matrix: Floats, colors: Floats) -> Floats:
 
 
 def _distance(matrix: Floats, colors: Floats, used: NDArray[np.bool_]) -> float:
-    """Mean CIEDE2000 of what a matrix makes of colors."""
+    """Return the mean CIEDE2000 of colors after a matrix."""
     if not len(colors):
         return np.inf
     return float(_skimage().deltaE_ciede2000(LAB[used], _lab(matrix, colors)).mean())
@@ -139,12 +134,15 @@ def _fitted(colors: Floats, used: NDArray[np.bool_]) -> Floats:
 
 
 def _left_out(colors: Floats, used: NDArray[np.bool_]) -> Floats:
-    """CIEDE2000 of each patch that is used, by the matrix of the others."""
-    errors = []
-    for patch in np.flatnonzero(used):
-        one = np.arange(len(LAB)) == patch
-        errors.append(_distance(_fitted(colors[used & ~one], used & ~one), colors[one], one))
-    return np.array(errors)
+    """Return the CIEDE2000 of each used patch by the matrix of the others."""
+    one = np.eye(len(LAB), dtype=bool)
+    others = used & ~one
+    return np.array(
+        [
+            _distance(_fitted(colors[others[k]], others[k]), colors[one[k]], one[k])
+            for k in np.flatnonzero(used)
+        ]
+    )
 
 
 def _skimage() -> Any:

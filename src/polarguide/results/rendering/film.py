@@ -1,4 +1,4 @@
-"""A run along a path of cameras, as a video (MP4, H.264) or as pictures."""
+"""Rendering of a run along a camera path, as a video (MP4, H.264) or as pictures."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from polarguide.visualization.layers import layer_picture
 
 
 def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: float) -> int:
-    """Write uint8 RGB pictures [H, W, 3] of one size; odd sides lose their last row or column, as H.264 wants.
+    """Write uint8 RGB pictures [H, W, 3] of one size as a video. Odd sides lose their last row or column for H.264.
 
     Returns:
-        How many were written.
+        The number of written pictures.
 
     Raises:
         PolarguideError: imageio-ffmpeg is not installed, or the encoder fails.
@@ -71,48 +71,48 @@ def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: f
         finally:
             if writer is not None:
                 with contextlib.suppress(OSError, RuntimeError):
-                    writer.close()  # the encoder would go on to write what is unlinked here
+                    writer.close()  # the encoder would continue to write the unlinked file
             named.unlink(missing_ok=True)
     return count
 
 
 def _require_whole(encoder: Any, path: Path, count: int) -> None:
-    """Check the number of frames of a video: the encoder is another program, and does not report a full disk.
+    """Check the number of frames of a video. The encoder is another program, and does not report a full disk.
 
     Raises:
-        OSError: there are fewer than were written.
+        OSError: frames are missing.
     """
     try:
         frames, _ = encoder.count_frames_and_secs(path)
-    except RuntimeError:  # it cannot be read at all
+    except RuntimeError:  # the file cannot be read
         frames = 0
     if frames != count:
         raise OSError(f"a file of {frames} of {count} pictures, as on a full disk")
 
 
 SWINGS = {"orbit": 0.0, "spiral": 0.25}
-"""Paths around the scene: by what share of the cameras' distance they go up and down."""
+"""Vertical amplitude of paths around the scene, in units of the cameras' distance."""
 FILLED = 0.9
-"""Share of the subject's Gaussians, the innermost, that a turntable has in its pictures from all sides."""
+"""Share of the subject's Gaussians, the innermost, that every picture of a turntable contains."""
 FRAMES_PER_SECOND = 30.0
 RENDERED = 160
-"""Bytes that a pixel takes at least while it is rendered: layers, and what they are made of."""
+"""Least number of bytes per pixel during rendering."""
 
 
 def path_cameras(
     run: OpenedRun, path: str, frames: int, size: tuple[int, int] | None = None
 ) -> tuple[list[Camera], float]:
-    """Cameras of a path, and their frames a second.
+    """Return the cameras of a path, and their frames per second.
 
     Args:
-        run: its cameras are the ones to move around.
+        run: the run whose cameras define the path.
         path: ``orbit``, ``turntable`` (around the subject, so near that it fills the picture), ``spiral``,
             ``interpolate``, or a JSON file of cameras.
-        frames: how many, except of a file.
-        size: width and height of the pictures, except of a file; None: the photographs'.
+        frames: number of cameras, except of a file.
+        size: width and height of the pictures, except of a file; None: those of the photographs.
 
     Raises:
-        PolarguideError: too many frames, a size for a file, which has its own, or a file that cannot be read.
+        PolarguideError: too many frames, a size for a file, or a file that cannot be read.
     """
     check_finite("frames", frames, 1, 100_000)
     cameras = list(run.cameras.values())
@@ -140,9 +140,12 @@ def _turntable(run: OpenedRun, cameras: list[Camera], frames: int) -> list[Camer
     center = inner.median(dim=0).values
     radius = float((inner - center).norm(dim=1).quantile(FILLED))
     lens = cameras[0]
-    narrow = min(lens.width / lens.fx, lens.height / lens.fy) / 2
-    distance = radius / math.sin(math.atan(narrow))
-    return orbit(cameras, frames, around=replace(run.frame, center=center), distance=distance)
+    return orbit(
+        cameras,
+        frames,
+        around=replace(run.frame, center=center),
+        distance=radius / math.sin(math.atan(min(lens.width / lens.fx, lens.height / lens.fy) / 2)),
+    )
 
 
 def write_film(
@@ -155,17 +158,18 @@ def write_film(
     size: tuple[int, int] | None = None,
     reporter: Reporter = SILENT,
 ) -> None:
-    """Render layers of the subject side by side along a path; in a video of several layers, with their names.
+    """Render layers of the subject side by side along a path. A video of several layers shows their names.
 
     Args:
         run: the run; its scene is read.
         out: MP4 file to write, or a folder for PNG files.
-        path, frames: those of the cameras; see ``path_cameras``.
+        path, frames: see ``path_cameras``.
         size: width and height of the film, all layers together; None: each layer has the photographs' size.
         layers: names of layers.
+        reporter: receives the progress.
 
     Raises:
-        PolarguideError: a layer that the recipe has not, cameras of several sizes, or a video that cannot be encoded.
+        PolarguideError: a layer does not exist, the cameras have several sizes, or the video cannot be encoded.
     """
     out = Path(out)
     names = checked_layers(list(layers))
@@ -183,11 +187,14 @@ def write_film(
             remedy="Give all the same width and height.",
         )
     width, height = sizes[0]
-    remedy = "Give the cameras of the path a smaller width and height."
-    require_memory(Path(path), RENDERED * width * height, f"pictures of {width}x{height}", remedy=remedy)
-    named = out.suffix.lower() == ".mp4" and len(names) > 1
-    pictures = _pictures(run, names, cameras, reporter, named=named)
-    if size is not None:  # a width that the layers do not share evenly ends with black columns
+    require_memory(
+        Path(path),
+        RENDERED * width * height,
+        f"pictures of {width}x{height}",
+        remedy="Give the cameras of the path a smaller width and height.",
+    )
+    pictures = _pictures(run, names, cameras, reporter, named=out.suffix.lower() == ".mp4" and len(names) > 1)
+    if size is not None:  # the remainder of the width is black
         rest = size[0] % len(names)
         pictures = (np.pad(picture, ((0, 0), (0, rest), (0, 0))) for picture in pictures)
     if out.suffix.lower() == ".mp4":
@@ -205,7 +212,7 @@ def write_film(
 def _pictures(
     run: OpenedRun, layers: list[str], cameras: list[Camera], reporter: Reporter, *, named: bool
 ) -> Iterator[Picture]:
-    """Layers side by side, a picture for each camera, with their names where these are wanted."""
+    """Yield a picture of the layers side by side for each camera, with their names if requested."""
     within = part_shown(run, reporter)
     depths = rendered_depths(run, cameras, within) if "depth" in layers else None
     color = run.presentation.color

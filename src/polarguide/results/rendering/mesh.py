@@ -21,8 +21,8 @@ from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.vectors import dot, unit
 from polarguide.shading.result import RenderResult
 
-TRUNCATION = 4.0  # voxels
-_SLAB = 1 << 21  # voxels at a time
+TRUNCATION = 4.0  # number of voxels
+_SLAB = 1 << 21  # number of voxels per batch
 _BOX_POINTS = 1 << 20
 """Points of all views together that the box is found from, about; all of a large capture would take gigabytes."""
 
@@ -49,23 +49,23 @@ class Surface:
     normals: NDArray[np.float64]
 
     def with_faces(self, faces: NDArray[np.int64]) -> tuple[Surface, NDArray[np.int64]]:
-        """The surface of some of the faces, and which of the vertices it has, [K]."""
+        """Return the surface of some of the faces, and the indices of its vertices, [K]."""
         used, numbers = np.unique(faces, return_inverse=True)
         return Surface(self.vertices[used], numbers.reshape(faces.shape), self.normals[used]), used
 
 
 def seen_points(camera: Camera, depth: Tensor, mask: Tensor) -> Tensor:
-    """World points [M, 3] float64 of the pixels in ``mask`` [H, W] at camera depths [H, W]."""
+    """Return the world points [M, 3] float64 of the pixels in ``mask`` [H, W] at camera depths [H, W]."""
     rays = camera.rays()[mask].double()
     local = rays * (depth[mask].double() / rays[:, 2])[:, None]
     return camera.to_world(local) + camera.center
 
 
 def box_around(points: Sequence[Tensor], center: Tensor, reach: float, resolution: int) -> Box:
-    """The box of what the cameras look at: points [M, 3] within ``reach`` of the center, without their outermost 0.5 %.
+    """Return the box of points [M, 3] within ``reach`` of the center, without the outermost 0.5 %.
 
     Raises:
-        PolarguideError: nothing is there.
+        PolarguideError: there are too few points.
     """
     near = torch.cat([p[(p - center).norm(dim=1) < reach] for p in points])
     if len(near) < 100:
@@ -83,13 +83,16 @@ def box_around(points: Sequence[Tensor], center: Tensor, reach: float, resolutio
 
 
 def fuse(box: Box, views: Iterable[tuple[Camera, Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    """Mean signed distance in truncations, in [-1, 1], positive before the surface; and how many views saw each voxel.
+    """Fuse depth maps to a truncated signed distance field.
 
     Args:
-        box: the grid. views: camera, camera depth [H, W] and where it counts [H, W] bool.
+        box: the grid.
+        views: camera, camera depth [H, W], and valid pixels [H, W] bool.
 
     Returns:
-        Both of the grid's shape, float32.
+        The mean distance in truncations, in [-1, 1], positive in front of the surface; and the number of views that
+        saw
+        each voxel. Both have the grid's shape, float32.
     """
     total = torch.zeros(box.counts)
     weight = torch.zeros(box.counts)
@@ -124,16 +127,17 @@ def fuse(box: Box, views: Iterable[tuple[Camera, Tensor, Tensor]]) -> tuple[Tens
 
 
 LEAST_VIEWS = 2
-"""Number of views that must have seen a voxel."""
+"""Least number of views that must have seen a voxel."""
 SMALLEST_PIECE = 0.01
-"""Pieces with fewer faces than this share of the largest piece are dropped."""
+"""Share of the largest piece's faces below which pieces are dropped."""
 
 
-def surface_of(box: Box, field: Tensor, weight: Tensor) -> Surface:
-    """The zero set where enough views looked, without small loose pieces (marching cubes, Lewiner et al. 2003).
+def zero_surface(box: Box, field: Tensor, weight: Tensor) -> Surface:
+    """Return the zero set of a distance field, without small loose pieces (marching cubes, Lewiner et al. 2003).
 
     Args:
-        field, weight: as of ``fuse``.
+        box: the grid.
+        field, weight: results of ``fuse``.
 
     Raises:
         PolarguideError: scikit-image is not installed, or there is no surface.
@@ -143,7 +147,7 @@ def surface_of(box: Box, field: Tensor, weight: Tensor) -> Surface:
     ).marching_cubes
     certain = (weight >= LEAST_VIEWS).numpy()
     try:
-        # Its normals point to smaller values, into the surface; with "descent" its faces turn outward.
+        # The returned normals point to smaller values, into the surface; with "descent" the faces turn outward.
         vertices, faces, inward, _ = marching_cubes(
             field.numpy(), 0.0, mask=certain, gradient_direction="descent"
         )
@@ -156,12 +160,12 @@ def surface_of(box: Box, field: Tensor, weight: Tensor) -> Surface:
 
 
 def largest_pieces(surface: Surface, smallest: float) -> Surface:
-    """The connected pieces that have at least a share of the largest one's faces."""
+    """Return the connected pieces that have at least a share of the largest piece's faces."""
     return surface.with_faces(large_faces(surface, smallest))[0]
 
 
 def large_faces(surface: Surface, smallest: float) -> NDArray[np.int64]:
-    """The faces [F, 3] of these pieces."""
+    """Return the faces [F, 3] of these pieces."""
     count = len(surface.vertices)
     ends = surface.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
     graph = coo_matrix((np.ones(len(ends), dtype=np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
@@ -171,11 +175,11 @@ def large_faces(surface: Surface, smallest: float) -> NDArray[np.int64]:
 
 
 RESOLUTION = 192
-"""Voxels along the longest side, unless something else is asked for."""
+"""Default number of voxels along the longest side."""
 OPAQUE = 0.8
 COARSE = 64
-"""Voxels along the sides of the box in which a field's surface is looked for."""
-# Pixels whose surface is seen at a flatter angle than this cosine do not give depth.
+"""Number of voxels along the sides of the box in which a field's surface is searched."""
+# Least cosine of the viewing angle of pixels with a valid depth.
 _STEEPEST = 0.1
 
 
@@ -187,7 +191,7 @@ class ColoredMesh:
     colors: NDArray[np.float64]
 
     def within(self, vertices: NDArray[np.bool_]) -> ColoredMesh:
-        """The faces all of whose vertices are kept, [V] bool, without the small pieces that the cut leaves.
+        """Return the faces whose vertices are all kept, [V] bool, without the small pieces that the cut leaves.
 
         Raises:
             PolarguideError: there are none.
@@ -206,11 +210,11 @@ class ColoredMesh:
 def scene_mesh(
     cameras: Mapping[str, Camera], render: Callable[[Camera], RenderResult], *, resolution: int
 ) -> ColoredMesh:
-    """Colored mesh of a scene, fused from depth maps of its cameras.
+    """Return the colored mesh of a scene, fused from depth maps of its cameras.
 
     Args:
         cameras: at least two cameras.
-        render: function that renders a camera's depth and normals.
+        render: renders a camera's depth and normals.
         resolution: number of voxels along the longest side of the box that the cameras see.
 
     Raises:
@@ -224,28 +228,25 @@ def scene_mesh(
 def fused_surface(
     cameras: Mapping[str, Camera], render: Callable[[Camera], RenderResult], *, resolution: int
 ) -> tuple[Surface, list[tuple[Camera, DepthSamples]], Box]:
-    """The surface of ``scene_mesh`` before it is painted, what each camera saw of it, and the grid it was fused in."""
+    """Return the unpainted surface of ``scene_mesh``, the depth samples of each camera, and the grid."""
     optional_import("skimage.measure", "a mesh")
     views = [(camera, _depth_samples(render(camera).to("cpu"), camera)) for camera in cameras.values()]
     around = scene_frame(list(cameras.values()))
-    points = [
-        _some(seen_points(camera, samples.depth, samples.mask), _BOX_POINTS // len(views))
-        for camera, samples in views
-    ]
+    points = []
+    for camera, samples in views:
+        places = seen_points(camera, samples.depth, samples.mask)
+        points.append(places[:: max(1, -(-len(places) // (_BOX_POINTS // len(views))))].clone())
     box = box_around(points, around.center, around.distance, resolution)
     field, weight = fuse(box, ((camera, samples.depth, samples.mask) for camera, samples in views))
-    return surface_of(box, field, weight), views, box
-
-
-def _some(points: Tensor, count: int) -> Tensor:
-    """At most ``count`` of points [M, 3], evenly."""
-    return points[:: max(1, -(-len(points) // count))].clone()
+    return zero_surface(box, field, weight), views, box
 
 
 @dataclass(frozen=True, eq=False)
 class DepthSamples:
-    """Of one view: depth [H, W], where it counts [H, W], diffuse color and world normal [H, W, 3] in half precision,
-    since all views are held together."""
+    """Samples of one view: depth [H, W], valid pixels [H, W], diffuse color and world normal [H, W, 3].
+
+    Colors and normals have half precision, since all views are in memory together.
+    """
 
     depth: Tensor
     mask: Tensor
@@ -263,7 +264,7 @@ def _depth_samples(result: RenderResult, camera: Camera) -> DepthSamples:
 
 
 def painted(surface: Surface, views: list[tuple[Camera, DepthSamples]], box: Box) -> ColoredMesh:
-    """Colors and normals of the views that see each vertex, weighted by how squarely they do."""
+    """Return a mesh with colors and normals averaged over the views of each vertex, weighted by the viewing angle."""
     vertices = torch.from_numpy(surface.vertices)
     own = torch.from_numpy(surface.normals)
     color = torch.zeros_like(vertices)
@@ -277,7 +278,7 @@ def painted(surface: Surface, views: list[tuple[Camera, DepthSamples]], box: Box
         color += weight[:, None] * samples.diffuse[pixel]
         normal += weight[:, None] * samples.normal[pixel]
         total += weight
-    # What no view sees squarely keeps the normal of its surface, and the color gray.
+    # Vertices without a view keep the normal of the surface, and are gray.
     learned = unit(normal, 1e-9)
     agrees = (total > 0) & (dot(learned, own) > 0)
     normals = torch.where(agrees[:, None], learned, own)

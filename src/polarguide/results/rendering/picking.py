@@ -1,4 +1,4 @@
-"""Picking: a place on the surface, its normal, its color; and gains that make a color gray."""
+"""Surfaces and colors at picked places, and gains of a white balance."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import unit
 from polarguide.shading.result import RenderResult
 
-SEEN = 0.5  # alpha from which there is a surface
+SEEN = 0.5  # alpha of a surface
 LEAST_GAIN = 0.02
 MOST_GAIN = 50.0
-# of a color that may be picked as white
+# limits of a color that may be picked as white
 DARKEST = 2e-3
 BRIGHTEST = 0.98
-PATCH = 2  # pixels to each side over which a picked color is averaged
+PATCH = 2  # radius in pixels over which a picked color is averaged
 
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoint:
-    """A place on the surface.
+    """A picked place of a surface.
 
     Attributes:
-        point: [3] float64 in the world. normal: [3] float64 unit, toward the camera, or None where none is known.
+        point: [3] float64 in the world.
+        normal: [3] float64 unit, toward the camera; None: unknown.
         color: [3] linear radiance of the final layer around it.
     """
 
@@ -39,10 +40,11 @@ class SurfacePoint:
 
 
 def surface_at(result: RenderResult, camera: Camera, x: float, y: float) -> SurfacePoint | None:
-    """The surface at a place of a rendering with depth; None outside the picture, or where there is no surface.
+    """Return the surface at a place of a rendering with depth, or None outside the picture and without a surface.
 
     Args:
-        result: with the size of the camera. camera: it was rendered with.
+        result: the rendering, with the size of the camera.
+        camera: its camera.
         x, y: pixels from the top left corner; the center of the first pixel is (0.5, 0.5).
     """
     if not (0 <= x < camera.width and 0 <= y < camera.height):
@@ -65,7 +67,7 @@ def surface_at(result: RenderResult, camera: Camera, x: float, y: float) -> Surf
 
 
 def photograph_color(view: View, x: float, y: float) -> Tensor:
-    """The mean color [3] of a photograph's valid pixels around a place, see ``surface_at``.
+    """Return the mean color [3] of a photograph's valid pixels around a place; see ``surface_at``.
 
     Raises:
         PolarguideError: the place lies outside, or no pixel there is valid.
@@ -92,17 +94,17 @@ def photograph_color(view: View, x: float, y: float) -> Tensor:
 
 
 def _patch(picture: Tensor, row: int, column: int) -> Tensor:
-    """[h, w, ...] around a pixel."""
+    """Return the pixels [h, w, ...] around a pixel."""
     top = max(0, row - PATCH)
     left = max(0, column - PATCH)
     return picture[top : row + PATCH + 1, left : column + PATCH + 1]
 
 
-def gains_of(color: Tensor) -> Vector:
-    """Gains that make a linear color [3] gray and leave green as it is, as cameras state their white balance.
+def white_balance_gains(color: Tensor) -> Vector:
+    """Return gains that make a linear color [3] gray, relative to green, like the white balance of a camera.
 
     Raises:
-        PolarguideError: the color is too dark, clips, or is no gray under any usual light.
+        PolarguideError: the color is too dark, clips, or is not gray under any usual light.
     """
     values = [float(value) for value in color]
     if not (min(values) > 0 and max(values) >= DARKEST and max(values) <= BRIGHTEST):
@@ -124,11 +126,11 @@ def gains_of(color: Tensor) -> Vector:
     return gains[0], 1.0, gains[2]
 
 
-def gray_world(views: Iterable[View]) -> Vector:
-    """Gains after which the photographs' mean is gray (Buchsbaum 1980), over valid pixels; green stays.
+def gray_world_gains(views: Iterable[View]) -> Vector:
+    """Return gains that make the photographs' mean over valid pixels gray (Buchsbaum 1980), relative to green.
 
     Raises:
-        PolarguideError: there are no such pixels, or all are black.
+        PolarguideError: there are no valid pixels, or all are black.
     """
     total = torch.zeros(3, dtype=torch.float64)
     count = 0
@@ -137,5 +139,5 @@ def gray_world(views: Iterable[View]) -> Vector:
         total += view.photograph()[valid].double().sum(dim=0)
         count += int(valid.sum())
     mean = total / max(count, 1)
-    # The gains do not depend on how bright the pictures are: black around an object changes nothing.
-    return gains_of(0.5 * mean / max(float(mean.max()), 1e-12))
+    # The gains do not depend on the brightness: black around an object changes nothing.
+    return white_balance_gains(0.5 * mean / max(float(mean.max()), 1e-12))

@@ -1,4 +1,4 @@
-"""Layers of a run's views as PNG files, with a contact sheet beside the ground truth."""
+"""Layers of a run's views as files, with a contact sheet next to the ground truth."""
 
 from __future__ import annotations
 
@@ -54,14 +54,14 @@ UNITS = {
     "aolp": "predicted angle of linear polarization, radians from 0 to pi, counter-clockwise from the picture's "
     "horizontal",
 }
-"""What the numbers of each layer mean."""
+"""Meaning of the numbers of each layer."""
 
 
-def select_views(scene: Scene, choice: str) -> tuple[View, ...]:
-    """The views of a choice: ``test``, ``train``, ``all``, or names separated by commas.
+def views_named(scene: Scene, choice: str) -> tuple[View, ...]:
+    """Return the views of a choice: ``test``, ``train``, ``all``, or names separated by commas.
 
     Raises:
-        PolarguideError: there is no such view, or none at all.
+        PolarguideError: a view does not exist, or the choice is empty.
     """
     groups = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}
     names = [name.strip() for name in choice.split(",") if name.strip()]
@@ -87,20 +87,22 @@ def write_pictures(
 
     Args:
         run: the run; its scene is read.
-        out: folder to write; ``render`` in the run's folder by default.
+        out: folder to write; default: ``render`` in the run's folder.
         views: ``test``, ``train``, ``all``, or names separated by commas.
-        layers: names of layers, all of the run's by default; one that the recipe has not is left out, and named to
-            the reporter.
-        format: png as a display shows layers, in the color of the run's presentation; exr and npy hold their
-            linear numbers, in the units that ``layers.json`` beside them states. The contact sheet is PNG.
-        transparent: PNG files are transparent where nothing is, by alpha; their colors are those of what is there, so
-            that no dark rim shows on another background. Not on the contact sheet.
+        layers: names of layers; default: all of the run's. Layers that the recipe lacks are left out and reported.
+        format: png as a display shows layers, in the color of the run's presentation; exr and npy have linear
+            numbers, in
+            the units that ``layers.json`` states. The contact sheet is PNG.
+        transparent: whether PNG files have a transparent background. Their colors are not blended, so that no dark
+            rim
+            shows on another background. The contact sheet is opaque.
+        reporter: receives the progress.
 
     Returns:
         The path of the contact sheet.
 
     Raises:
-        PolarguideError: there is no such view or layer.
+        PolarguideError: a view or a layer does not exist.
     """
     check_choice("format", format, get_args(PictureFormat))
     if transparent and format != "png":
@@ -112,7 +114,7 @@ def write_pictures(
     if out is None:
         require_inside(run.folder, folder)
     names = checked_layers(list(run.layers if layers is None else layers))
-    chosen = select_views(run.scene, views)
+    chosen = views_named(run.scene, views)
     make_folder(folder)
     rows: list[tuple[str, dict[str, Picture]]] = []
     missing: set[str] = set()
@@ -135,8 +137,9 @@ def write_pictures(
                     missing.add(name)
                 elif format == "png" and transparent:
                     rendered = _unblended(result)
-                    exposed = name == "reflection"
-                    whole = layer_picture(rendered, name, view.camera, depths, exposed=exposed, color=color)
+                    whole = layer_picture(
+                        rendered, name, view.camera, depths, exposed=name == "reflection", color=color
+                    )
                     assert whole is not None
                     alpha = (result.alpha.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
                     figures.write_png(folder / f"{view.name}_{name}.png", whole, alpha, about)
@@ -160,8 +163,9 @@ def write_pictures(
 
 
 def common_depths(run: OpenedRun, views: Sequence[View]) -> Depths:
-    """One range of depths for some views, so that their colors mean the same: of the true depths where all have them,
-    else of the rendered ones of a few.
+    """Return one depth range for some views, so that their colors are comparable.
+
+    It is the range of the true depths if all views have them, else of the rendered depths of a few views.
     """
     true = [true_depths(view) for view in views]
     known = [depth for depth in true if depth is not None]
@@ -172,7 +176,13 @@ def common_depths(run: OpenedRun, views: Sequence[View]) -> Depths:
 
 
 def rendered_depths(run: OpenedRun, cameras: Sequence[Camera], within: Within | None = None) -> Depths:
-    """The range of the rendered depths of a few of some cameras; ``within``: what is shown of the scene."""
+    """Return the range of the rendered depths of a few of the cameras.
+
+    Args:
+        run: the run.
+        cameras: the cameras.
+        within: part of the scene that is shown.
+    """
     values = []
     for camera in cameras[:: max(1, len(cameras) // 4)]:
         result = run.result(camera, within=within)
@@ -184,14 +194,20 @@ def rendered_depths(run: OpenedRun, cameras: Sequence[Camera], within: Within | 
 def _sheet(
     views: Sequence[tuple[str, dict[str, Picture]]], names: Sequence[str], caption: str, depths: Depths | None
 ) -> Picture:
-    """A row a view; beside each layer what is true of it or measured; below, what its colors mean.
+    """Return a contact sheet with a row for each view, and a legend below.
 
-    Left out are columns that some view has not, and layers of one color in all views, such as metalness where there is
-    no metal: the caption names these.
+    Columns that some view lacks are left out. Layers of one color in all views are left out as well, such as
+    metalness
+    without any metal; the caption names them.
     """
     titles = [column for name in names for column in (name, true_name(name), f"{name}, measured")]
     columns = [column for column in titles if all(column in cells for _, cells in views)]
-    even = [column for column in columns if all(_is_even(cells[column]) for _, cells in views)]
+    # A difference of one level is rounding.
+    even = [
+        column
+        for column in columns
+        if all(np.ptp(cells[column].reshape(-1, 3), axis=0).max() <= 1 for _, cells in views)
+    ]
     columns = [column for column in columns if column not in even] or columns
     if even and columns != even:
         caption = f"{caption}; left out, the same everywhere: {', '.join(even)}"
@@ -200,20 +216,15 @@ def _sheet(
     return contact_sheet(rows, [name for name, _ in views], columns, footer=scales, caption=caption)
 
 
-def _is_even(picture: Picture) -> bool:
-    """Whether all pixels are one color, but for rounding."""
-    return int(np.ptp(picture.reshape(-1, 3), axis=0).max()) <= 1
-
-
 def _unblended(result: RenderResult) -> RenderResult:
-    """Layers of radiance as of what is there alone: over alpha, where anything is."""
+    """Return a rendering whose layers of radiance are divided by alpha."""
     alpha = result.alpha.clamp(min=1e-3)[..., None]
     names = {"final", "base", "specular", "diffuse"} & result.layers.keys()
     return result.with_layers(**{name: result.layers[name] / alpha for name in names})
 
 
 def _write_numbers(path: Path, values: Tensor) -> None:
-    """Linear numbers of a layer, [H, W], [H, W, 3] or of Stokes vectors [3, H, W, 3], float32."""
+    """Write the linear numbers of a layer, [H, W], [H, W, 3], or Stokes vectors [3, H, W, 3], as float32."""
     numbers = values.detach().cpu().float().contiguous()
     if path.suffix == ".exr":
         numbers = numbers if numbers.ndim < 4 else luminance(numbers).movedim(0, -1).contiguous()

@@ -1,4 +1,4 @@
-"""Set how a scene or a run is presented, from what the command line or a program says."""
+"""Setting of the presentation of a scene or a run, from texts of the command line or of a program."""
 
 from __future__ import annotations
 
@@ -31,9 +31,14 @@ from polarguide.core.files import require_folder
 from polarguide.core.options import DeviceName, PathLike
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import decode
-from polarguide.core.text import command, decimal
+from polarguide.core.text import command, decimals
 from polarguide.results.rendering.chart import chart_of
-from polarguide.results.rendering.picking import gains_of, gray_world, photograph_color, surface_at
+from polarguide.results.rendering.picking import (
+    gray_world_gains,
+    photograph_color,
+    surface_at,
+    white_balance_gains,
+)
 from polarguide.runs.folder import CONFIGURATION
 from polarguide.runs.opened import OpenedRun
 
@@ -59,63 +64,66 @@ def present(
     device: DeviceName = "cpu",
     reporter: Reporter = SILENT,
 ) -> Presentation:
-    """Set how a scene or a run is presented, in its ``presentation.json``. What is not given stays as it is.
+    """Set how a scene or a run is presented, in its ``presentation.json``. Omitted values stay.
 
     A PLACE is X,Y,Z in the scene's axes; VIEW, for the camera of a photograph; or VIEW,X,Y, for the surface that a
     run shows at a pixel of a photograph, counted from the top left corner.
 
     Args:
-        folder: folder of a scene, whose runs then have it from there, or of a run.
+        folder: folder of a scene, whose runs inherit the presentation, or of a run.
         white_balance: ``none``, ``gray`` (the mean of the photographs becomes gray), gains of R, G and B such as
             ``1.9,1,1.6``, or VIEW,X,Y: a place in a photograph that should be white or gray.
         chart: ``none``, or VIEW,X,Y,X,Y,X,Y,X,Y: the centers of the corner patches of a 24-patch color chart, around
-            it; or the folder of another scene or run, whose chart it takes. It replaces a white balance.
-        exposure: stops by which all is shown brighter, -8 to 8, or ``none``.
-        up_axis: ``none`` (as the cameras say), an axis such as ``z`` or ``-y``, three numbers, or VIEW,X,Y: a place
-            whose surface is level; up is its normal there.
-        points: two PLACEs whose distance is known. distance: it, such as ``85mm``.
-        meters_per_unit: how long one unit of the scene is, or ``none``.
-        crop: left,right,down,up,front,back in percent of the cameras' distance, as the viewer counts; ``all``: the
+            it; or the folder of another scene or run with a chart. It replaces a white balance.
+        exposure: exposure compensation in stops, -8 to 8, or ``none``.
+        up_axis: ``none`` (the up axis of the cameras), an axis such as ``z`` or ``-y``, three numbers, or VIEW,X,Y: a
+            place
+            on a level surface, whose normal is up.
+        points: two PLACEs of known distance.
+        distance: their distance, such as ``85mm``.
+        meters_per_unit: length of one unit of the scene, or ``none``.
+        crop: left,right,down,up,front,back in percent of the cameras' distance, as in the viewer; ``all``: the
             whole scene; ``none``: the subject, see ``results.rendering.subject``.
-        title, author, license, provenance: one line of text each; ``none`` or nothing removes it.
-        scene: where the scene of a run lies now, if it was moved; ``run.json`` of the run has it from then on.
-        device: what surfaces are rendered on.
+        title, author, license, provenance: one line of text each; ``none`` or an empty text removes it.
+        scene: new folder of a moved scene, which ``run.json`` of the run then names.
+        device: device of the rendering.
         reporter: receives the progress of long operations.
 
     Returns:
         The presentation of the folder: for a run, its own over its scene's.
 
     Raises:
-        PolarguideError: no such folder, or a value that cannot be read; nothing is written then.
+        PolarguideError: the folder does not exist, or a value is invalid; nothing is written.
     """
-    place = _Place(Path(folder), device, reporter)
+    place = _PresentedFolder(Path(folder), device, reporter)
     if scene is not None:
         place.move_scene(scene)
     own = read_presentation(place.folder)
     changes: dict[str, Any] = {}
-    if white_balance is not None:
-        changes["white_balance"] = None if white_balance == "none" else _white_balance(white_balance, place)
-    if chart is not None:
-        changes["chart"] = None if chart == "none" else _chart(chart, place)
-    if exposure is not None:
-        wanted = "stops such as 0.5, or none"
-        changes["exposure"] = (
-            None if exposure == "none" else _require_numbers(exposure, 1, "exposure", wanted)[0]
-        )
-    if up_axis is not None:
-        changes["up_axis"] = None if up_axis == "none" else _up_axis(up_axis, place)
+    parsers = {
+        "white_balance": (_white_balance, white_balance),
+        "chart": (_chart, chart),
+        "exposure": (_exposure, exposure),
+        "up_axis": (_up_axis, up_axis),
+    }
+    for name, (parse, text) in parsers.items():
+        if text is not None:
+            changes[name] = None if text == "none" else parse(text, place)
     if points or distance is not None or meters_per_unit is not None:
         changes["meters_per_unit"] = _scale(points, distance, meters_per_unit, place)
     if crop is not None:
         up = changes["up_axis"] if "up_axis" in changes else place.shown(own).up_axis
         changes["crop"] = None if crop in ("none", "all") else _crop(crop, up)
         changes["whole"] = crop == "all"
-    texts = {"title": title, "author": author, "license": license, "provenance": provenance}
-    changes |= {
-        name: "" if (text := texts[name]) == "none" else text for name in CREDITS if texts[name] is not None
+    credits = {"title": title, "author": author, "license": license, "provenance": provenance}
+    changes |= {name: "" if text == "none" else text for name, text in credits.items() if text is not None}
+    replaced = {
+        name for names in EITHER if any(changes.get(n) not in NOTHING for n in names) for name in names
     }
-    place.refuse_inherited(_removed(changes))
-    unchanged = {name: value for name, value in own.to_record().items() if name not in _replaced(changes)}
+    place.refuse_inherited(
+        [name for name, value in changes.items() if value in NOTHING and name not in replaced]
+    )
+    unchanged = {name: value for name, value in own.to_record().items() if name not in replaced}
     record = {**unchanged, **{name: msgspec.to_builtins(value) for name, value in changes.items()}}
     decoded = decode(record, Presentation, "presentation", remedy="Correct the value; nothing was written.")
     if changes:
@@ -123,8 +131,8 @@ def present(
     return place.shown(decoded)
 
 
-class _Place:
-    """A scene's or a run's folder, read as far as needed."""
+class _PresentedFolder:
+    """Folder of a scene or a run, read on demand."""
 
     def __init__(self, folder: Path, device: DeviceName, reporter: Reporter) -> None:
         require_folder(
@@ -147,34 +155,33 @@ class _Place:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene, or that of the run."""
+        """The scene, or the scene of the run."""
         return self._run.scene if self._is_run else load_scene(self.folder, reporter=self._reporter)
 
     def move_scene(self, scene: PathLike) -> None:
-        """Point the run to where its scene lies now.
+        """Set the new folder of a run's scene.
 
         Raises:
-            PolarguideError: this is no run, or that is another scene.
+            PolarguideError: the folder is not a run, or the scene is another one.
         """
         if not self._is_run:
             raise _wrong("scene", "the folder of a run, whose scene was moved", str(self.folder))
         self._run.point_to(scene)
 
     def shown(self, own: Presentation) -> Presentation:
-        """The presentation that applies, with these values of the folder's own."""
+        """Return the presentation that applies, given the folder's own values."""
         return own.over(read_presentation(self._scene_folder)) if self._is_run else own
 
-    def refuse_inherited(self, names: Any) -> None:
-        """Refuse to remove from a run what its scene says.
+    def refuse_inherited(self, names: Sequence[str]) -> None:
+        """Refuse to remove inherited values from a run.
 
         Raises:
-            PolarguideError: the scene says it.
+            PolarguideError: the scene has one of the values.
         """
-        removed = list(names)
-        if not (self._is_run and removed):
+        if not self._is_run:
             return
         above = read_presentation(self._scene_folder)
-        for name in removed:
+        for name in names:
             if getattr(above, name) not in NOTHING:
                 raise PolarguideError(
                     name,
@@ -184,18 +191,18 @@ class _Place:
                 )
 
     def pixel(self, text: str) -> tuple[str, float, float] | None:
-        """A view and a place in it, if the text is VIEW,X,Y."""
+        """Parse VIEW,X,Y to a view and a place in it, or return None for other texts."""
         name, *numbers = text.rsplit(",", 2)
-        places = _numbers(",".join(numbers))
-        if len(places) != 2 or (_numbers(name) and name not in find_layout(self._scene_folder).names):
+        places = decimals(",".join(numbers))
+        if len(places) != 2 or (decimals(name) and name not in find_layout(self._scene_folder).names):
             return None
         return name, places[0], places[1]
 
     def surface(self, name: str, x: float, y: float, where: str) -> tuple[Tensor, Tensor | None]:
-        """Point and normal of the surface at a pixel of a view.
+        """Return the point and the normal of the surface at a pixel of a view.
 
         Raises:
-            PolarguideError: no surface is there, or the folder is not a run's.
+            PolarguideError: there is no surface, or the folder is not a run.
         """
         if not self._is_run:
             raise PolarguideError(
@@ -216,7 +223,7 @@ class _Place:
         return hit.point, hit.normal
 
     def point(self, text: str) -> Tensor:
-        """A PLACE as a point [3] in the world.
+        """Return a PLACE as a point [3] in the world.
 
         Raises:
             PolarguideError: the text is not a PLACE.
@@ -224,18 +231,18 @@ class _Place:
         pixel = self.pixel(text)
         if pixel is not None:
             return self.surface(*pixel, "points")[0]
-        numbers = _numbers(text)
+        numbers = decimals(text)
         if len(numbers) == 3:
             return torch.tensor(numbers, dtype=torch.float64)
         return read_model(self._scene_folder).camera(text).center
 
 
-def _white_balance(text: str, place: _Place) -> Vector | None:
+def _white_balance(text: str, place: _PresentedFolder) -> Vector | None:
     if text == "gray":
-        return gray_world(place.scene.train_views)
+        return gray_world_gains(place.scene.train_views)
     if (pixel := place.pixel(text)) is not None:
         name, x, y = pixel
-        return gains_of(photograph_color(place.scene.view(name), x, y))
+        return white_balance_gains(photograph_color(place.scene.view(name), x, y))
     expected = "none, gray, three gains such as 1.9,1,1.6, or VIEW,X,Y"
     red, green, blue = _require_numbers(text, 3, "white_balance", expected)
     return red, green, blue
@@ -244,20 +251,10 @@ def _white_balance(text: str, place: _Place) -> Vector | None:
 NOTHING = (None, "", False)
 
 
-def _replaced(changes: dict[str, Any]) -> set[str]:
-    """The fields of ``EITHER`` of which one is given: it takes the other's place."""
-    return {name for names in EITHER if any(changes.get(n) not in NOTHING for n in names) for name in names}
-
-
-def _removed(changes: dict[str, Any]) -> list[str]:
-    """The fields that are taken back without another in their place."""
-    return [name for name in changes if changes[name] in NOTHING and name not in _replaced(changes)]
-
-
-def _chart(text: str, place: _Place) -> Chart:
+def _chart(text: str, place: _PresentedFolder) -> Chart:
     expected = "none, VIEW and the four corners X,Y,X,Y,X,Y,X,Y, or a folder with a chart"
     name, *numbers = text.rsplit(",", 8)
-    corners = _numbers(",".join(numbers))
+    corners = decimals(",".join(numbers))
     if len(corners) == 8:
         return chart_of(place.scene.view(name), corners)
     other = read_presentation(Path(text)).chart if Path(text).is_dir() else None
@@ -266,7 +263,11 @@ def _chart(text: str, place: _Place) -> Chart:
     return other
 
 
-def _up_axis(text: str, place: _Place) -> Vector | None:
+def _exposure(text: str, place: _PresentedFolder) -> float:
+    return _require_numbers(text, 1, "exposure", "stops such as 0.5, or none")[0]
+
+
+def _up_axis(text: str, place: _PresentedFolder) -> Vector | None:
     if (axis := AXES.get(text.removeprefix("-").removeprefix("+").lower())) is not None:
         sign = -1.0 if text.startswith("-") else 1.0
         return sign * axis[0], sign * axis[1], sign * axis[2]
@@ -282,7 +283,7 @@ def _up_axis(text: str, place: _Place) -> Vector | None:
 
 
 def _scale(
-    points: Sequence[str], distance: str | None, meters_per_unit: str | None, place: _Place
+    points: Sequence[str], distance: str | None, meters_per_unit: str | None, place: _PresentedFolder
 ) -> float | None:
     if meters_per_unit is not None:
         if points or distance is not None:
@@ -306,21 +307,13 @@ def _crop(text: str, up: Vector | None) -> dict[str, Any]:
     return {"low": (left, down, front), "high": (right, above, back), "up": up}
 
 
-def _numbers(text: str) -> list[float]:
-    """Numbers separated by commas; an empty list where the text is something else."""
-    try:
-        return [decimal(part) for part in text.split(",")]
-    except ValueError:
-        return []
-
-
-def _require_numbers(text: str, count: int, where: str, expected: str) -> list[float]:
-    """So many numbers separated by commas.
+def _require_numbers(text: str, count: int, where: str, expected: str) -> tuple[float, ...]:
+    """Parse a fixed count of numbers separated by commas.
 
     Raises:
-        PolarguideError: the text is something else.
+        PolarguideError: the text has another form.
     """
-    numbers = _numbers(text)
+    numbers = decimals(text)
     if len(numbers) != count:
         raise _wrong(where, expected, text)
     return numbers
@@ -330,26 +323,29 @@ def _wrong(where: str, expected: str, found: str) -> PolarguideError:
     return PolarguideError(where, expected=expected, found=found, remedy="Correct the value.")
 
 
-def described(presentation: Presentation) -> list[str]:
-    """The fields that are set, a line each; "nothing is set" for an empty presentation."""
+def presentation_lines(presentation: Presentation) -> list[str]:
+    """Return the values that are set, a line each; "nothing is set" for an empty presentation."""
     chart = presentation.chart
     exposure = presentation.exposure
+    crop = presentation.crop
+    scale = presentation.meters_per_unit
+    sides = (
+        None
+        if crop is None
+        else [100 * side for ends in zip(crop.low, crop.high, strict=True) for side in ends]
+    )
     lines = {
         "white balance": _listed(presentation.white_balance),
         "color chart": chart
         and f"{chart.patches} patches in {chart.view}, CIEDE2000 {chart.delta_e:.1f}, up to {chart.delta_e_worst:.1f}",
         "exposure": f"{exposure:+g} stops" if exposure else "",
         "up axis": _listed(presentation.up_axis),
-        "scale": ""
-        if presentation.meters_per_unit is None
-        else f"1 unit is {shown_length(1.0, presentation.meters_per_unit)}",
+        "scale": "" if scale is None else f"1 unit is {shown_length(1.0, scale)}",
+        "crop": sides and f"{_listed(sides)} % of the cameras' distance",
+        **{name: getattr(presentation, name) for name in CREDITS},
     }
-    if (crop := presentation.crop) is not None:
-        sides = (100 * side for pair in zip(crop.low, crop.high, strict=True) for side in pair)
-        lines["crop"] = f"{_listed(tuple(sides))} % of the cameras' distance"
     if presentation.whole:
         lines["crop"] = "all of the scene"
-    lines |= {name: getattr(presentation, name) for name in CREDITS}
     return [f"{name}: {text}" for name, text in lines.items() if text] or ["nothing is set"]
 
 

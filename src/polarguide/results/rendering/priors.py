@@ -1,4 +1,4 @@
-"""Pictures of what polarization says about a scene, before or after training."""
+"""Pictures of the polarization of a scene and of the priors that follow from it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder
 from polarguide.core.options import PathLike, check_finite, index_of
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.results.rendering.pictures import CONTACT_SHEET, SHEET_VIEWS, select_views
+from polarguide.results.rendering.pictures import CONTACT_SHEET, SHEET_VIEWS, views_named
 from polarguide.runs.opened import OpenedRun
 from polarguide.training.priors import facing_chromatic, guide_normals
 from polarguide.training.recipe import Priors
@@ -31,11 +31,13 @@ def write_priors(
     threshold: float = 0.05,
     reporter: Reporter = SILENT,
 ) -> Path:
-    """Pictures of what polarization says about a scene, one PNG each, and a contact sheet of them.
+    """Write pictures of a scene's polarization, one PNG each, and a contact sheet of them.
 
-    S0, DoLP, AoLP, zenith, both separations, polarization normals, those that color differences tell, and the mask of
-    usable pixels. The exact separation needs normals: those of a trained run, else the polarization normals themselves,
-    with their ambiguity resolved only by the surface facing the camera.
+    They are S0, DoLP, AoLP, zenith, both separations, polarization normals, normals from color differences, and the
+    mask of
+    usable pixels. The exact separation needs normals: those of a trained run, else the polarization normals
+    themselves,
+    whose ambiguity is then resolved only by the surface facing the camera.
 
     Args:
         scene: a scene with poses.
@@ -44,13 +46,15 @@ def write_priors(
         views: ``test``, ``train``, ``all``, or names separated by commas.
         refractive_index: refractive index of the surfaces; None: that of the scene.
         threshold: DoLP above which a pixel's normal is used.
+        reporter: receives the progress.
 
     Returns:
         The path of the contact sheet.
 
     Raises:
-        PolarguideError: there is no such view, its pictures do not determine its polarization, or the run was trained
-            at another size.
+        PolarguideError: a view does not exist, its pictures do not determine its polarization, or the run was trained
+            at
+            another size.
     """
     check_finite("threshold", threshold, 0.0, 1.0)
     index = index_of(refractive_index, scene.refractive_index)
@@ -62,32 +66,28 @@ def write_priors(
             found=str(scene.downscale),
             remedy="Give the same factor.",
         )
-    chosen = select_views(scene, views)
+    chosen = views_named(scene, views)
     for view in chosen:
         if not view.is_determined:
             raise view.undetermined("polarization at every pixel")
     make_folder(out := Path(out))
-    rows: list[list[Picture]] = []
-    labels: list[str] = []
-    names: list[str] = []
+    rows: list[dict[str, Picture]] = []
     with reporter.track("drawing", len(chosen)) as advance:
         for number, view in enumerate(chosen):
             pictures = prior_pictures(view, run, index, threshold)
-            names = list(pictures)
             for name, picture in pictures.items():
                 figures.write_png(out / f"{view.name}_{name}.png", picture)
-            if len(rows) < SHEET_VIEWS:
-                rows.append(list(pictures.values()))
-                labels.append(view.name)
+            rows = [*rows, pictures][:SHEET_VIEWS]
             advance(number + 1)
     sheet = out / CONTACT_SHEET
-    figures.write_png(sheet, contact_sheet(rows, labels, names))
+    labels = [view.name for view in chosen[:SHEET_VIEWS]]
+    figures.write_png(sheet, contact_sheet([[*row.values()] for row in rows], labels, [*rows[0]]))
     return sheet
 
 
 @torch.no_grad()
 def prior_pictures(view: View, run: OpenedRun | None, index: float, threshold: float) -> dict[str, Picture]:
-    """All prior pictures of one view, by the name their file gets."""
+    """Return all pictures of one view by the name of their file."""
     rays = view.camera.rays()
     stokes = view.stokes()
     luminance = optics.luminance(stokes)
@@ -127,13 +127,12 @@ def prior_pictures(view: View, run: OpenedRun | None, index: float, threshold: f
 def resolving_normals(
     view: View, run: OpenedRun | None, rays: Tensor, luminance: Tensor, index: float
 ) -> tuple[Tensor, str]:
-    """Normals in camera axes that resolve the ambiguity, and where they come from."""
+    """Return normals in camera axes that resolve the ambiguity, and the name of their source."""
     if run is not None:
         normal = run.result(view.name, depth=False).to("cpu").normal
         assert normal is not None
         return guide_normals(view.camera.to_camera(normal), rays, Priors.minimum_normal)[0], "by_run"
-    upward = torch.tensor([0.0, -0.5, -1.0]).expand_as(rays)
-    guess = torch.nn.functional.normalize(upward, dim=-1)
+    guess = torch.nn.functional.normalize(torch.tensor([0.0, -0.5, -1.0]).expand_as(rays), dim=-1)
     chosen = optics.disambiguate(
         optics.physical_candidates(luminance, rays, index), guess, rays, azimuth_weight=0.0
     ).normal

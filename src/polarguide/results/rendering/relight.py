@@ -1,7 +1,7 @@
-"""Other light for a run; the learned environment as a panorama, and panoramas as environments.
+"""Relighting of a run, and conversion between learned environments and panoramas.
 
-A panorama [H, 2 H, 3] is upright in the scene: row i, column j is at latitude ``pi (1/2 - (i + 1/2) / H)`` over the
-cameras' common level and at longitude ``pi ((j + 1/2) / H - 1)`` from the middle, to the right. Files hold linear
+A panorama [H, 2 H, 3] is upright in the scene. Row i, column j is at latitude ``pi (1/2 - (i + 1/2) / H)`` above the
+cameras' common level, and at longitude ``pi ((j + 1/2) / H - 1)`` from the middle to the right. Files have linear
 radiance on the scale of the photographs (S0 / 2), in the color of the run's presentation.
 """
 
@@ -31,19 +31,19 @@ from polarguide.shading.model import RadianceCubemap, ShadingModel, mirrored
 
 LARGEST = 8192 * 4096
 RELIT_RESOLUTION = 128
-"""Texels along the sides of a cubemap that is made of another light, or of the learned one turned."""
+"""Texels along the sides of a cubemap made from a panorama or by rotation."""
 
 
 def relight(
     run: OpenedRun, panorama: PathLike | None = None, degrees: float = 0.0, *, reporter: Reporter = SILENT
 ) -> None:
-    """Put a panorama in the learned environment's place, or turn it, in the run as it is in memory.
+    """Replace the learned environment of a run in memory by a panorama, or rotate it.
 
     Args:
         run: the run; its scene is read.
-        panorama: file of linear radiance (.hdr, .exr), to be reflected in place of the learned environment.
-        degrees: by which to turn the environment, counter-clockwise seen from above.
-        reporter: receives a note of each layer that stays as it was learned.
+        panorama: file of linear radiance (.hdr, .exr) that replaces the learned environment.
+        degrees: rotation of the environment, counter-clockwise seen from above.
+        reporter: receives a note about layers that keep their learned light.
 
     Raises:
         PolarguideError: the recipe learns no radiance, or the file cannot be read.
@@ -58,7 +58,7 @@ def relight(
     around = run.frame
     if panorama is not None:
         picture = in_camera(read_panorama(Path(panorama)), run.presentation.color)
-        texels = texels_of(picture, cubemap, around, RELIT_RESOLUTION)
+        texels = cubemap_of_panorama(picture, cubemap, around, RELIT_RESOLUTION)
         light[cubemap.name] = texels.to(light[cubemap.name].device)
     light[cubemap.name] = turned_cubemap(light[cubemap.name].detach(), around.turn(degrees), RELIT_RESOLUTION)
     if cubemap.note:
@@ -66,10 +66,14 @@ def relight(
 
 
 def needs_radiance(shading: ShadingModel, *, what: str) -> RadianceCubemap:
-    """The radiance that a shading model's light holds; ``what`` asks for it.
+    """Return the radiance cubemap of a shading model's light.
+
+    Args:
+        shading: the shading model.
+        what: the option that needs the cubemap, for the message.
 
     Raises:
-        PolarguideError: the model has no light, or none that is a cubemap of radiance.
+        PolarguideError: the model has no light, or its light is not a cubemap of radiance.
     """
     cubemap = shading.radiance_cubemap
     if cubemap is not None:
@@ -84,10 +88,12 @@ def needs_radiance(shading: ShadingModel, *, what: str) -> RadianceCubemap:
 
 @torch.no_grad()
 def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -> Tensor:
-    """Raw texels [6, R, R, 3] of the learned light with what the Gaussians add of their own folded in.
+    """Return raw texels [6, R, R, 3] of the learned light together with the local light of the Gaussians.
 
-    A texel is the mean of what all training views see mirrored from its direction, weighted by the square of the share
-    that is mirrored: the least squares fit to the specular layers. Learned light counts as one more pixel of a surface
+    A texel is the mean of the light that all training views see mirrored from its direction, weighted by the square
+    of the
+    mirrored share: the least-squares fit to the specular layers. The learned light counts as one more pixel of a
+    surface
     that mirrors with all of its strength, seen squarely.
     """
     texels = run.light[cubemap.name].detach().cpu()
@@ -104,7 +110,7 @@ def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -
         )
         directions = mirrored(view.camera.world_rays(), unit(result.normal, 1e-3)).reshape(-1, 3)
         with torch.enable_grad():
-            # The gradient of a look-up shares each pixel among the texels that it would read.
+            # The gradient of a look-up distributes each pixel among the texels that it reads.
             cubemap_lookup(sums, directions).backward(
                 torch.cat([share * light, share], dim=-1).reshape(-1, 4)
             )
@@ -117,7 +123,7 @@ def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -
 
 @torch.no_grad()
 def panorama(texels: Tensor, cubemap: RadianceCubemap, around: SceneFrame, height: int) -> Tensor:
-    """Radiance [H, 2 H, 3] of raw texels [6, R, R, 3]."""
+    """Return the radiance [H, 2 H, 3] of raw texels [6, R, R, 3]."""
     steps = torch.arange(2 * height, dtype=torch.float64) + 0.5
     latitude = math.pi * (0.5 - steps[:height, None] / height)
     longitude = math.pi * (steps[None] / height - 1)
@@ -130,33 +136,38 @@ def panorama(texels: Tensor, cubemap: RadianceCubemap, around: SceneFrame, heigh
 
 
 @torch.no_grad()
-def texels_of(picture: Tensor, cubemap: RadianceCubemap, around: SceneFrame, resolution: int) -> Tensor:
-    """Raw texels [6, R, R, 3] of a panorama [H, W, 3] of radiance, as far as raw values can hold it."""
+def cubemap_of_panorama(
+    picture: Tensor, cubemap: RadianceCubemap, around: SceneFrame, resolution: int
+) -> Tensor:
+    """Return raw texels [6, R, R, 3] of a panorama of radiance [H, W, 3], clamped to the range of raw values."""
     directions = texel_directions(resolution).double() @ around.panorama_axes()
     x, y, z = directions.unbind(-1)
     across = torch.atan2(x, -z) / math.pi
     down = -2 / math.pi * torch.asin(y.clamp(-1, 1))
-    # One column more on each side: the panorama goes round.
+    # One more column on each side: the panorama is periodic.
     wide = pad(picture.double().movedim(-1, 0)[None], (1, 1, 0, 0), mode="circular")
     width = picture.shape[1]
     places = torch.stack((across * width / (width + 2), down), dim=-1).reshape(
         1, 6 * resolution, resolution, 2
     )
     sampled = grid_sample(wide, places, mode="bilinear", padding_mode="border", align_corners=False)
-    light = sampled[0].movedim(0, -1).reshape(6, resolution, resolution, 3)
-    return cubemap.raw(light).float()
+    return cubemap.raw(sampled[0].movedim(0, -1).reshape(6, resolution, resolution, 3)).float()
 
 
 @torch.no_grad()
 def turned_cubemap(texels: Tensor, turn: Tensor, resolution: int) -> Tensor:
-    """Raw texels [6, R, R, C] after turning what they show by a rotation [3, 3] of the world."""
+    """Return raw texels [6, R, R, C] of an environment rotated by [3, 3] in the world."""
     directions = (texel_directions(resolution).double() @ turn).reshape(-1, 3)
-    sampled = cubemap_lookup(texels, directions.to(texels))
-    return sampled.reshape(6, resolution, resolution, -1)
+    return cubemap_lookup(texels, directions.to(texels)).reshape(6, resolution, resolution, -1)
 
 
 def write_exr(path: Path, picture: Tensor, attributes: Mapping[str, str] = {}) -> None:
-    """Write linear radiance [H, W, 3] as 32-bit floats, with standard attributes of the format, such as ``owner``.
+    """Write linear radiance [H, W, 3] as an EXR file of 32-bit floats.
+
+    Args:
+        path: the file.
+        picture: the radiance.
+        attributes: standard attributes of the format, such as ``owner``.
 
     Raises:
         PolarguideError: OpenEXR is not installed.
@@ -172,7 +183,9 @@ def write_exr(path: Path, picture: Tensor, attributes: Mapping[str, str] = {}) -
 
 
 def write_hdr(path: Path, picture: Tensor) -> None:
-    """Write linear radiance [H, W, 3] as Radiance RGBE, which more viewers read: 8 bits a channel, one exponent."""
+    """Write linear radiance [H, W, 3] as Radiance RGBE, which more programs read: 8 bits per channel, a common
+    exponent.
+    """
     pixels = np.ascontiguousarray(picture.detach().numpy().astype(np.float32)[..., ::-1])
     _, data = cv2.imencode(".hdr", pixels)
     write_whole(path, data.tobytes())
@@ -182,17 +195,24 @@ def read_panorama(path: Path) -> Tensor:
     """Read a panorama of linear radiance, Radiance HDR or OpenEXR: [H, W, 3] float32, not negative.
 
     Raises:
-        PolarguideError: no such file, not twice as wide as high, not such a picture, without light, or NaN somewhere.
+        PolarguideError: the file is missing, has another format or aspect ratio, has no light, or contains NaN.
     """
-    expected = "a panorama of linear radiance, .hdr or .exr, twice as wide as high"
-    remedy = "Give an equirectangular picture."
-    if not path.is_file() or path.suffix.lower() not in (".hdr", ".exr"):
-        found = "no such file" if not path.is_file() else f"a name that ends in {path.suffix or 'nothing'}"
-        raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
-    pixels = read_radiance(path)
-    if pixels.shape[1] != 2 * pixels.shape[0] or pixels.size > 3 * LARGEST:
-        found = f"a picture of shape {list(pixels.shape)}"
-        raise PolarguideError(path, expected=expected, found=found, remedy=remedy)
+    found = ""
+    if not path.is_file():
+        found = "no such file"
+    elif path.suffix.lower() not in (".hdr", ".exr"):
+        found = f"a name that ends in {path.suffix or 'nothing'}"
+    else:
+        pixels = read_radiance(path)
+        if pixels.shape[1] != 2 * pixels.shape[0] or pixels.size > 3 * LARGEST:
+            found = f"a picture of shape {list(pixels.shape)}"
+    if found:
+        raise PolarguideError(
+            path,
+            expected="a panorama of linear radiance, .hdr or .exr, twice as wide as high",
+            found=found,
+            remedy="Give an equirectangular picture.",
+        )
     values = torch.tensor(pixels)
     missing = int(values.isnan().any(dim=-1).sum())
     if missing or not bool((values > 0).any()):
@@ -200,8 +220,6 @@ def read_panorama(path: Path) -> Tensor:
             path,
             expected="a finite value at every pixel, and one above 0",
             found=f"NaN at {missing} of {values[..., 0].numel()} pixels" if missing else "no value above 0",
-            remedy="Export the panorama again."
-            if not missing
-            else "Export the panorama again, or fill these pixels.",
+            remedy="Export the panorama again, or fill these pixels.",
         )
     return values.clamp(0, 6e4)

@@ -1,4 +1,4 @@
-"""The subject of a run: what films, pages and exported files show of it, unless somebody chose otherwise."""
+"""The subject of a run: the part of the scene that films, pages and exported files show by default."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from polarguide.runs.model import Within
 from polarguide.runs.opened import OpenedRun
 
 Inside = Callable[[NDArray[Any]], NDArray[np.bool_]]
-"""Which places [N, 3] of the scene belong to the subject."""
+"""Function that returns which places [N, 3] of the scene belong to the subject."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,20 +27,21 @@ class Subject:
     """The part of a scene that is shown.
 
     Attributes:
-        inside: what belongs to it; None: everything. words: what that is, for people.
+        inside: selects the part; None: everything.
+        words: description of the part.
     """
 
     inside: Inside | None
     words: str
 
     def holds(self, places: Tensor) -> Tensor:
-        """Which places [N, 3] belong to it, [N] bool on their device."""
+        """Return which places [N, 3] belong to it, [N] bool on their device."""
         if self.inside is None:
             return torch.ones(len(places), dtype=torch.bool, device=places.device)
         return torch.from_numpy(self.inside(places.detach().cpu().numpy())).to(places.device)
 
     def told(self, kept: int, total: int, run: OpenedRun) -> str:
-        """A line about what was cut, and how to change it; empty where nothing was."""
+        """Return a line about the removed Gaussians and the remedy, or an empty text if none was removed."""
         if kept == total:
             return ""
         return (
@@ -51,18 +52,19 @@ class Subject:
 
 
 def subject_of(run: OpenedRun, *, masked: bool = False) -> Subject:
-    """The subject: what lies in the crop box; without one, what the scene's masks show; without masks, the region that
-    the cameras look at.
+    """Return the subject: the crop box; else the foreground of the scene's masks; else the region that the cameras
+    see.
 
-    A place is in the masks if it is so in most of the pictures that have it, and in the region that the cameras look at
-    if most of them have it in their pictures.
+    The foreground is decided by the majority of the pictures that contain a place. The region contains the places
+    that are
+    in most of the pictures.
 
     Args:
-        run: the run; where the scene has masks they are read, else poses alone.
-        masked: whether it must be in the masks, too, where there is a crop box.
+        run: the run. The scene is read if it has masks, else only its poses.
+        masked: whether the subject must be in the masks as well if there is a crop box.
 
     Raises:
-        PolarguideError: masks are asked for and the scene has none, or the scene is not there any more.
+        PolarguideError: ``masked`` is set and the scene has no masks, or the scene is missing.
     """
     presentation = run.presentation
     if masked and not run.has_masks:
@@ -89,17 +91,19 @@ def subject_of(run: OpenedRun, *, masked: bool = False) -> Subject:
         return Subject(_in_masks(run), "what most of the scene's masks show")
     if presentation.whole:
         return Subject(None, "everything")
-    return Subject(_looked_at([*run.poses.values()]), "what most of the cameras have in their pictures")
+    everywhere = [(camera, None) for camera in run.poses.values()]
+    return Subject(_by_majority(everywhere), "what most of the cameras have in their pictures")
 
 
 def part_shown(run: OpenedRun, reporter: Reporter) -> Within:
-    """The part of a run that a film shows, as renderings take it.
+    """Return the part of a run that a film shows, as an argument of renderings.
 
     Args:
-        run: the run. reporter: receives the line of ``Subject``.
+        run: the run.
+        reporter: receives the line about removed Gaussians.
 
     Raises:
-        PolarguideError: the scene is not there any more.
+        PolarguideError: the scene is missing.
     """
     subject = subject_of(run)
     inside = subject.holds(run.model.state.gaussians["means"])
@@ -109,25 +113,25 @@ def part_shown(run: OpenedRun, reporter: Reporter) -> Within:
 
 
 def _in_masks(run: OpenedRun) -> Inside:
-    masks = [(view.camera, view.mask.cpu()) for view in run.scene.views if view.mask is not None]
+    return _by_majority([(view.camera, view.mask.cpu()) for view in run.scene.views if view.mask is not None])
+
+
+def _by_majority(views: Sequence[tuple[Camera, Tensor | None]]) -> Inside:
+    """Return a function that selects the places with more votes for than against them.
+
+    Args:
+        views: cameras, and masks [H, W] bool. A view votes against places outside its mask, and abstains outside its
+            picture. Without a mask it votes against places outside its picture.
+    """
 
     def inside(places: NDArray[Any]) -> NDArray[np.bool_]:
         points = torch.from_numpy(places)
         votes = torch.zeros(len(points))
-        for camera, mask in masks:
+        for camera, mask in views:
             pixel, _, in_picture = seen_at(points - camera.center, camera)
-            votes += in_picture * torch.where(mask[pixel], 1.0, -1.0)
+            votes += torch.where(in_picture if mask is None else mask[pixel], 1.0, -1.0) * (
+                1.0 if mask is None else in_picture
+            )
         return np.asarray((votes > 0).numpy())
-
-    return inside
-
-
-def _looked_at(cameras: Sequence[Camera]) -> Inside:
-    def inside(places: NDArray[Any]) -> NDArray[np.bool_]:
-        points = torch.from_numpy(places)
-        count = torch.zeros(len(points))
-        for camera in cameras:
-            count += seen_at(points - camera.center, camera)[2]
-        return np.asarray((2 * count > len(cameras)).numpy())
 
     return inside
