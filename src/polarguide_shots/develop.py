@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 from polarguide.capture import checks
 from polarguide.capture.calibration import UNIT_GAINS, oriented, pair_ratio
 from polarguide.capture.develop import (
+    LinearShots,
     MosaicFiles,
     as_displayed,
     calibration_of,
-    exposures_of_view,
-    gains_of,
+    levels_of_shot,
+    pair_gains,
     sample_blocks,
 )
 from polarguide.capture.exposures import FOUR
 from polarguide.capture.filter.camera_files import apply_orientation
-from polarguide.capture.filter.develop import align_shots, estimate_shifts, linear_intensities, moved_shots
+from polarguide.capture.filter.develop import moved_shots
 from polarguide.capture.filter.encoding import transfer_of_pictures
 from polarguide.capture.filter.shots import _READ, Shots, read_stack, require_four_shots, stacked
 from polarguide.capture.layout import (
@@ -33,11 +34,10 @@ from polarguide.capture.layout import (
 )
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic, spoiled
 from polarguide.capture.sensor.pattern import (
-    SENSOR_SIZES,
     SIDE,
     Levels,
     Pattern,
-    estimate_levels,
+    require_kind,
     unusable_samples,
 )
 from polarguide.capture.view import ANGLES, FULL_CODE, View
@@ -58,8 +58,6 @@ from polarguide_shots.options import ShotOptions
 from polarguide_shots.samples import (
     SetSamples,
     behind_lens,
-    levels_of_shot,
-    piled_up,
     read_set,
     samples_of_arrays,
     samples_of_view,
@@ -83,15 +81,14 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     files = MosaicFiles(options)
     stored = files.read(shot.where, shot.stored)
     pattern = files.pattern
-    _require_on_sensor(shot.where, stored.shape, options)
     dark = files.dark(stored.shape)
     values = files.cut(stored)
     levels, notes = _levels_of(shot, stored, files, options)
-    files.require_kind(sample_blocks(values, SIDE), levels)
     assert options.sensor is not None
+    require_kind(options.sensor, sample_blocks(values, SIDE), levels)
     blocks = [sample_blocks(values, 2 * pattern.period)]
     ratio, _ = files.light_of_blocks(blocks, levels, dark, values.shape)
-    gains, gain_notes = gains_of(ratio, options, _GAINS)
+    gains, gain_notes = pair_gains(ratio, options, _GAINS, calibrated=files.analyzers is not None)
     mode = options.demosaic
     way = options.interpolation
     step = DEMOSAIC_MODES[mode]
@@ -141,24 +138,9 @@ def _levels_of(
     full = None
     if shot.stored is None:
         container, full = files.depth(shot.files[0], stored)
-    levels = estimate_levels(
-        int(stored.max()),
-        int(np.bitwise_or.reduce(stored, None)),
-        container,
-        bits=options.bits,
-        black=options.black_level,
-        saturation=options.saturation,
-        stated=full,
+    levels, notes = levels_of_shot(
+        stored, container, options, bits=options.bits, black=options.black_level, stated=full
     )
-    notes = []
-    if full is not None:
-        notes.append(f"{levels.white} is full scale, as the file states (--bits says otherwise).")
-    elif options.bits is None and container == 16:
-        notes.append(f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale.")
-    pile, piled = piled_up(stored, container, options)
-    if pile is not None and pile < levels.saturation:
-        levels = replace(levels, saturation=pile)
-        notes = [*notes, *piled]
     return replace(levels, gamma=options.gamma), notes
 
 
@@ -187,20 +169,6 @@ def _cut(part: Part | None, shape: tuple[int, ...], step: int) -> tuple[slice, s
     rows, columns = ends
     area = (rows.stop - rows.start) * (columns.stop - columns.start)
     return (rows, columns) if 0 < 2 * area <= shape[0] * shape[1] else None
-
-
-def _require_on_sensor(path: Path | str, shape: tuple[int, ...], options: ShotOptions) -> None:
-    """Refuse what is larger than the sensor: another one, or no mosaic."""
-    assert options.sensor is not None
-    size = SENSOR_SIZES[options.sensor]
-    most = tuple(n - o for n, o in zip(size, (options.offset_x, options.offset_y), strict=True))
-    if shape[1] > most[0] or shape[0] > most[1]:
-        raise PolarguideError(
-            path,
-            expected=f"at most {most[0]}x{most[1]} pixels of {options.sensor}",
-            found=f"{shape[1]}x{shape[0]}",
-            remedy="Check --sensor, --offset-x and --offset-y.",
-        )
 
 
 _MAPS = 4 * (4 * 3 + 3 + 5)
@@ -273,51 +241,41 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
         require_four_shots(shot.paths[0].parent, {shot.name: shot.files})
     paths = [shot.files[angle] for angle in ANGLES] if shot.stored is None else []
     shots = _four(shot)
-    levels, notes = levels_of_shot(shots.pictures, 8 * shots.pictures.dtype.itemsize, options)
-    if levels is not None:
+    container = 8 * shots.pictures.dtype.itemsize
+    levels, notes = levels_of_shot(shots.pictures, container, options, bits=options.bits or container)
+    if not levels.is_full(container):
         shots = _four(shot, levels)
     decision = transfer_of_pictures(paths, options.transfer, lambda: [(shots, ANGLES)])
-    transfer = decision.transfer
     notes += [decision.note, *filter(None, [decision.doubt])]
-    linear = linear_intensities(shots.pictures, transfer)
-    lsb = 1 / float(np.iinfo(shots.pictures.dtype).max if levels is None else levels.white)
-    clipped = shots.clipped
-    dark = shots.dark
-    if options.align:
-        shifts = estimate_shifts(linear)
-        linear, clipped = align_shots(linear, clipped, shifts)
-        moved = moved_shots(shifts)
-        notes += [f"Shots moved, in pixels: {', '.join(moved)}."] if moved else []
-    saturated = np.asarray(clipped.any(axis=0))
-    stated, corrected = stated_of_shot(paths)
-    exposed = np.asarray(stated or UNIT_GAINS)
-    notes += corrected
-    if options.gains == "auto" and options.calibration.gains is None:
-        labels = [path.name for path in paths] or [f"picture {number}" for number in (1, 2, 3, 4)]
-        measured, warning = exposures_of_view(
-            labels, linear.mean(axis=3), ~(saturated | dark), exposed.tolist()
-        )
-        exposed = np.asarray(measured)
-        notes += [f"Shots {warning}"] if warning else []
-    if (exposed != 1.0).any():
-        linear = linear / exposed.astype(np.float32)[:, None, None, None]
-    gray = linear.mean(axis=3)
-    ratio = pair_ratio(gray, ~(saturated | dark))
-    gains, gain_notes = gains_of(ratio, options, _GAINS)
-    if gains != UNIT_GAINS:
-        linear = linear / np.asarray(gains, np.float32)[:, None, None, None]
-        gray = linear.mean(axis=3)
+    linear = LinearShots.of(shots, decision.transfer, align=options.align)
+    moved = moved_shots(linear.shifts)
+    notes += [f"Shots moved, in pixels: {', '.join(moved)}."] if moved else []
+    stated: Sequence[float] = UNIT_GAINS
+    if options.gains != "none" and paths:
+        stated, corrected = stated_of_shot(paths)
+        notes += corrected
+    labels = [path.name for path in paths] or [f"picture {number}" for number in (1, 2, 3, 4)]
+    intensities, _, warning = linear.evenly_exposed(labels, stated, options)
+    notes += [f"Shots {warning}"] if warning else []
+    usable = ~linear.invalid
+    ratio = pair_ratio(intensities.mean(axis=3), usable)
+    gains, gain_notes = pair_gains(ratio, options, _GAINS)
+    intensities = intensities / np.asarray(gains, np.float32)[:, None, None, None]
+    lsb = 1 / float(levels.white)
     noise = given_noise(options, lsb)
     # The luminance is the mean of three samples, whose noise is independent but in gray files, where they are copies.
     samples = 1 if (shots.pictures[..., :1] == shots.pictures).all() else 3
     factor = 1.0 if noise is None else 1 / samples
-    noise = noise or estimated_noise(gray, ~(saturated | dark), lsb / samples**0.5)
-    upright = as_displayed(linear, options.calibration, shots.orientation)
+    noise = noise or estimated_noise(intensities.mean(axis=3), usable, lsb / samples**0.5)
+    dark, saturated, outside = (
+        np.ascontiguousarray(apply_orientation(mask, shots.orientation))
+        for mask in (linear.dark, linear.saturated, linear.outside)
+    )
     return Developed(
-        intensities=np.ascontiguousarray(upright),
-        dark=np.ascontiguousarray(apply_orientation(dark, shots.orientation)),
-        saturated=np.ascontiguousarray(apply_orientation(saturated, shots.orientation)),
-        masked=np.zeros(upright.shape[1:3], bool),
+        intensities=np.ascontiguousarray(as_displayed(intensities, options.calibration, shots.orientation)),
+        dark=dark,
+        saturated=saturated,
+        masked=outside,
         noise=noise,
         factors=np.full((4, 1, 1), factor, np.float32),
         mean_variance=factor,

@@ -27,6 +27,7 @@ from polarguide.capture.write import picture_names
 from polarguide.core.files import write_whole
 from polarguide.core.progress import Reporter
 from polarguide.preparation.folder import SceneFolder
+from polarguide.preparation.journal import ExposureRecord
 
 Array = NDArray[np.floating[Any]]
 FILE_ERROR = 0.03
@@ -95,24 +96,24 @@ _LISTED = 12
 
 
 @dataclass
-class _Exposure:
+class TableRow:
     """A picture of the scene.
 
     Attributes:
         view, file: its view, and its name in ``polar/``.
-        record: what is noted of it in ``scene.json``.
+        record: its record in ``scene.json``.
         points: how many points its view was compared at.
         log: logarithm of its gain.
     """
 
     view: str
     file: str
-    record: dict[str, Any]
+    record: ExposureRecord
     points: int = 0
     log: float = math.nan
 
 
-def write_exposure_table(folder: SceneFolder, *, estimate: bool, posed: bool, reporter: Reporter) -> None:
+def write_exposure_table(folder: SceneFolder, gains: str, *, posed: bool, reporter: Reporter) -> None:
     """Estimate the gain of every picture of a written scene, note it with the views, and write ``angles.csv``.
 
     Shots of one view share one exposure, but for what their files say. Gains that the user gave stay, and the others
@@ -120,47 +121,40 @@ def write_exposure_table(folder: SceneFolder, *, estimate: bool, posed: bool, re
 
     Args:
         folder: with all views written, and the model if there is one.
-        estimate: whether to estimate gains; else they are 1, or as given.
+        gains: auto by the files and, with a model, by points; exif by the files alone; none for 1, or as given.
         posed: whether there is a model.
         reporter: for messages.
     """
     pictures = [
-        _Exposure(view, Path(name).name, record)
-        for view in sorted(folder.views)
-        for name, record in zip(
-            picture_names(view, [shot["angle"] for shot in folder.views[view]["exposures"]]),
-            folder.views[view]["exposures"],
+        TableRow(view, Path(name).name, exposure)
+        for view, record in sorted(folder.views.items())
+        for name, exposure in zip(
+            picture_names(view, [shot.angle for shot in record.exposures or ()]),
+            record.exposures or (),
             strict=True,
         )
     ]
-    if estimate:
-        _estimate(folder.root, pictures, posed, reporter)
-    else:
+    if gains == "none":
         for picture in pictures:
             picture.log = 0.0
+    else:
+        _estimate(folder.root, pictures, posed and gains == "auto", reporter)
     _apply_given(pictures)
     for picture in pictures:
-        gain = float(f"{math.exp(picture.log):.6g}")
-        picture.record |= {"gain": gain, "points": picture.points}
+        picture.record.gain = float(f"{math.exp(picture.log):.6g}")
+        picture.record.points = picture.points
     _tell(pictures, reporter)
-    write_whole(folder.root / TABLE, _table(pictures).encode())
-
-
-def _table(pictures: list[_Exposure]) -> str:
-    """The table of a scene: files are named exactly, as they are read again."""
-    rows = [
-        (picture.file, picture.view, angle_text(picture.record["angle"]), f"{picture.record['gain']:.6g}")
-        for picture in pictures
-    ]
+    # Files are named exactly, as they are read again.
+    rows = [(p.file, p.view, angle_text(p.record.angle), f"{p.record.gain:.6g}") for p in pictures]
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([("file", "view", "angle", "gain"), *rows])
-    return text.getvalue()
+    write_whole(folder.root / TABLE, text.getvalue().encode())
 
 
-def _estimate(root: Path, pictures: list[_Exposure], posed: bool, reporter: Reporter) -> None:
+def _estimate(root: Path, pictures: list[TableRow], posed: bool, reporter: Reporter) -> None:
     """Gains of all pictures, from points in common and what the files say."""
     views = list(dict.fromkeys(picture.view for picture in pictures))
-    noted = [picture.record["light"] for picture in pictures]
+    noted = [picture.record.light for picture in pictures]
     files = np.log(np.array([math.nan if light is None else light for light in noted], np.float64))
     within = _within_views(pictures, files)
     rows = {view: [k for k, picture in enumerate(pictures) if picture.view == view] for view in views}
@@ -174,7 +168,7 @@ def _estimate(root: Path, pictures: list[_Exposure], posed: bool, reporter: Repo
         errors = compared.errors
     of_view = np.array([float(np.mean((files - within)[rows[view]])) for view in views])
     # Views that were photographed both ways: whatever the shots are compared at, most of it passed the filter.
-    bare = np.array([all(pictures[k].record["angle"] == "none" for k in rows[view]) for view in views])
+    bare = np.array([all(pictures[k].record.angle == "none" for k in rows[view]) for view in views])
     estimate = reconciled(points, of_view, bare, errors)
     lost = [view for view, log in zip(views, estimate.logs, strict=True) if not math.isfinite(log)]
     middle = float(np.nanmean(estimate.logs)) if len(lost) < len(views) else 0.0
@@ -188,12 +182,12 @@ def _estimate(root: Path, pictures: list[_Exposure], posed: bool, reporter: Repo
     _warn([views[k] for k in estimate.contradicted], pictures, of_view, reporter)
 
 
-def _within_views(pictures: list[_Exposure], files: NDArray[np.float64]) -> NDArray[np.float64]:
+def _within_views(pictures: list[TableRow], files: NDArray[np.float64]) -> NDArray[np.float64]:
     """Logarithms of exposures relative to the mean of their view, as the files say; 0 where not all of them do."""
     relative = np.zeros(len(pictures))
     for view in {picture.view for picture in pictures}:
         places = [k for k, picture in enumerate(pictures) if picture.view == view]
-        bare = np.array([pictures[k].record["angle"] == "none" for k in places])
+        bare = np.array([pictures[k].record.angle == "none" for k in places])
         # Beside shots through the filter, one without gets twice the light at the same exposure.
         extra = np.where(bare & (not bare.all()), math.log(2.0), 0.0)
         logs = files[places] + extra if np.isfinite(files[places]).all() else extra
@@ -203,7 +197,7 @@ def _within_views(pictures: list[_Exposure], files: NDArray[np.float64]) -> NDAr
 
 def _of_points(
     root: Path,
-    pictures: list[_Exposure],
+    pictures: list[TableRow],
     rows: dict[str, list[int]],
     within: NDArray[np.float64],
     reporter: Reporter,
@@ -229,9 +223,9 @@ def _of_points(
     return exposures_of_points(values, compared.places)
 
 
-def _apply_given(pictures: list[_Exposure]) -> None:
+def _apply_given(pictures: list[TableRow]) -> None:
     """Take the gains that the user gave, and fit the others to them; without any, their geometric mean becomes 1."""
-    stated = [math.nan if (gain := p.record["given_gain"]) is None else math.log(gain) for p in pictures]
+    stated = [math.nan if (gain := p.record.given_gain) is None else math.log(gain) for p in pictures]
     known = np.isfinite(stated)
     logs = np.array([picture.log for picture in pictures])
     shift = float(np.median((np.array(stated) - logs)[known])) if known.any() else -float(logs.mean())
@@ -279,7 +273,7 @@ def _significance(logs: Array, errors: Array) -> str:
 
 
 def _warn(
-    contradicted: list[str], pictures: list[_Exposure], files: NDArray[np.float64], reporter: Reporter
+    contradicted: list[str], pictures: list[TableRow], files: NDArray[np.float64], reporter: Reporter
 ) -> None:
     """Name exposures that are out of the ordinary."""
     if contradicted:
@@ -297,9 +291,9 @@ def _warn(
             )
 
 
-def _tell(pictures: list[_Exposure], reporter: Reporter) -> None:
+def _tell(pictures: list[TableRow], reporter: Reporter) -> None:
     """Print the table: all pictures, or the most unusual ones of many; nothing where all gains are 1."""
-    if all(picture.record["gain"] == 1 for picture in pictures):
+    if all(picture.record.gain == 1 for picture in pictures):
         return
     listing = pictures
     if len(pictures) > _LISTED:
@@ -309,8 +303,8 @@ def _tell(pictures: list[_Exposure], reporter: Reporter) -> None:
     width = max(len("picture"), *(len(picture.file) for picture in listing))
     rows = [f"{'picture':<{width}}   angle    gain  stops  points"]
     for picture in listing:
-        gain = picture.record["gain"]
-        angle = angle_text(picture.record["angle"])
+        gain = picture.record.gain
+        angle = angle_text(picture.record.angle)
         stops = f"{math.log2(gain):+.2f}"
         rows.append(f"{picture.file:<{width}} {angle:>7} {gain:>7.3f} {stops:>6} {picture.points:>7}")
     if len(listing) < len(pictures):

@@ -7,28 +7,23 @@ import math
 import warnings
 from collections import Counter
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.calibration import (
-    LARGEST_IMBALANCE,
-    UNIT_GAINS,
-    pair_ratio,
-)
+from polarguide.capture.calibration import LARGEST_IMBALANCE, pair_ratio
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.develop import (
     COMPARABLE,
+    LinearShots,
     as_displayed,
     exposure_notes,
-    exposures_of_view,
-    gains_of,
-    levels_of_shots,
+    levels_of_pictures,
     light_of_files,
+    pair_gains,
     require_one,
     stated_exposures,
 )
@@ -42,21 +37,13 @@ from polarguide.capture.filter.camera_files import (
     orientation_calibration,
     stored_frame,
 )
-from polarguide.capture.filter.develop import (
-    Shift,
-    align_shots,
-    estimate_shifts,
-    linear_intensities,
-    rounding_of_bytes,
-    shift_notes,
-)
+from polarguide.capture.filter.develop import rounding_of_bytes, shift_notes
 from polarguide.capture.filter.encoding import (
     TransferDecision,
     kind_of_file,
     transfer_of_pictures,
 )
 from polarguide.capture.filter.shots import (
-    Shots,
     SingleShot,
     find_shots,
     find_single_shots,
@@ -71,7 +58,14 @@ from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.write import EXACT, Rounding
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.progress import Advance
-from polarguide.preparation.settings import PrepareSettings, white_gains
+from polarguide.preparation.journal import (
+    ExposureRecord,
+    Factor,
+    Measured,
+    StoredRounding,
+    ViewRecord,
+)
+from polarguide.preparation.settings import FilterSettings, SinglesSettings, white_gains
 from polarguide.preparation.source import DevelopedView, Source, Stored
 
 _JUDGED_VIEWS = 8
@@ -83,15 +77,32 @@ _GAINS = {
 _WORKED = 3 * (2 + 2 + 4 + 4 + 4)
 
 
+class ShotsMeasured(Measured, kw_only=True):
+    """Measurements of the shots of a capture.
+
+    Attributes:
+        transfer: transfer function of the files. scale: factor of the linear values.
+        rounding: rounding of codes. levels: levels of the stored values; None for those that the files state.
+        light: exposures by file.
+    """
+
+    transfer: Literal["linear", "srgb"]
+    scale: Factor
+    rounding: StoredRounding = tuple(EXACT)
+    levels: Levels | None = None
+    light: dict[str, Factor]
+
+
 class ShotsSource(Source):
     """Shots of an ordinary camera through a polarizing filter: what four a view and single ones have in common."""
 
     cameras = None
+    measured_type = ShotsMeasured
     assumed: tuple[str, ...] = ()
     """Assumptions about the capture, in sentences for the user."""
     _root: Path
 
-    def __init__(self, paths: list[Path], views: dict[str, list[Path]], settings: PrepareSettings) -> None:
+    def __init__(self, paths: list[Path], views: dict[str, list[Path]], settings: FilterSettings) -> None:
         """Use the shots of each view, in their order; ``paths`` are all files that are read.
 
         Raises:
@@ -164,67 +175,47 @@ class ShotsSource(Source):
         """A photograph's name in its folder."""
         return path.relative_to(self._root).as_posix()
 
-    def _linear(self, view: str, measured: dict[str, Any], *, align: bool) -> _Linear:
-        """The shots of a view: validity, transfer, and shifts where there are four to align."""
-        levels = None if measured.get("levels") is None else msgspec.convert(measured["levels"], Levels)
-        shots = read_stack(self._of_view[view], self._white, levels)
-        linear = linear_intensities(shots.pictures, measured["transfer"])
-        bad = shots.clipped | shots.dark
-        shifts = [Shift(0.0, 0.0, True)] * len(linear)
-        notes = []
-        if align:
-            shifts = estimate_shifts(linear)
-            linear, bad = align_shots(linear, bad, shifts)
-            notes = shift_notes(view, shifts)
-        code = 1 if self.used_as_stored(view) else shots.orientation
-        return _Linear(shots, linear, np.asarray(bad.any(axis=0)), shifts, notes, code)
+    def _linear(self, view: str, measured: ShotsMeasured, *, align: bool) -> LinearShots:
+        """Return the linear shots of a view; four are aligned if ``align``."""
+        shots = read_stack(self._of_view[view], self._white, measured.levels)
+        if self.used_as_stored(view):
+            shots = replace(shots, orientation=1)
+        return LinearShots.of(shots, measured.transfer, align=align)
 
     def _developed(
         self,
-        picture: _Linear,
+        shots: LinearShots,
         upright: NDArray[np.float32],
-        record: dict[str, Any],
+        invalid: NDArray[np.bool_],
+        notes: Sequence[str],
         angles: Sequence[Angle] = ANGLES,
+        **measurements: Any,
     ) -> DevelopedView:
-        """The view of pictures [K, H, W, 3] that are turned for display, with a record of the measurements beside."""
+        """Return the view of pictures [K, H, W, 3] that are turned for display, with its record."""
         height, width = upright.shape[1:3]
-        shots = picture.shots
         return DevelopedView(
             intensities=np.ascontiguousarray(upright),
-            invalid=np.ascontiguousarray(apply_orientation(picture.invalid, picture.orientation)),
-            geometry=Geometry((width, height), (0, 0), 1, (width, height)),
-            record={
-                "orientation": picture.orientation,
-                **record,
-                "clipped_share": round(float(shots.clipped.any(axis=0).mean()), 6),
-                "dark_share": round(float(shots.dark.mean()), 6),
-                "invalid_share": round(float(picture.invalid.mean()), 6),
-            },
+            invalid=np.ascontiguousarray(apply_orientation(invalid, shots.orientation)),
+            record=ViewRecord(
+                orientation=shots.orientation,
+                clipped_share=round(shots.clipped_share, 6),
+                dark_share=round(shots.dark_share, 6),
+                invalid_share=round(float(invalid.mean()), 6),
+                geometry=Geometry((width, height), (0, 0), 1, (width, height)),
+                **measurements,
+            ),
             angles=angles,
-            notes=tuple(picture.notes),
+            notes=tuple(notes),
         )
-
-
-@dataclass
-class _Linear:
-    """Linear shots of a view [K, H, W, 3], unusable pixels [H, W], shifts, notes, and the orientation to turn them."""
-
-    shots: Shots
-    linear: NDArray[np.float32]
-    invalid: NDArray[np.bool_]
-    shifts: list[Shift]
-    notes: list[str]
-    orientation: int
 
 
 class FilterSource(ShotsSource):
     """Shots of an ordinary camera through a rotating linear polarizer."""
 
     kind = "filter"
-    needs = ("transfer", "scale", "light")
 
     def __init__(
-        self, root: Path, settings: PrepareSettings, shots: dict[str, dict[int, Path]] | None = None
+        self, root: Path, settings: FilterSettings, shots: dict[str, dict[int, Path]] | None = None
     ) -> None:
         """Use the shots of a folder: as their names say, or as given by view and angle."""
         self._root = root
@@ -238,16 +229,16 @@ class FilterSource(ShotsSource):
         views = {view: [files[angle] for angle in ANGLES] for view, files in sorted(shots.items())}
         super().__init__([path for files in views.values() for path in files], views, settings)
 
-    def measure(self, advance: Advance) -> dict[str, Any]:
+    def measure(self, advance: Advance) -> ShotsMeasured:
         """The transfer of the capture, from a few views spread over it."""
         self._require_memory("four shots")
         settings = self._settings
         gains = settings.calibration.gains
         notes = [*self.assumed]
-        levels, counted = levels_of_shots(self._shots, self._white, self._settings)
+        levels, counted = levels_of_pictures(self._shots, self._white, self._settings)
         decision = self._decided(levels)
         notes += [*counted, decision.note]
-        stated, missing = stated_exposures(self._of_view, advance) if settings.gains == "auto" else ({}, "")
+        stated, missing = stated_exposures(self._of_view, advance) if settings.gains != "none" else ({}, "")
         notes += [missing] if missing else exposure_notes(stated)
         # One scale for all shots, with room for the largest gain that is corrected.
         room = math.sqrt(1.0 - LARGEST_IMBALANCE)
@@ -255,55 +246,49 @@ class FilterSource(ShotsSource):
         scale /= settings.calibration.peak
         smallest = scale / (max(gains) if gains is not None else 1.0 / room)
         every = [value for of_view in stated.values() for value in of_view] or [1.0]
-        return {
-            "transfer": decision.transfer,
-            "scale": scale * min(1.0, *every),
-            "rounding": self._rounding(decision.transfer, smallest * min(1.0, *every) / max(1.0, *every)),
-            "levels": None if levels is None else asdict(levels),
-            "light": {
+        return ShotsMeasured(
+            transfer=decision.transfer,
+            scale=scale * min(1.0, *every),
+            rounding=self._rounding(decision.transfer, smallest * min(1.0, *every) / max(1.0, *every)),
+            levels=levels,
+            light={
                 self._name(path): value
                 for view, values in stated.items()
                 for path, value in zip(self._of_view[view], values, strict=True)
             },
-            "notes": notes,
-        }
+            notes=notes,
+        )
 
-    def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
+    def develop(self, view: str, measured: ShotsMeasured) -> DevelopedView:
         """Read the four shots: validity, transfer, shifts, exposures, gains, the sense of the angles, then the turn."""
         settings = self._settings
-        developed = self._linear(view, measured, align=settings.align)
-        usable = ~developed.invalid
+        shots = self._linear(view, measured, align=settings.align)
         paths = self._of_view[view]
-        light = [measured["light"].get(self._name(path), 1.0) for path in paths]
-        exposed = UNIT_GAINS
-        warning = ""
-        if settings.gains == "auto":
-            exposed, warning = exposures_of_view(
-                [path.name for path in paths], developed.linear.mean(axis=3), usable, light
-            )
+        stated = [measured.light.get(self._name(path), 1.0) for path in paths]
+        linear, exposures, warning = shots.evenly_exposed([path.name for path in paths], stated, settings)
         if warning:
             warnings.warn(f"{view}: {warning}", PolarguideWarning, stacklevel=2)
-        linear = developed.linear / np.asarray(exposed, np.float32)[:, None, None, None]
-        ratio = pair_ratio(linear.mean(axis=3), usable)
-        gains, why = gains_of(ratio, settings, _GAINS if settings.gains == "auto" else {})
-        developed.notes += [f"{view}: {note}" for note in why]
+        invalid = shots.invalid
+        ratio = pair_ratio(linear.mean(axis=3), ~invalid)
+        gains, why = pair_gains(ratio, settings, _GAINS if settings.gains == "auto" else {})
         # A shot that the pair sums brighten beyond what its file states may exceed full scale: it counts as clipped.
-        factors = np.asarray(measured["scale"] / np.asarray(gains), np.float32)
-        linear = linear * factors[:, None, None, None]
-        developed.invalid |= np.asarray((linear > 1.0).any(axis=(0, 3)))
-        turned = as_displayed(np.minimum(linear, 1.0), settings.calibration, developed.orientation)
-        record = {
-            "shifts": [[shift.x, shift.y] for shift in developed.shifts],
-            "warps": [shift.warp for shift in developed.shifts],
-            "shifts_corrected": [shift.corrected for shift in developed.shifts],
-            "pair_ratio": ratio,
-            "light": [round(value, 6) for value in exposed],
-            "gains": list(gains),
-        }
-        return self._developed(developed, turned, record)
+        linear = linear * np.asarray(measured.scale / np.asarray(gains), np.float32)[:, None, None, None]
+        invalid = invalid | (linear > 1.0).any(axis=(0, 3))
+        return self._developed(
+            shots,
+            as_displayed(np.minimum(linear, 1.0), settings.calibration, shots.orientation),
+            invalid,
+            [*shift_notes(view, shots.shifts), *(f"{view}: {note}" for note in why)],
+            shifts=[(shift.x, shift.y) for shift in shots.shifts],
+            warps=[shift.warp for shift in shots.shifts],
+            shifts_corrected=[shift.corrected for shift in shots.shifts],
+            pair_ratio=ratio,
+            light=[round(value, 6) for value in exposures],
+            gains=list(gains),
+        )
 
 
-def development_of(paths: Sequence[Path], settings: PrepareSettings) -> tuple[float, float, float]:
+def development_of(paths: Sequence[Path], settings: FilterSettings) -> tuple[float, float, float]:
     """Gains of R, G and B for camera raw, after a check that white balance and transfer fit the files.
 
     Raises:
@@ -331,10 +316,9 @@ def development_of(paths: Sequence[Path], settings: PrepareSettings) -> tuple[fl
 class SinglesSource(ShotsSource):
     """Photographs of one camera through a linear polarizer that was turned between them, or without one."""
 
-    needs = ("transfer", "scale", "light")
     kind = "singles"
 
-    def __init__(self, root: Path, settings: PrepareSettings) -> None:
+    def __init__(self, root: Path, settings: SinglesSettings) -> None:
         """Find the photographs and their angles.
 
         Raises:
@@ -349,7 +333,7 @@ class SinglesSource(ShotsSource):
         paths = [path for mine in of_view.values() for path in mine]
         super().__init__([*paths, *tables], of_view, settings)
 
-    def measure(self, advance: Advance) -> dict[str, Any]:
+    def measure(self, advance: Advance) -> ShotsMeasured:
         """The transfer, and what the files say about their exposure.
 
         Raises:
@@ -363,40 +347,35 @@ class SinglesSource(ShotsSource):
         require_one(self._root, sizes, "photographs of one size", alike)
         kinds = ((kind_of_file(path), path) for path in self._shots)
         require_one(self._root, kinds, "photographs of one kind of file", COMPARABLE)
-        levels, counted = levels_of_shots(self._shots, self._white, self._settings)
+        levels, counted = levels_of_pictures(self._shots, self._white, self._settings)
         decision = self._decided(levels)
         stated, missing = light_of_files(self._of_view, advance)
         light = {self._name(path): value for path, value in stated.items()}
         stating = f"{'All' if light else 'None'} of {len(self._shots)} files state their exposure (EXIF)."
-        return {
-            "transfer": decision.transfer,
-            "scale": 1.0,
-            "rounding": self._rounding(decision.transfer, 1.0),
-            "levels": None if levels is None else asdict(levels),
-            "light": light,
-            "notes": [*self.assumed, self._summary(), decision.note, *counted, missing or stating],
-        }
+        return ShotsMeasured(
+            transfer=decision.transfer,
+            scale=1.0,
+            rounding=self._rounding(decision.transfer, 1.0),
+            levels=levels,
+            light=light,
+            notes=[*self.assumed, self._summary(), decision.note, *counted, missing or stating],
+        )
 
-    def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
+    def develop(self, view: str, measured: ShotsMeasured) -> DevelopedView:
         """Read the shots of a view: validity, transfer, shifts of the usual four, the turn of pictures and angles."""
         settings = self._settings
-        mine = self._singles[view]
-        usual = [shot.angle for shot in mine] == list(ANGLES)
-        developed = self._linear(view, measured, align=settings.align and usual)
-        code = developed.orientation
-        turn = orientation_calibration(code)
-        angles = [turned(turned(shot.angle, settings.calibration), turn) for shot in mine]
+        singles = self._singles[view]
+        usual = [shot.angle for shot in singles] == list(ANGLES)
+        shots = self._linear(view, measured, align=settings.align and usual)
+        turn = orientation_calibration(shots.orientation)
+        angles = [turned(turned(shot.angle, settings.calibration), turn) for shot in singles]
         exposures = [
-            {
-                "source": self._name(shot.path),
-                "angle": angle,
-                "light": measured["light"].get(self._name(shot.path)),
-                "given_gain": shot.gain,
-            }
-            for shot, angle in zip(mine, angles, strict=True)
+            ExposureRecord(self._name(shot.path), angle, measured.light.get(self._name(shot.path)), shot.gain)
+            for shot, angle in zip(singles, angles, strict=True)
         ]
-        upright = np.stack([apply_orientation(picture, code) for picture in developed.linear])
-        return self._developed(developed, upright, {"exposures": exposures}, angles)
+        upright = np.stack([apply_orientation(picture, shots.orientation) for picture in shots.values])
+        notes = shift_notes(view, shots.shifts) if usual else []
+        return self._developed(shots, upright, shots.invalid, notes, angles, exposures=exposures)
 
     def _angles(self, view: str) -> list[Angle]:
         return [shot.angle for shot in self._singles[view]]

@@ -7,14 +7,13 @@ A folder without ``scene.json`` is not finished; the same command goes on with i
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import re
 import shutil
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -25,8 +24,7 @@ from polarguide.capture.colmap.sfm import reconstruct, tone_mapped
 from polarguide.capture.colmap.triangulate import add_points
 from polarguide.capture.exposures import Angle
 from polarguide.capture.filter.consecutive import chosen_matching
-from polarguide.capture.sensor.pattern import Levels
-from polarguide.capture.view import ANGLES, FULL_CODE, listed
+from polarguide.capture.view import ANGLES
 from polarguide.capture.write import (
     EXACT,
     intensity_codes,
@@ -41,7 +39,7 @@ from polarguide.core.progress import Reporter
 from polarguide.core.records import decode, read_record, shortened, to_json
 from polarguide.core.system import hold_folder
 from polarguide.core.text import canonical, stem_of
-from polarguide.preparation.request import FileStamp, first_difference
+from polarguide.preparation.journal import Journal, Measured, Request, State, ViewRecord, changed_entry
 from polarguide.preparation.settings import PrepareSettings, known_intrinsics
 from polarguide.preparation.source import Source, developed
 
@@ -56,94 +54,36 @@ REMEDY = "Give another --out; nothing was written."
 # Of a picture's angle, in its name.
 _LABEL = r"(\d{3}(\.\d+)?|unknown|none)(-\d+)?"
 _OF_POSES = ("poses", "poses_of", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
-
-
-_Code = Annotated[int, msgspec.Meta(ge=0, le=FULL_CODE)]
-_Factor = Annotated[float, msgspec.Meta(gt=0, le=1e12)]
-_Multiple = tuple[_Code, Annotated[int, msgspec.Meta(ge=1, le=FULL_CODE)]]
-
-
-class _Settings(msgspec.Struct):
-    poses: str
-
-
-class _Request(msgspec.Struct):
-    settings: _Settings
-    source: str
-    format: str
-    file: dict[str, FileStamp]
-    model: dict[str, FileStamp] = {}
-
-
-class _Exposure(msgspec.Struct):
-    """One of the single shots of a view."""
-
-    source: str
-    angle: float | Literal["unknown", "none"]
-    light: _Factor | None
-    given_gain: _Factor | None
-
-
-class _View(msgspec.Struct):
-    files: dict[str, int]
-    geometry: Geometry
-    clipped_share: float
-    warp: Any
-    exposures: list[_Exposure] = []
-
-
-class _Measured(msgspec.Struct):
-    rounding: Annotated[tuple[_Multiple, ...], msgspec.Meta(min_length=1)] = ((0, 1),)
-    levels: Levels | None = None
-    gains: tuple[_Factor, _Factor, _Factor, _Factor] | None = None
-    white_balance: tuple[_Factor, _Factor, _Factor] | None = None
-    scale: _Factor | None = None
-    transfer: Literal["linear", "srgb"] | None = None
-    light: dict[str, _Factor] | None = None
-    sense: Literal["ccw", "cw"] | None = None
-
-
-class _State(msgspec.Struct):
-    request: _Request
-    views: dict[str, _View] = {}
-    measured: _Measured | None = None
-
-
-class _Journal(msgspec.Struct):
-    """The fields of a journal that are read; it has others."""
-
-    prepare: _State
+_EARLIER_SETTINGS = {"analyzers": None, "angles": None, "poses_of": "auto", "shots_per_view": None}
+"""Settings that earlier journals do not have."""
 
 
 class SceneFolder:
     """An ``--out`` folder, new or gone on with."""
 
-    def __init__(self, root: Path, request: dict[str, Any]) -> None:
-        """Open it; nothing is written yet.
+    def __init__(self, root: Path, request: Request, measured_type: type[Measured]) -> None:
+        """Open the folder; nothing is written yet.
 
         Args:
             root: the folder.
-            request: what is asked for: source, its files, settings. ``settings.poses`` may follow on none.
+            request: source, files and settings of this call. ``settings.poses`` may follow on none.
+            measured_type: type of the measurements of the source.
 
         Raises:
             PolarguideError: the folder holds something else, or a preparation of something else.
         """
         self.root = root
-        self.request = request
-        self.measured: dict[str, Any] | None = None
-        self.views: dict[str, dict[str, Any]] = {}
-        self.finished = self.begun = False
-        self._follows_none = False
+        self.state = State[Any](request)
+        self.finished = False
         self._finished_before: bytes | None = None
         self._there_before = root.exists()
         check_out(root)
-        whole = root / SCENE
-        journal = root / JOURNAL
-        path = journal if journal.exists() else whole
+        finished = root / SCENE
+        unfinished = root / JOURNAL
+        path = unfinished if unfinished.exists() else finished
         if path.exists():
-            self._go_on(path)
-            self.begun = True
-            self.finished = path == whole and not self._follows_none
+            follows_none = self._resume(path, request, measured_type)
+            self.finished = path == finished and not follows_none
         elif root.exists() and holds_files(root):
             raise PolarguideError(
                 root,
@@ -152,7 +92,8 @@ class SceneFolder:
                 remedy=REMEDY,
             )
 
-    def _go_on(self, path: Path) -> None:
+    def _resume(self, path: Path, request: Request, measured_type: type[Measured]) -> bool:
+        """Read the state of an earlier call; return whether this call adds poses to views without poses."""
         content = read_record(path, dict[str, Any])
         if "prepare" not in content:
             raise PolarguideError(
@@ -161,53 +102,52 @@ class SceneFolder:
                 found=f"a {path.name} of another origin",
                 remedy=REMEDY,
             )
-        journal = decode(content, _Journal, path, remedy=REMEDY)
-        for view, record in journal.prepare.views.items():
+        journal: Journal[Any] = decode(content, Journal[measured_type], path, remedy=REMEDY)  # type: ignore[valid-type]
+        before = journal.prepare
+        for view, record in before.views.items():
             _require_own_files(path, view, record.files)
-            if journal.prepare.request.format == "singles":
+            if before.request.format == "singles":
                 _require_exposures(path, view, record)
-        state = content["prepare"]
-        before = json.loads(json.dumps(state["request"]))
-        now = json.loads(json.dumps(self.request))
-        if before["settings"].get("white_balance") == "grey":  # its name in earlier journals
-            before["settings"]["white_balance"] = "gray"
-        for name in ("analyzers", "angles"):  # earlier journals do not know them
-            before["settings"].setdefault(name, None)
-        before["settings"].setdefault("poses_of", "auto")
-        before["settings"].setdefault("shots_per_view", None)
-        if before["settings"]["matching"] == "exhaustive" and now["settings"]["matching"] == "auto":
-            now["settings"]["matching"] = "exhaustive"  # the default of earlier journals
-        self._follows_none = before["settings"]["poses"] == "none" != now["settings"]["poses"]
-        if self._follows_none:
-            for record in (before, now):
-                record["settings"] = {k: v for k, v in record["settings"].items() if k not in _OF_POSES}
-                record.pop("model", None)
-        differing = first_difference(before, now)
-        if differing is not None:
-            name, old, new = differing
+        settings = {**_EARLIER_SETTINGS, **before.request.settings}
+        now = dict(request.settings)
+        if settings.get("white_balance") == "grey":  # its name in earlier journals
+            settings["white_balance"] = "gray"
+        if settings.get("matching") == "exhaustive" and now["matching"] == "auto":
+            now["matching"] = "exhaustive"  # the default of earlier journals
+        follows_none = settings.get("poses") == "none" != now["poses"]
+        ignored = _OF_POSES if follows_none else ()
+        old, new = (
+            msgspec.structs.replace(
+                each,
+                settings={name: value for name, value in given.items() if name not in ignored},
+                model={} if follows_none else each.model,
+            )
+            for each, given in ((before.request, settings), (request, now))
+        )
+        difference = changed_entry(old, new)
+        if difference is not None:
+            name, was, is_now = difference
             raise PolarguideError(
                 self.root,
-                expected=f"a preparation with {name} {old}",
-                found=f"{name} {new}",
+                expected=f"a preparation with {name} {was}",
+                found=f"{name} {is_now}",
                 remedy="Repeat the command as it was, or give another --out; nothing was written.",
             )
-        self.measured = state.get("measured")
-        self.views = {canonical(view): record for view, record in state.get("views", {}).items()}
+        views = {canonical(view): record for view, record in before.views.items()}
+        self.state = State(request, before.measured, views)
+        return follows_none
 
-    def require_measured(self, needs: Collection[str]) -> None:
-        """Check that what an earlier call has measured, if there was one, has all that is read of it.
+    @property
+    def views(self) -> dict[str, ViewRecord]:
+        """Records of the views that are written."""
+        return self.state.views
 
-        Raises:
-            PolarguideError: something is missing.
-        """
-        missing = [key for key in needs if self.measured is not None and self.measured.get(key) is None]
-        if missing:
-            raise PolarguideError(
-                self.root / (JOURNAL if (self.root / JOURNAL).exists() else SCENE),
-                expected="the measurements of an earlier call",
-                found=f"no {listed(missing)}",
-                remedy="Remove the folder, and begin anew.",
-            )
+    @property
+    def measured(self) -> Measured:
+        """Measurements of the capture."""
+        assert self.state.measured is not None
+        measured: Measured = self.state.measured
+        return measured
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
@@ -262,11 +202,11 @@ class SceneFolder:
 
     def save(self) -> None:
         """Write the journal."""
-        write_whole(self.root / JOURNAL, to_json({"prepare": self._state()}))
+        write_whole(self.root / JOURNAL, to_json({"prepare": msgspec.to_builtins(self.state)}))
 
     def finish(self, summary: dict[str, Any]) -> None:
         """Write ``scene.json``, the sign that the scene is whole, and drop the journal."""
-        write_whole(self.root / SCENE, to_json({**summary, "prepare": self._state()}))
+        write_whole(self.root / SCENE, to_json({**summary, "prepare": msgspec.to_builtins(self.state)}))
         (self.root / JOURNAL).unlink(missing_ok=True)
 
     def has(self, view: str, warp: object) -> bool:
@@ -274,10 +214,10 @@ class SceneFolder:
         record = self.views.get(view)
         return (
             record is not None
-            and record["warp"] == warp
+            and record.warp == warp
             and all(
                 (self.root / name).is_file() and (self.root / name).stat().st_size == size
-                for name, size in record["files"].items()
+                for name, size in record.files.items()
             )
         )
 
@@ -286,14 +226,14 @@ class SceneFolder:
         view: str,
         intensities: NDArray[np.float32],
         invalid: NDArray[np.bool_],
-        record: dict[str, Any],
+        record: ViewRecord,
         mask: NDArray[np.bool_] | None = None,
         angles: Sequence[Angle] = ANGLES,
     ) -> None:
-        """Write the pictures of a view, then note it."""
-        codes = intensity_codes(intensities, invalid, (self.measured or {}).get("rounding", EXACT))
-        sizes = write_view(self.root, view, codes, invalid, mask, angles)
-        self.views[view] = {**record, "files": sizes}
+        """Write the pictures of a view, then its record."""
+        codes = intensity_codes(intensities, invalid, getattr(self.measured, "rounding", EXACT))
+        record.files = write_view(self.root, view, codes, invalid, mask, angles)
+        self.views[view] = record
         self.save()
 
     def hold_out(self, views: Sequence[str]) -> None:
@@ -303,12 +243,9 @@ class SceneFolder:
 
     def drop(self, view: str) -> None:
         """Remove a view that an earlier call without poses wrote, and that has none."""
-        for name in self.views.pop(view)["files"]:
+        for name in self.views.pop(view).files:
             (self.root / name).unlink(missing_ok=True)
         self.save()
-
-    def _state(self) -> dict[str, Any]:
-        return {"request": self.request, "measured": self.measured, "views": self.views}
 
 
 def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
@@ -329,13 +266,13 @@ def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
         )
 
 
-def _require_exposures(journal: Path, view: str, record: _View) -> None:
+def _require_exposures(journal: Path, view: str, record: ViewRecord) -> None:
     """Refuse a journal that does not say what the pictures of a view are.
 
     Raises:
         PolarguideError: the journal lacks it.
     """
-    named = picture_names(view, [exposure.angle for exposure in record.exposures])
+    named = picture_names(view, [exposure.angle for exposure in record.exposures or ()])
     pictures = sorted(name for name in record.files if name.startswith("polar/"))
     if sorted(named) != pictures or not named:
         raise PolarguideError(
@@ -344,9 +281,6 @@ def _require_exposures(journal: Path, view: str, record: _View) -> None:
             found=shortened(named),
             remedy=REMEDY,
         )
-
-
-PHOTOGRAPHS = "photographs"
 
 
 class Workshop:
@@ -405,8 +339,8 @@ class Workshop:
         images = self._root / "images"
         masks = self._root / "masks"
         measured = self._folder.measured
-        assert measured is not None
-        known = measured.setdefault(PHOTOGRAPHS, {})
+        known = measured.photographs or {}
+        measured.photographs = known
         if images.is_dir() and any(stem_of(path) not in views for path in images.iterdir()):
             shutil.rmtree(self._root, ignore_errors=True)  # of an earlier call with other poses
             known.clear()
@@ -420,10 +354,10 @@ class Workshop:
                     if done.mask is not None:
                         write_png(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
                     write_png(path, tone_mapped(done.intensities, self._settings.sfm_pictures))
-                    known[view] = asdict(done.geometry)
+                    known[view] = done.record.geometry
                     self._folder.save()
                 advance(count)
-        return {view: msgspec.convert(known[view], Geometry) for view in views}
+        return {view: known[view] for view in views}
 
 
 def _untried(settings: PrepareSettings, kind: str) -> str:

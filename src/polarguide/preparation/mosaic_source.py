@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.calibration import UNIDENTIFIED, oriented
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.datasets.dataset import Dataset, resized_mask
-from polarguide.capture.develop import QUARTER_TURNS, MosaicFiles, gains_of, sample_blocks
+from polarguide.capture.develop import (
+    QUARTER_TURNS,
+    MosaicFiles,
+    levels_of_capture,
+    pair_gains,
+    sample_blocks,
+)
 from polarguide.capture.formats.pictures import stated_size
 from polarguide.capture.layout import index_files
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic
@@ -24,16 +29,16 @@ from polarguide.capture.sensor.pattern import (
     SIDE,
     Levels,
     agreed_full_scale,
-    estimate_levels,
-    level_notes,
+    require_kind,
     unusable_samples,
 )
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import FULL_CODE
-from polarguide.capture.write import EXACT, Rounding, rounding_of
+from polarguide.capture.write import EXACT, rounding_of
 from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import Advance
-from polarguide.preparation.settings import PrepareSettings, white_gains
+from polarguide.preparation.journal import Factor, Measured, StoredRounding, ViewRecord
+from polarguide.preparation.settings import MosaicSettings, white_gains
 from polarguide.preparation.source import DevelopedView, Source, Stored
 
 _JUDGED = 8
@@ -46,18 +51,34 @@ _GAINS = {
 }
 
 
-def gray_world(colors: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Gains that make the mean of [3, N] colors gray; green keeps its own."""
-    mean = np.maximum(colors.mean(axis=1) if colors.size else np.ones(3), 1e-6)
-    return float(mean[1] / mean[0]), 1.0, float(mean[1] / mean[2])
+class MosaicMeasured(Measured, kw_only=True):
+    """Measurements of the mosaics of a capture.
+
+    Attributes:
+        levels: levels of the stored values. pattern: rows of the sensor's pattern. crop: columns and rows cut off.
+        pair_ratio: ratio of the pair sums. gains: gains of the four angles. white_balance: gains of R, G and B.
+        analyzers: calibration of the sensor. scale: factor of the linear values.
+        rounding: rounding of codes. defects: number of defective samples.
+    """
+
+    levels: Levels
+    pattern: tuple[str, ...] = ()
+    crop: tuple[int, int] = (0, 0)
+    pair_ratio: float | None = None
+    gains: tuple[Factor, Factor, Factor, Factor]
+    analyzers: dict[str, str] | None = None
+    white_balance: tuple[Factor, Factor, Factor]
+    scale: Factor
+    rounding: StoredRounding = tuple(EXACT)
+    defects: int = 0
 
 
 class MosaicSource(Source):
     """Raw mosaics of a division-of-focal-plane sensor."""
 
-    needs = ("levels", "gains", "white_balance", "scale")
+    measured_type = MosaicMeasured
 
-    def __init__(self, root: Path, settings: PrepareSettings, dataset: Dataset | None = None) -> None:
+    def __init__(self, root: Path, settings: MosaicSettings, dataset: Dataset | None = None) -> None:
         """Find the files.
 
         Args:
@@ -109,7 +130,7 @@ class MosaicSource(Source):
         across, down = ((side - cut) // 2 * 2 // step for side, cut in zip(size, self._crop, strict=True))
         return Stored(size, developed=(across, down))
 
-    def measure(self, advance: Advance) -> dict[str, Any]:
+    def measure(self, advance: Advance) -> MosaicMeasured:
         """Levels, gains of the angles and white balance of the capture; every file is read once."""
         counts = np.zeros(FULL_16 + 1, np.int64)
         container = 0
@@ -120,7 +141,14 @@ class MosaicSource(Source):
         for count, path in enumerate(self._files.values(), 1):
             values = self._mosaics.read(path)
             shape = shape or (values.shape, values.dtype)
-            self._require_alike(path, values, shape)
+            if (values.shape, values.dtype) != shape:
+                (height, width), kind = shape
+                raise PolarguideError(
+                    path,
+                    expected=f"{width}x{height} pixels of {kind}, as in the first file",
+                    found=f"{values.shape[1]}x{values.shape[0]} pixels of {values.dtype}",
+                    remedy="Prepare captures that differ in size or bit depth separately, each with its own --out.",
+                )
             container, stated[path] = self._mosaics.depth(path, values)
             counts += np.bincount(values.ravel(), minlength=len(counts))
             cut = self._mosaics.cut(values)
@@ -129,41 +157,51 @@ class MosaicSource(Source):
             advance(count)
         assert shape is not None
         settings = self._settings
-        occurring = np.flatnonzero(counts)
         full = agreed_full_scale(stated)
-        levels = estimate_levels(
-            int(occurring[-1]), int(np.bitwise_or.reduce(occurring)), container,
-            bits=settings.bits, black=settings.black_level, saturation=settings.saturation, counts=counts, stated=full,
-        )  # fmt: skip
+        levels, counted = levels_of_capture(
+            counts, container, settings, black=settings.black_level, stated=full
+        )
         levels = replace(levels, gamma=settings.gamma if self._dataset is None else self._dataset.gamma)
         if self._dataset is None:
-            self._mosaics.require_kind(np.concatenate(blocks), levels)
+            assert settings.sensor is not None
+            require_kind(settings.sensor, np.concatenate(blocks), levels)
         dark = self._mosaics.dark(shape[0])
         ratio, colors = self._mosaics.light_of_blocks(samples, levels, dark, cut.shape)
-        gains, notes = gains_of(ratio, settings, _GAINS if settings.gains == "auto" else {})
+        analyzers = self._mosaics.analyzers
+        gains, notes = pair_gains(
+            ratio,
+            settings,
+            _GAINS if settings.gains == "auto" else {},
+            calibrated=analyzers is not None,
+        )
         notes += [] if self._dataset is None else self._dataset.notes
-        notes += level_notes(levels, counts, container, settings.bits, full)
+        notes += counted
         standing_out = int(self._defects(levels).sum())
         if standing_out:
             notes.append(defects_note(standing_out, shape[0][0] * shape[0][1]))
-        white = self._white or gray_world(colors)
+        mean = np.maximum(colors.mean(axis=1) if colors.size else np.ones(3), 1e-6)
+        white = self._white or (float(mean[1] / mean[0]), 1.0, float(mean[1] / mean[2]))
         peak = max(white) / min(gains) * settings.calibration.peak
-        analyzers = self._mosaics.analyzers
         if analyzers is not None:
             peak *= analyzers.peak(self._mosaics.corner, cut.shape[::-1])
-        return {
-            "levels": asdict(levels),
-            "pattern": self._pattern.rows(),
-            "crop": list(self._crop),
-            "pair_ratio": ratio,
-            "gains": list(gains),
-            "analyzers": None if analyzers is None else analyzers.record(),
-            "white_balance": list(white),
-            "scale": 1.0 / max(1.0, peak),
-            "rounding": self._rounding(levels, min(white) / max(gains) / max(1.0, peak)),
-            "defects": standing_out,
-            "notes": notes,
-        }
+        rounding = EXACT
+        if settings.precision == "source" and levels.gamma == 1.0:
+            # By the smallest factor that a sample is multiplied by.
+            factor = min(white) / max(gains) / max(1.0, peak)
+            rounding = rounding_of(np.array([0.0, FULL_CODE * factor / ((1 << levels.bits) - 1)]))
+        return MosaicMeasured(
+            levels=levels,
+            pattern=tuple(self._pattern.rows()),
+            crop=self._crop,
+            pair_ratio=ratio,
+            gains=gains,
+            analyzers=None if analyzers is None else analyzers.record(),
+            white_balance=white,
+            scale=1.0 / max(1.0, peak),
+            rounding=tuple(rounding),
+            defects=standing_out,
+            notes=notes,
+        )
 
     def _defects(self, levels: Levels) -> NDArray[np.bool_]:
         """The samples of a mosaic, cut to whole cells, that are no measure of light; saturated ones are told later."""
@@ -176,17 +214,17 @@ class MosaicSource(Source):
             self._defective = defects(mosaics, self._pattern.period)
         return self._defective
 
-    def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
+    def develop(self, view: str, measured: MosaicMeasured) -> DevelopedView:
         """Read one mosaic: validity, levels, gains, then demosaicing, then the sense of the angles."""
         path = self._files[view]
         stored = self._mosaics.read(path)
         dark = self._mosaics.dark(stored.shape)
         values = self._mosaics.cut(stored)
-        levels = msgspec.convert(measured["levels"], Levels)
+        levels = measured.levels
         saturated, black = unusable_samples(values, levels, dark)
         linear, (bad,) = self._mosaics.linear(values, levels, dark, saturated | black | self._defects(levels))
         linear = linear * self._mosaics.sample_factors(
-            values.shape, measured["gains"], measured["white_balance"], measured["scale"]
+            values.shape, measured.gains, measured.white_balance, measured.scale
         )
         settings = self._settings
         picture = demosaic(
@@ -198,29 +236,16 @@ class MosaicSource(Source):
         return DevelopedView(
             intensities=intensities,
             invalid=picture.invalid,
-            geometry=Geometry(
-                stored.shape[::-1], self._crop, DEMOSAIC_MODES[settings.demosaic], (width, height)
+            record=ViewRecord(
+                clipped_share=round(float(saturated.mean()), 6),
+                dark_share=round(float(black.mean()), 6),
+                invalid_share=round(float(picture.invalid.mean()), 6),
+                geometry=Geometry(
+                    (stored.shape[1], stored.shape[0]),
+                    self._crop,
+                    DEMOSAIC_MODES[settings.demosaic],
+                    (width, height),
+                ),
             ),
-            record={
-                "clipped_share": round(float(saturated.mean()), 6),
-                "dark_share": round(float(black.mean()), 6),
-                "invalid_share": round(float(picture.invalid.mean()), 6),
-            },
             mask=None if self._dataset is None else resized_mask(self._dataset, view, (height, width)),
         )
-
-    def _rounding(self, levels: Levels, factor: float) -> Rounding:
-        """Rounding of codes, by the smallest factor that a sample is multiplied by."""
-        if self._settings.precision == "full" or levels.gamma != 1.0:
-            return EXACT
-        return rounding_of(np.array([0.0, FULL_CODE * factor / ((1 << levels.bits) - 1)]))
-
-    def _require_alike(self, path: Path, values: NDArray[Any], first: tuple[Any, Any]) -> None:
-        if (values.shape, values.dtype) != first:
-            (height, width), kind = first
-            raise PolarguideError(
-                path,
-                expected=f"{width}x{height} pixels of {kind}, as in the first file",
-                found=f"{values.shape[1]}x{values.shape[0]} pixels of {values.dtype}",
-                remedy="Prepare captures that differ in size or bit depth separately, each with its own --out.",
-            )

@@ -36,7 +36,13 @@ from polarguide.core.progress import Reporter
 from polarguide.core.text import stem_of
 from polarguide.preparation.filter_source import FilterSource, ShotsSource, SinglesSource
 from polarguide.preparation.mosaic_source import MosaicSource
-from polarguide.preparation.settings import PrepareSettings, check_format
+from polarguide.preparation.settings import (
+    FilterSettings,
+    MosaicSettings,
+    PrepareSettings,
+    SinglesSettings,
+    settings_of_format,
+)
 from polarguide.preparation.source import Source, StokesSource
 
 
@@ -100,11 +106,7 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
                 kind = "singles"
                 settings = replace(settings, angles="none")
                 assumed = (_ORDINARY,)
-    check_format(settings, kind)
-    if kind == "filter":
-        source: Source = FilterSource(root, settings, shots)
-    else:
-        source = _source(root, settings, kind)
+    source = _source(root, settings, kind, shots)
     if isinstance(source, ShotsSource):
         source.assumed = assumed
     if not source.views:
@@ -319,17 +321,24 @@ def poses_beside(root: Path) -> list[str]:
     return [name for name in names if (root / name).exists()]
 
 
-def _source(root: Path, settings: PrepareSettings, kind: str) -> Source:
-    if kind == "singles":
-        return SinglesSource(root, settings)
-    if kind == "mosaic":
-        return MosaicSource(root, settings)
-    dataset = open_dataset(root, kind, transfer=settings.transfer)
-    if dataset.mosaics is None:
-        return StokesSource(dataset, settings)
-    calibration = replace(settings.calibration, sense=settings.calibration.sense or dataset.sense)
-    settings = replace(settings, sensor=settings.sensor or PISR_SENSOR, calibration=calibration)
-    return MosaicSource(dataset.mosaics, settings, dataset)
+def _source(
+    root: Path, settings: PrepareSettings, kind: str, shots: dict[str, dict[int, Path]] | None
+) -> Source:
+    match settings_of_format(settings, kind):
+        case SinglesSettings() as singles:
+            return SinglesSource(root, singles)
+        case FilterSettings() as pictures:
+            return FilterSource(root, pictures, shots)
+        case MosaicSettings() as mosaics if kind == "mosaic":
+            return MosaicSource(root, mosaics)
+        case others:
+            dataset = open_dataset(root, kind, transfer=settings.transfer)
+            sense = settings.calibration.sense or dataset.sense
+            if dataset.mosaics is None or not isinstance(others, MosaicSettings):
+                return StokesSource(dataset, others)
+            calibration = replace(settings.calibration, sense=sense)
+            mosaics = replace(others, sensor=settings.sensor or PISR_SENSOR, calibration=calibration)
+            return MosaicSource(dataset.mosaics, mosaics, dataset)
 
 
 def origin_of_poses(pictures: Source, origin: str) -> str:

@@ -7,7 +7,7 @@ import os
 import shlex
 import shutil
 from collections import Counter
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +16,19 @@ import numpy as np
 
 from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
-from polarguide.capture.colmap.poses import Geometry, Poses
+from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError
 from polarguide.capture.filter.camera_files import TURNS
+from polarguide.capture.raw_options import SampledOptions, changed
+from polarguide.capture.sensor.pattern import MosaicOptions
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, writing
 from polarguide.core.progress import Reporter
 from polarguide.core.records import option_name
 from polarguide.preparation.exposure_table import write_exposure_table
-from polarguide.preparation.folder import JOURNAL, PARTIAL, PHOTOGRAPHS, SCENE, SFM, SceneFolder, Workshop
+from polarguide.preparation.folder import JOURNAL, PARTIAL, SCENE, SFM, SceneFolder, Workshop
+from polarguide.preparation.journal import request_of
 from polarguide.preparation.open_source import (
     frames_of_video,
     known_poses,
@@ -34,9 +37,8 @@ from polarguide.preparation.open_source import (
     poses_beside,
     settle_pose_frames,
 )
-from polarguide.preparation.request import request_of
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.preparation.source import Source, developed, measured_source
+from polarguide.preparation.source import Source, developed
 
 MOSTLY = 0.5
 """Share of saturated pixels from which on a view is warned of."""
@@ -118,8 +120,7 @@ def prepare_scene(
         [*pictures.paths, *pictures.masks.values()],
         poses.files if poses is not None else (),
     )
-    folder = SceneFolder(target, request)
-    folder.require_measured(pictures.needs)
+    folder = SceneFolder(target, request, pictures.measured_type)
     if folder.finished:
         reporter.say(f"{target} is complete already; nothing to do.")
         return _outcome(folder, pictures, settings, new=False)
@@ -136,10 +137,15 @@ def prepare_scene(
         reporter.say(
             f"Poses by structure from motion. The folder holds poses, too: {ways} takes them instead."
         )
-    if folder.measured is None:
+    if folder.state.measured is None:
         with reporter.track("measuring", len(pictures.views)) as advance:
-            folder.measured = measured_source(pictures, advance)
-        for note in folder.measured["notes"]:
+            folder.state.measured = pictures.measure(advance)
+        bare = [view for view in pictures.views if view not in pictures.masks]
+        if pictures.masks and bare:
+            folder.measured.notes.append(
+                f"{len(bare)} of {len(pictures.views)} views have no mask and are used whole ({listed(bare)})."
+            )
+        for note in folder.measured.notes:
             reporter.say(note)
     with folder.held():
         return _write_scene(root, folder, pictures, settings, poses, reporter)
@@ -187,8 +193,7 @@ def _write_scene(
         _write_model(folder, poses)
         folder.hold_out([view for view in poses.views if view in tests])
     if pictures.kind == "singles":
-        estimate = settings.gains == "auto"
-        write_exposure_table(folder, estimate=estimate, posed=poses is not None, reporter=reporter)
+        write_exposure_table(folder, settings.gains, posed=poses is not None, reporter=reporter)
     folder.finish(_summary(folder, pictures, settings, points))
     shutil.rmtree(folder.root / SFM, ignore_errors=True)
     return _outcome(folder, pictures, settings, new=True)
@@ -203,23 +208,9 @@ def _without_poses(root: Path, pictures: Source, settings: PrepareSettings) -> s
         return (
             f"Without poses: --poses none develops the views, then polarguide priors SCENE {out} shows each."
         )
-    default = PrepareSettings()
-    names = (
-        "sensor",
-        "packing",
-        "width",
-        "height",
-        "bits",
-        "offset_x",
-        "offset_y",
-        "black_level",
-        "saturation",
-    )
-    flags = [
-        f" {option_name(name)} {getattr(settings, name)}"
-        for name in names
-        if getattr(settings, name) != getattr(default, name)
-    ]
+    differing = changed(settings)
+    names = [f.name for f in (*fields(MosaicOptions), *fields(SampledOptions)) if f.name != "calibration"]
+    flags = [f" {option_name(name)} {getattr(settings, name)}" for name in names if name in differing]
     command = f"polarguide priors {shlex.quote(str(root))} {out}{''.join(flags)}"
     return (
         f"Each view alone has S0, DoLP, AoLP, normals and separations: {command}. "
@@ -228,7 +219,6 @@ def _without_poses(root: Path, pictures: Source, settings: PrepareSettings) -> s
 
 
 def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, reporter: Reporter) -> None:
-    assert folder.measured is not None
     views = pictures.views if poses is None else poses.views
     for view in folder.views.keys() - set(views):
         folder.drop(view)
@@ -238,11 +228,11 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
         for count, view in enumerate(views, 1):
             known = folder.views.get(view)
             warp = None
-            if known is not None and known.get("orientation", 1) != 1 and pictures.used_as_stored(view):
+            if known is not None and known.turned and pictures.used_as_stored(view):
                 folder.drop(view)  # an earlier call without poses turned it for display
                 known = None
             if known is not None and poses is not None:
-                warp = poses.warp(view, msgspec.convert(known["geometry"], Geometry)).record()
+                warp = poses.warp(view, known.geometry).record()
             if not folder.has(view, warp):
                 found_faults, found_notes = _write_view(folder, pictures, view, poses)
                 faults += found_faults
@@ -264,22 +254,20 @@ def _write_view(
     folder: SceneFolder, pictures: Source, view: str, poses: Poses | None
 ) -> tuple[list[str], tuple[str, ...]]:
     """Write the pictures of a view; returns what makes it useless, and the notes about it."""
-    assert folder.measured is not None
     done = developed(pictures, view, folder.measured)
     intensities = done.intensities
     invalid = done.invalid
     mask = done.mask
-    warped = None
+    record = done.record
     if poses is not None:
-        warp = poses.warp(view, done.geometry)
+        warp = poses.warp(view, record.geometry)
         intensities, invalid = warp.apply(intensities, invalid)
         mask = None if mask is None else warp.apply_mask(mask)
-        warped = warp.record()
-    record = {**done.record, "geometry": asdict(done.geometry), "warp": warped}
+        record.warp = warp.record()
     folder.write_view(view, intensities, invalid, record, mask, done.angles)
     faults = [] if mask is None or mask.any() else [f"{view}: its mask shows no object."]
-    if record["clipped_share"] > MOSTLY:
-        faults.append(f"{view}: {record['clipped_share']:.0%} of its pixels are saturated.")
+    if record.clipped_share > MOSTLY:
+        faults.append(f"{view}: {record.clipped_share:.0%} of its pixels are saturated.")
     elif not all(picture.any() for picture in intensities):
         faults.append(f"{view}: a picture of it is black throughout.")
     elif len(intensities) > 1 and all(np.array_equal(intensities[0], other) for other in intensities[1:]):
@@ -297,22 +285,16 @@ def _write_view(
 
 def _turns(folder: SceneFolder) -> str:
     """Which views were turned for display, and their polarizer angles with them; empty where none was."""
-    records = folder.views.values()
-    counts = Counter(record.get("orientation", 1) for record in records)
-    del counts[1]
-    if not counts:
+    records = [record for record in folder.views.values() if record.turned]
+    if not records:
         return ""
-    turned = listed([f"{counts[code]} {TURNS[code]}" for code in sorted(counts)])
-    noted = [
-        shot["angle"]
-        for record in records
-        for shot in record.get("exposures", ())
-        if record["orientation"] > 1
-    ]
+    counts = sorted(Counter(int(record.orientation or 1) for record in records).items())
+    turned = listed([f"{count} {TURNS[code]}" for code, count in counts])
+    noted = [shot.angle for record in records for shot in record.exposures or ()]
     # Shots of a view at the usual four angles have no list of exposures.
     angles = not noted or any(not isinstance(angle, str) for angle in noted)
     also = ", and the polarizer angles with them" if angles else ""
-    return f"EXIF orientation: {counts.total()} of {len(records)} views were turned for display{also} ({turned})."
+    return f"EXIF orientation: {len(records)} of {len(folder.views)} views were turned for display{also} ({turned})."
 
 
 def _write_model(folder: SceneFolder, poses: Poses) -> None:
@@ -335,12 +317,12 @@ def _summary(
     folder: SceneFolder, pictures: Source, settings: PrepareSettings, points: dict[str, Any] | None
 ) -> dict[str, Any]:
     """The notes in ``scene.json`` for readers; everything else is under "prepare"."""
-    measured = dict(folder.measured or {})
-    for name in (PHOTOGRAPHS, "light"):
+    measured = msgspec.to_builtins(folder.measured)
+    for name in ("photographs", "light"):
         measured.pop(name, None)
     calibration = settings.calibration.record()
     calibration["sense"] = measured.pop("sense", calibration["sense"])
-    shares = [record["clipped_share"] for record in folder.views.values()]
+    shares = [record.clipped_share for record in folder.views.values()]
     return {
         "prepared_by": f"polarguide {__version__}",
         "format": pictures.kind,

@@ -22,11 +22,11 @@ from polarguide.capture.exposures import Angle
 from polarguide.capture.filter.camera_files import INVERSE, QUARTER_TURNS, Lens, apply_orientation
 from polarguide.capture.formats.pictures import stated_size
 from polarguide.capture.layout import require_memory_of_each
-from polarguide.capture.view import listed
+from polarguide.capture.raw_options import CameraOptions
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES, four_intensities
-from polarguide.preparation.settings import PrepareSettings
+from polarguide.preparation.journal import Factor, Measured, ViewRecord
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,17 +36,15 @@ class DevelopedView:
     Attributes:
         intensities: [4, H, W, 3] float32 in [0, 1], linear, at 0, 45, 90 and 135 degrees; or [K, H, W, 3].
         invalid: pixels that depend on an unusable sample, [H, W].
-        geometry: crop and scale relative to the stored picture.
         mask: object mask, [H, W], or None.
         angles: angles of the pictures, counter-clockwise as displayed.
-        record: measurements for ``scene.json``.
+        record: record of the view; ``geometry`` is part of it.
         notes: messages for the user.
     """
 
     intensities: NDArray[np.float32]
     invalid: NDArray[np.bool_]
-    geometry: Geometry
-    record: dict[str, Any]
+    record: ViewRecord
     notes: tuple[str, ...] = ()
     mask: NDArray[np.bool_] | None = None
     angles: Sequence[Angle] = ANGLES
@@ -89,20 +87,20 @@ class Source(Protocol):
         views: view names, sorted.
         paths: all files that are read, but for masks.
         masks: object masks of the user by view; the object is where one has at least half of its maximum.
-        needs: keys of what ``measure`` returns that ``develop`` reads.
+        measured_type: type of what ``measure`` returns.
     """
 
-    needs: tuple[str, ...]
+    measured_type: type[Measured]
     kind: str
     cameras: Mapping[str, PosedCamera] | None
     views: list[str]
     paths: list[Path]
     masks: Mapping[str, Path] = MappingProxyType({})
 
-    def measure(self, advance: Advance) -> dict[str, Any]:
-        """Measure what is common to the whole capture, as JSON types; ``notes`` are messages for the user."""
+    def measure(self, advance: Advance) -> Measured:
+        """Measure what is common to the whole capture."""
 
-    def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
+    def develop(self, view: str, measured: Any) -> DevelopedView:
         """Read one view."""
 
     def stored(self, view: str) -> Stored:
@@ -124,17 +122,7 @@ class Source(Protocol):
         return False
 
 
-def measured_source(pictures: Source, advance: Advance) -> dict[str, Any]:
-    """The result of ``Source.measure``, with a note on views without a mask."""
-    measured = pictures.measure(advance)
-    bare = [view for view in pictures.views if view not in pictures.masks]
-    if pictures.masks and bare:
-        note = f"{len(bare)} of {len(pictures.views)} views have no mask and are used whole ({listed(bare)})."
-        measured["notes"] = [*measured["notes"], note]
-    return measured
-
-
-def developed(pictures: Source, view: str, measured: dict[str, Any]) -> DevelopedView:
+def developed(pictures: Source, view: str, measured: Measured) -> DevelopedView:
     """The result of ``Source.develop``, with the view's mask.
 
     Raises:
@@ -159,7 +147,7 @@ def _fitted(path: Path, view: DevelopedView, code: int) -> NDArray[np.bool_]:
         code: orientation that makes the used picture of the other one.
     """
     mask = read_mask(path)
-    geometry = view.geometry
+    geometry = view.record.geometry
     turned = mask.shape
     size = mask.shape[::-1]
     fitting = (geometry.size, geometry.stored)
@@ -195,12 +183,29 @@ _SAMPLES = 20_000
 _WORKED = 4 * 3 * (3 + 3 + 4 + 4)
 
 
+class StokesMeasured(Measured, kw_only=True):
+    """Measurements of Stokes vectors.
+
+    Attributes:
+        scale: factor of the dataset's intensities. full_scale: the dataset's intensity that becomes 1.
+        negative_share, not_finite_share: shares of intensities and of pixels.
+        pair_sums: result of the four-angle sum check. sense: sense of the angles.
+    """
+
+    scale: Factor
+    full_scale: float = 0.0
+    negative_share: float = 0.0
+    not_finite_share: float = 0.0
+    pair_sums: str = PAIR_SUMS
+    sense: Sense
+
+
 class StokesSource(Source):
     """Stokes vectors in any unit, without a full scale."""
 
-    needs = ("scale", "sense")
+    measured_type = StokesMeasured
 
-    def __init__(self, dataset: Dataset, settings: PrepareSettings) -> None:
+    def __init__(self, dataset: Dataset, settings: CameraOptions) -> None:
         """Use a dataset with ``read_stokes``; its sense of angles applies unless the settings name one."""
         self.kind = dataset.name
         self.cameras = dataset.cameras
@@ -215,7 +220,7 @@ class StokesSource(Source):
         """By the header of a file that has the size of the Stokes vectors."""
         return Stored(stated_size(self._dataset.files[view]))
 
-    def measure(self, advance: Advance) -> dict[str, Any]:
+    def measure(self, advance: Advance) -> StokesMeasured:
         """Determine one scale for the whole capture, and the share of clipped pixels; every file is read once.
 
         The largest intensity becomes 1 where it is at most twice the one that 0.1 % of the pixels exceed;
@@ -258,34 +263,32 @@ class StokesSource(Source):
         )
         if broken:
             notes.append(f"{broken / count:.3%} of the pixels are not finite and become invalid.")
-        return {
-            "scale": 1.0 / (white * self._calibration.peak),
-            "full_scale": white,
-            "negative_share": round(share, 6),
-            "not_finite_share": round(broken / count, 6),
-            "pair_sums": PAIR_SUMS,
-            "sense": sense,
-            "notes": notes,
-        }
+        return StokesMeasured(
+            scale=1.0 / (white * self._calibration.peak),
+            full_scale=white,
+            negative_share=round(share, 6),
+            not_finite_share=round(broken / count, 6),
+            sense=sense,
+            notes=notes,
+        )
 
-    def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
+    def develop(self, view: str, measured: StokesMeasured) -> DevelopedView:
         """Read one view, scale it, form the four intensities and correct the sense of the angles."""
         stokes, finite, clipped = self._stokes(view)
-        intensities = np.stack(four_intensities(stokes * np.float32(measured["scale"])))
+        intensities = np.stack(four_intensities(stokes * np.float32(measured.scale)))
         # Rounding of the scale may leave the largest intensity a hair above 1.
         clipped = clipped | (intensities > 1.0 + 1e-5).any(axis=(0, 3))
         height, width = clipped.shape
-        calibration = replace(self._calibration, sense=measured["sense"])
-        rotated = oriented(np.clip(intensities, 0.0, 1.0), calibration)
+        calibration = replace(self._calibration, sense=measured.sense)
         return DevelopedView(
-            intensities=rotated,
+            intensities=oriented(np.clip(intensities, 0.0, 1.0), calibration),
             invalid=clipped | ~finite,
-            geometry=Geometry((width, height), (0, 0), 1, (width, height)),
-            record={
-                "clipped_share": round(float(clipped.mean()), 6),
-                "negative_share": round(float((intensities < 0).mean()), 6),
-                "invalid_share": round(float((clipped | ~finite).mean()), 6),
-            },
+            record=ViewRecord(
+                clipped_share=round(float(clipped.mean()), 6),
+                negative_share=round(float((intensities < 0).mean()), 6),
+                invalid_share=round(float((clipped | ~finite).mean()), 6),
+                geometry=Geometry((width, height), (0, 0), 1, (width, height)),
+            ),
             mask=resized_mask(self._dataset, view, (height, width)),
         )
 
