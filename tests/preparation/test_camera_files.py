@@ -34,8 +34,8 @@ from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, t
 from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
 from polarguide.optics.color import srgb_encode_array as srgb_encode
 from polarguide.preparation.filter_source import SinglesSource
-from polarguide.preparation.mosaic_source import MosaicSource
 from polarguide.preparation.settings import PrepareSettings
+from polarguide.preparation.source import MosaicSource
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.read import read_shot
 

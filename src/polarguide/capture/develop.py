@@ -37,8 +37,12 @@ from polarguide.capture.filter.shots import Shots, read_stack
 from polarguide.capture.formats.pictures import may_use_fewer_bits
 from polarguide.capture.layout import require_memory, require_memory_of_each
 from polarguide.capture.raw_options import GainOptions, RawMosaicOptions, SampledOptions
-from polarguide.capture.sensor.analyzer_file import read_analyzers
-from polarguide.capture.sensor.analyzers import AnalyzerCalibration, imbalance_notes, spread_to_cells
+from polarguide.capture.sensor.analyzers import (
+    AnalyzerCalibration,
+    imbalance_notes,
+    read_analyzers,
+    spread_to_cells,
+)
 from polarguide.capture.sensor.pattern import (
     FULL_16,
     SENSOR_NAMES,
@@ -55,7 +59,7 @@ from polarguide.core.files import require_file
 from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES
 
-QUARTER_TURNS = ("90", "270")
+QUARTER_FLIPS = ("90", "270")
 """Values of ``flip`` for mosaics that were turned, in degrees counter-clockwise."""
 SMALLEST = 16
 """Pixels of the shorter side of a mosaic."""
@@ -134,14 +138,14 @@ class MosaicFiles:
             PolarguideError: it is larger than the sensor, maybe because it was turned.
         """
         flip = self._options.flip
-        if flip in QUARTER_TURNS:
+        if flip in QUARTER_FLIPS:
             values = np.rot90(values, -1 if flip == "90" else 1)
         width, height = SENSOR_SIZES[self._sensor]
         left = self._options.offset_x
         top = self._options.offset_y
         rows, columns = values.shape
         if columns > width - left or rows > height - top:
-            turned = rows <= width and columns <= height and flip not in QUARTER_TURNS
+            turned = rows <= width and columns <= height and flip not in QUARTER_FLIPS
             raise PolarguideError(
                 where,
                 expected=f"a mosaic as the sensor lies, at most {width - left}x{height - top} pixels of {self._sensor}",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,7 @@ from polarguide.capture.view import listed
 from polarguide.capture.write import picture_names
 from polarguide.core.files import write_whole
 from polarguide.core.progress import Reporter
-from polarguide.preparation.folder import SceneFolder
-from polarguide.preparation.journal import ExposureRecord
+from polarguide.preparation.journal import ExposureRecord, ViewRecord
 
 Array = NDArray[np.floating[Any]]
 FILE_ERROR = 0.03
@@ -113,21 +113,23 @@ class TableRow:
     log: float = math.nan
 
 
-def write_exposure_table(folder: SceneFolder, gains: str, *, posed: bool, reporter: Reporter) -> None:
+def write_exposure_table(
+    root: Path, views: Mapping[str, ViewRecord], gains: str, *, posed: bool, reporter: Reporter
+) -> None:
     """Estimate the gain of every picture of a written scene, note it with the views, and write ``angles.csv``.
 
     Shots of one view share one exposure, but for what their files say. Gains that the user gave stay, and the others
     fit them; without any, the geometric mean is 1.
 
     Args:
-        folder: with all views written, and the model if there is one.
+        root: folder of the scene, with all views written, and the model if there is one. views: its views.
         gains: auto by the files and, with a model, by points; exif by the files alone; none for 1, or as given.
         posed: whether there is a model.
         reporter: for messages.
     """
     pictures = [
         TableRow(view, Path(name).name, exposure)
-        for view, record in sorted(folder.views.items())
+        for view, record in sorted(views.items())
         for name, exposure in zip(
             picture_names(view, [shot.angle for shot in record.exposures or ()]),
             record.exposures or (),
@@ -138,7 +140,7 @@ def write_exposure_table(folder: SceneFolder, gains: str, *, posed: bool, report
         for picture in pictures:
             picture.log = 0.0
     else:
-        _estimate(folder.root, pictures, posed and gains == "auto", reporter)
+        _estimate(root, pictures, posed and gains == "auto", reporter)
     _apply_given(pictures)
     for picture in pictures:
         picture.record.gain = float(f"{math.exp(picture.log):.6g}")
@@ -148,7 +150,7 @@ def write_exposure_table(folder: SceneFolder, gains: str, *, posed: bool, report
     rows = [(p.file, p.view, angle_text(p.record.angle), f"{p.record.gain:.6g}") for p in pictures]
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([("file", "view", "angle", "gain"), *rows])
-    write_whole(folder.root / TABLE, text.getvalue().encode())
+    write_whole(root / TABLE, text.getvalue().encode())
 
 
 def _estimate(root: Path, pictures: list[TableRow], posed: bool, reporter: Reporter) -> None:

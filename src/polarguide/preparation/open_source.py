@@ -35,7 +35,6 @@ from polarguide.core.files import require_folder
 from polarguide.core.progress import Reporter
 from polarguide.core.text import stem_of
 from polarguide.preparation.filter_source import FilterSource, ShotsSource, SinglesSource
-from polarguide.preparation.mosaic_source import MosaicSource
 from polarguide.preparation.settings import (
     FilterSettings,
     MosaicSettings,
@@ -43,7 +42,7 @@ from polarguide.preparation.settings import (
     SinglesSettings,
     settings_of_format,
 )
-from polarguide.preparation.source import Source, StokesSource
+from polarguide.preparation.source import MosaicSource, Source, StokesSource
 
 
 def _views_of_masks(files: Iterable[Path], views: Sequence[str]) -> dict[str, Path]:

@@ -22,7 +22,7 @@ from polarguide.capture.raw_options import (
     SampledOptions,
     misplaced,
 )
-from polarguide.capture.sensor.analyzer_file import is_analyzer_file
+from polarguide.capture.sensor.analyzers import is_analyzer_file
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import option_name
 from polarguide.core.text import decimals
