@@ -231,8 +231,12 @@ def _four(shot: ExposureSet, levels: Levels | None = None) -> Shots:
     """
     if shot.stored is not None:
         return stacked(shot.stored, levels=levels)
-    remedy = "Make the pictures smaller, all by the same factor."
-    require_memory_of_each(list(shot.files.values()), _READ, "four shots", remedy=remedy)
+    require_memory_of_each(
+        list(shot.files.values()),
+        _READ,
+        "four shots",
+        remedy="Make the pictures smaller, all by the same factor.",
+    )
     return read_stack([shot.files[angle] for angle in ANGLES], levels=levels)
 
 
@@ -304,8 +308,7 @@ def _read_view(shot: ExposureSet, options: ShotOptions) -> tuple[ViewData, int |
         "a view",
         remedy="Free memory, or prepare the scene in a smaller size.",
     )
-    transfer = "srgb" if options.transfer == "srgb" else "linear"
-    data = read_view(layout, shot.view, factor=1, transfer=transfer)
+    data = read_view(layout, shot.view, factor=1, transfer="srgb" if options.transfer == "srgb" else "linear")
     return data, checks.full_scale(data.histogram, int(np.iinfo(data.peak.dtype).max))
 
 
@@ -324,13 +327,12 @@ def _undistorted(
     dark, saturated, invalid, foreground = masks
     gray = intensities.mean(axis=3)
     good = ~(saturated | dark | invalid)
-    noise = given_noise(options, lsb) or estimated_noise(gray, good, lsb)
     return Developed(
         intensities=intensities,
         dark=dark,
         saturated=saturated,
         masked=invalid if foreground is None else invalid | ~foreground,
-        noise=noise,
+        noise=given_noise(options, lsb) or estimated_noise(gray, good, lsb),
         factors=np.ones((4, 1, 1), np.float32),
         mean_variance=1.0,
         pair_ratio=pair_ratio(gray, good),

@@ -174,9 +174,12 @@ def _or_fault(
     except PolarguideError as error:
         fault = error
     except OSError as error:
-        found = error.strerror or str(error)
-        remedy = "Check its permissions."
-        fault = PolarguideError(folder, expected="a folder that can be read", found=found, remedy=remedy)
+        fault = PolarguideError(
+            folder,
+            expected="a folder that can be read",
+            found=error.strerror or str(error),
+            remedy="Check its permissions.",
+        )
     return [ExposureSet(folder.resolve().name, "filter", {}, fault=fault, others=(folder,))]
 
 

@@ -102,8 +102,9 @@ def fault_of(shot: ExposureSet, error: BaseException) -> PolarguideError:
     else:
         found = "it needs more memory than there is"
         remedy = "Free memory, or take a smaller region."
-    expected = "a shot that can be read, and room for its maps"
-    return PolarguideError(shot.where, expected=expected, found=found, remedy=remedy)
+    return PolarguideError(
+        shot.where, expected="a shot that can be read, and room for its maps", found=found, remedy=remedy
+    )
 
 
 def tiles(height: int, width: int) -> Iterator[slice]:
@@ -354,11 +355,12 @@ def array_shot(
     if options.sensor is not None:
         return ExposureSet(name, "mosaic", {}, stored=_mosaic(values, options, name))
     if values.ndim == 2:
-        remedy = (
-            "Name the sensor of a mosaic: ShotOptions(sensor=...); stack the pictures of a filter, [K, H, W]."
+        raise PolarguideError(
+            name,
+            expected="pictures [K, H, W] or [K, H, W, 3] through a filter, or a sensor of the mosaic",
+            found=kind_of(values),
+            remedy="Name the sensor of a mosaic: ShotOptions(sensor=...); stack the pictures of a filter, [K, H, W].",
         )
-        expected = "pictures [K, H, W] or [K, H, W, 3] through a filter, or a sensor of the mosaic"
-        raise PolarguideError(name, expected=expected, found=kind_of(values), remedy=remedy)
     if np.issubdtype(values.dtype, np.floating) and options.transfer == "srgb":
         raise PolarguideError(
             name,
@@ -393,9 +395,11 @@ def stacked_array(shot: Array | Sequence[Array], name: str = NAME) -> Array:
     pictures = [as_numpy(picture) for picture in shot]
     kinds = list(dict.fromkeys(map(kind_of, pictures)))
     if len(kinds) > 1:
-        remedy = "Export all pictures of a shot with the same settings."
         raise PolarguideError(
-            name, expected="pictures of one shape and type", found=" and ".join(kinds), remedy=remedy
+            name,
+            expected="pictures of one shape and type",
+            found=" and ".join(kinds),
+            remedy="Export all pictures of a shot with the same settings.",
         )
     return np.stack(pictures)
 
@@ -404,10 +408,12 @@ def _mosaic(values: NDArray[Any], options: ShotOptions, name: str) -> NDArray[An
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if values.ndim != 2 or values.dtype not in (np.uint8, np.uint16) or 0 in values.shape:
-        remedy = (
-            "Give what the sensor delivers, before any demosaicing; without a sensor, pictures [K, H, W]."
+        raise PolarguideError(
+            name,
+            expected=_MOSAIC,
+            found=kind_of(values),
+            remedy="Give what the sensor delivers, before any demosaicing; without a sensor, pictures [K, H, W].",
         )
-        raise PolarguideError(name, expected=_MOSAIC, found=kind_of(values), remedy=remedy)
     found = values.shape[1], values.shape[0]
     wanted = options.width or found[0], options.height or found[1]
     if found != wanted:

@@ -80,8 +80,12 @@ def measure(
     if outcome.waiting:
         names = ", ".join(outcome.waiting[:4]) + (", ..." if len(outcome.waiting) > 4 else "")
         unmeasured = f"{len(outcome.waiting)} that are not, and were not measured ({names})"
-        remedy = "Complete, rename or remove their files; the same command goes on."
-        error = PolarguideError(watching.watch, expected="complete shots", found=unmeasured, remedy=remedy)
+        error = PolarguideError(
+            watching.watch,
+            expected="complete shots",
+            found=unmeasured,
+            remedy="Complete, rename or remove their files; the same command goes on.",
+        )
         print_error(str(error))
     status: int = outcome.exit_status
     return status

@@ -258,9 +258,11 @@ def files_of(root: Path, table: Path, lines: Sequence[Line]) -> list[Path]:
 
 def _listed_twice(where: str, first: Line, second: Line) -> PolarguideError:
     names = " and ".join(dict.fromkeys((first.file, second.file)))
-    found = f"two for {names}, lines {first.number} and {second.number}"
     return PolarguideError(
-        where, expected="one line for each file", found=found, remedy="Remove one of them."
+        where,
+        expected="one line for each file",
+        found=f"two for {names}, lines {first.number} and {second.number}",
+        remedy="Remove one of them.",
     )
 
 

@@ -142,8 +142,9 @@ class ShotsSource(Source):
             PolarguideError: the largest is too large.
         """
         pixel = max(map(len, self._of_view.values())) * _WORKED
-        remedy = "Make all pictures smaller by the same factor."
-        require_memory_of_each(self._shots, pixel, what, remedy=remedy)
+        require_memory_of_each(
+            self._shots, pixel, what, remedy="Make all pictures smaller by the same factor."
+        )
 
     def _angles(self, view: str) -> Sequence[Angle]:
         """The angles of a view's pictures, as the user counts them."""

@@ -87,8 +87,11 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
     Raises:
         PolarguideError: there is no such folder, or nothing in it that can be read.
     """
-    remedy = "Give the folder that holds the raw mosaics, or the shots through the filter."
-    require_folder(root, expected="a folder of camera files", remedy=remedy)
+    require_folder(
+        root,
+        expected="a folder of camera files",
+        remedy="Give the folder that holds the raw mosaics, or the shots through the filter.",
+    )
     kind: str = settings.format
     settings, shots, assumed = _consecutive(root, settings)
     if shots is not None and kind == "auto":
@@ -251,8 +254,11 @@ def frames_of_video(
     folder = out.resolve().with_name(f"{out.resolve().name}-frames")
     count = extract_frames(videos[0], folder, reporter)
     reporter.say(f"{count} frames of {names} are in {folder}: the sharpest of equal spans of time.")
-    transfer = "srgb" if settings.transfer == "auto" else settings.transfer
-    return folder, replace(settings, angles=settings.angles or "none", transfer=transfer)
+    return folder, replace(
+        settings,
+        angles=settings.angles or "none",
+        transfer="srgb" if settings.transfer == "auto" else settings.transfer,
+    )
 
 
 def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
@@ -294,8 +300,12 @@ def _unknown_layout(root: Path) -> PolarguideError:
     inside = None if named else _folder_of_pictures(root)
     if inside is not None:
         remedy = f"Give the folder that the pictures are in, such as {inside}. {remedy}"
-    expected = "shots through a filter, raw mosaics with --sensor, or a published dataset"
-    return PolarguideError(root, expected=expected, found=found or "nothing to read", remedy=remedy)
+    return PolarguideError(
+        root,
+        expected="shots through a filter, raw mosaics with --sensor, or a published dataset",
+        found=found or "nothing to read",
+        remedy=remedy,
+    )
 
 
 def _folder_of_pictures(root: Path) -> Path | None:
@@ -335,8 +345,11 @@ def _source(
             sense = settings.calibration.sense or dataset.sense
             if dataset.mosaics is None or not isinstance(others, MosaicSettings):
                 return StokesSource(dataset, others)
-            calibration = replace(settings.calibration, sense=sense)
-            mosaics = replace(others, sensor=settings.sensor or PISR_SENSOR, calibration=calibration)
+            mosaics = replace(
+                others,
+                sensor=settings.sensor or PISR_SENSOR,
+                calibration=replace(settings.calibration, sense=sense),
+            )
             return MosaicSource(dataset.mosaics, mosaics, dataset)
 
 

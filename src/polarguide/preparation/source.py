@@ -247,8 +247,12 @@ class StokesSource(Source):
         The largest intensity becomes 1 where it is at most twice the one that 0.1 % of the pixels exceed;
         else twice this one does, and what exceeds it clips.
         """
-        remedy = "Make the files smaller, all by the same factor, or prepare the dataset on a larger machine."
-        require_memory_of_each(self.paths, _WORKED, "Stokes vectors", remedy=remedy)
+        require_memory_of_each(
+            self.paths,
+            _WORKED,
+            "Stokes vectors",
+            remedy="Make the files smaller, all by the same factor, or prepare the dataset on a larger machine.",
+        )
         peaks: list[NDArray[np.float32]] = []
         rims: list[RimAgreement | None] = []
         largest = 0.0

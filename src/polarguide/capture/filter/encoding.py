@@ -393,8 +393,12 @@ def transfer_of_pictures(
         return given
     stated = stated_video_transfer(video) if video else stated_transfer(paths) if paths else None
     shots, angles = zip(*judged(), strict=True)
-    slope = slope_of_shots(shots, angles) if len(angles[0]) > 1 else None
-    return decide_transfer(kind, stated, eight=shots[0].pictures.dtype == np.uint8, slope=slope)
+    return decide_transfer(
+        kind,
+        stated,
+        eight=shots[0].pictures.dtype == np.uint8,
+        slope=slope_of_shots(shots, angles) if len(angles[0]) > 1 else None,
+    )
 
 
 def _doubt(slope: Slope | None, transfer: str) -> str:
