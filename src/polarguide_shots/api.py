@@ -102,22 +102,19 @@ def shot_priors(
         PolarguideError: nothing can be read, or an option is wrong or means nothing here.
     """
     many = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
-    index = index_of(refractive_index, _index_from_scene_json(many))
+    metadata = Path(many[0]) / "scene.json" if len(many) == 1 else None
+    stated = None
+    if metadata is not None and metadata.is_file():
+        stated = refractive_index_of(metadata, read_file(metadata))
     return write_shots(
         many,
         out,
         shots,
         formats=FORMATS if formats is None else formats,
         intrinsics=intrinsics,
-        refractive_index=index,
+        refractive_index=index_of(refractive_index, stated),
         reporter=reporter,
     )
-
-
-def _index_from_scene_json(paths: Sequence[PathLike]) -> float | None:
-    """The refractive index in the ``scene.json`` of shots from one folder; None where it has none."""
-    file = Path(paths[0]) / "scene.json" if len(paths) == 1 else None
-    return refractive_index_of(file, read_file(file)) if file is not None and file.is_file() else None
 
 
 def _require_options_of_maps(shots: ShotOptions, *, maps: bool) -> None:

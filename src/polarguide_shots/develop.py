@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from polarguide.capture import checks
 from polarguide.capture.calibration import UNIT_GAINS, oriented, pair_ratio
@@ -36,7 +34,6 @@ from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_
 from polarguide.capture.sensor.pattern import (
     SIDE,
     Levels,
-    Pattern,
     require_kind,
     unusable_samples,
 )
@@ -48,7 +45,6 @@ from polarguide_shots.maps import (
     Developed,
     Map,
     Mask,
-    NoiseModel,
     Part,
     estimated_noise,
     given_noise,
@@ -83,11 +79,17 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     pattern = files.pattern
     dark = files.dark(stored.shape)
     values = files.cut(stored)
-    levels, notes = _levels_of(shot, stored, files, options)
+    container = 8 * stored.dtype.itemsize
+    full = None
+    if shot.stored is None:
+        container, full = files.depth(shot.files[0], stored)
+    levels, notes = levels_of_shot(
+        stored, container, options, bits=options.bits, black=options.black_level, stated=full
+    )
+    levels = replace(levels, gamma=options.gamma)
     assert options.sensor is not None
     require_kind(options.sensor, sample_blocks(values, SIDE), levels)
-    blocks = [sample_blocks(values, 2 * pattern.period)]
-    ratio, _ = files.light_of_blocks(blocks, levels, dark, values.shape)
+    ratio, _ = files.light_of_blocks([sample_blocks(values, 2 * pattern.period)], levels, dark, values.shape)
     gains, gain_notes = pair_gains(ratio, options, _GAINS, calibrated=files.analyzers is not None)
     mode = options.demosaic
     way = options.interpolation
@@ -108,7 +110,12 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     if gains != UNIT_GAINS:
         linear *= files.sample_factors(linear.shape, gains)
     lsb = 1 / (levels.white - levels.black)
-    noise = given_noise(options, lsb) or _noise_of(linear, saturated | black | defective, pattern, lsb)
+    noise = given_noise(options, lsb)
+    if noise is None:
+        cells = {int(pattern.angles[r, c]): linear[r::2, c::2] for r, c in np.ndindex(2, 2)}
+        bad = saturated | black | defective
+        good = ~(bad[::2, ::2] | bad[1::2, ::2] | bad[::2, 1::2] | bad[1::2, 1::2])
+        noise = estimated_noise([cells[angle] for angle in ANGLES], good, lsb)
     picture = demosaic(linear, saturated, pattern, mode=mode, interpolation=way, colored=False)
     dark_pixels, masked = (
         spoiled(samples, pattern, mode=mode, interpolation=way) for samples in (black, defective)
@@ -128,27 +135,6 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
         origin=(0, 0) if cut is None else (cut[1].start // step, cut[0].start // step),
         whole=whole,
     )
-
-
-def _levels_of(
-    shot: ExposureSet, stored: NDArray[Any], files: MosaicFiles, options: ShotOptions
-) -> tuple[Levels, list[str]]:
-    """Black, full scale and saturation of a mosaic, and notes of what its type does not imply."""
-    container = 8 * stored.dtype.itemsize
-    full = None
-    if shot.stored is None:
-        container, full = files.depth(shot.files[0], stored)
-    levels, notes = levels_of_shot(
-        stored, container, options, bits=options.bits, black=options.black_level, stated=full
-    )
-    return replace(levels, gamma=options.gamma), notes
-
-
-def _noise_of(linear: NDArray[np.float32], bad: Mask, pattern: Pattern, lsb: float) -> NoiseModel:
-    """The noise of the samples that are not ``bad``."""
-    cells = {int(pattern.angles[r, c]): linear[r::2, c::2] for r, c in np.ndindex(2, 2)}
-    good = ~(bad[::2, ::2] | bad[1::2, ::2] | bad[::2, 1::2] | bad[1::2, 1::2])
-    return estimated_noise([cells[angle] for angle in ANGLES], good, lsb)
 
 
 def _cut(part: Part | None, shape: tuple[int, ...], step: int) -> tuple[slice, slice] | None:
@@ -189,11 +175,21 @@ def develop(shot: ExposureSet, options: ShotOptions, part: Part | None = None) -
             if error.where.startswith(str(path)):
                 raise
             # An option or the dark frame does not fit this file; of many, it has to be named.
-            where = f"{path} ({error.where})"
             raise PolarguideError(
-                where, expected=error.expected, found=error.found, remedy=error.remedy
+                f"{path} ({error.where})", expected=error.expected, found=error.found, remedy=error.remedy
             ) from error
-    return _filter(shot, options) if shot.kind == "filter" else _scene_view(shot, options)
+    if shot.kind == "filter":
+        return _filter(shot, options)
+    data, scale = _read_view(shot, options)
+    return _undistorted(
+        oriented(data.codes.astype(np.float32) / np.float32(FULL_CODE), options.calibration),
+        data.black,
+        np.zeros(data.black.shape, bool) if scale is None else np.asarray(data.peak >= scale),
+        data.invalid,
+        data.mask,
+        1 / int(np.iinfo(data.peak.dtype).max),
+        options,
+    )
 
 
 def set_samples(shot: ExposureSet, options: ShotOptions) -> SetSamples | None:
@@ -288,15 +284,6 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
     )
 
 
-def _scene_view(shot: ExposureSet, options: ShotOptions) -> Developed:
-    data, scale = _read_view(shot, options)
-    largest = int(np.iinfo(data.peak.dtype).max)
-    intensities = oriented(data.codes.astype(np.float32) / np.float32(FULL_CODE), options.calibration)
-    saturated = np.zeros(data.black.shape, bool) if scale is None else np.asarray(data.peak >= scale)
-    masks = data.black, saturated, data.invalid, data.mask
-    return _undistorted(intensities, masks, 1 / largest, options)
-
-
 def _read_view(shot: ExposureSet, options: ShotOptions) -> tuple[ViewData, int | None]:
     """A view of a scene, and the stored value at which it saturates; None where it does not."""
     assert shot.root is not None
@@ -316,15 +303,27 @@ def develop_view(view: View, options: ShotOptions) -> Developed:
     """The intensities of a view of a scene at 0, 45, 90 and 135 degrees, as its ``codes`` and masks are."""
     intensities = behind_lens(view, view.intensities(), FOUR)
     dark, lost, step = state_of(view)
-    masks = dark, lost, view.invalid.numpy(), None if view.mask is None else view.mask.numpy()
-    return _undistorted(intensities.numpy(), masks, step, options)
+    return _undistorted(
+        intensities.numpy(),
+        dark,
+        lost,
+        view.invalid.numpy(),
+        None if view.mask is None else view.mask.numpy(),
+        step,
+        options,
+    )
 
 
 def _undistorted(
-    intensities: Map, masks: tuple[Mask, Mask, Mask, Mask | None], lsb: float, options: ShotOptions
+    intensities: Map,
+    dark: Mask,
+    saturated: Mask,
+    invalid: Mask,
+    foreground: Mask | None,
+    lsb: float,
+    options: ShotOptions,
 ) -> Developed:
-    """A picture of a scene, whose samples are its pixels. masks: dark, saturated, invalid, foreground."""
-    dark, saturated, invalid, foreground = masks
+    """Return a picture of a scene, whose samples are its pixels."""
     gray = intensities.mean(axis=3)
     good = ~(saturated | dark | invalid)
     return Developed(

@@ -273,8 +273,7 @@ def surface_maps(
         paper_specular[part], paper_diffuse[part] = paper.specular, paper.diffuse
         specular[part], diffuse[part] = exact.specular, exact.diffuse
         conditioned[part] = exact.conditioned
-        usable = torch.from_numpy(maps.usable[part])
-        normal[part] = chosen * usable[..., None]
+        normal[part] = chosen * torch.from_numpy(maps.usable[part])[..., None]
     above = dolp > optics.diffuse_dolp_limit(refractive_index)
     zeniths[0][above] = math.nan
     return SurfaceMaps(
@@ -380,8 +379,7 @@ def array_shot(
 
 def is_array(shot: object) -> TypeGuard[Array | Sequence[Array]]:
     """Whether something is an array, or a list of them."""
-    first = shot[0] if isinstance(shot, list | tuple) and shot else shot
-    return isinstance(first, np.ndarray | Tensor)
+    return isinstance(shot[0] if isinstance(shot, list | tuple) and shot else shot, np.ndarray | Tensor)
 
 
 def stacked_array(shot: Array | Sequence[Array], name: str = NAME) -> Array:

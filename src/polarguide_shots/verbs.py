@@ -79,11 +79,10 @@ def measure(
         print_error(outcome.trouble)
     if outcome.waiting:
         names = ", ".join(outcome.waiting[:4]) + (", ..." if len(outcome.waiting) > 4 else "")
-        unmeasured = f"{len(outcome.waiting)} that are not, and were not measured ({names})"
         error = PolarguideError(
             watching.watch,
             expected="complete shots",
-            found=unmeasured,
+            found=f"{len(outcome.waiting)} that are not, and were not measured ({names})",
             remedy="Complete, rename or remove their files; the same command goes on.",
         )
         print_error(str(error))

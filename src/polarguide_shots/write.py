@@ -27,7 +27,7 @@ from polarguide.visualization import figures
 from polarguide.visualization.figures import FONT, INK, Picture
 from polarguide.visualization.pages import data_uri, page, page_part, script_json
 from polarguide_shots.develop import check_files
-from polarguide_shots.exposures import find_shots, require_elsewhere, require_name, require_own_folder
+from polarguide_shots.exposures import find_shots, name_fault, require_elsewhere, require_own_folder
 from polarguide_shots.maps import REASONS, Reason, ShotMaps
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.read import UNREADABLE, SurfaceMaps, camera_of, fault_of, read_shot, surface_maps, tiles
@@ -90,13 +90,19 @@ def write_shots(
     with reporter.track("shots", len(shots)) as advance:
         for number, shot in enumerate(shots, 1):
             try:
-                require_name(shot)
+                misnamed = name_fault(shot)
+                if misnamed is not None:
+                    raise misnamed
                 folder = Path(out) / shot.name
                 require_own_folder(shot, folder)
                 require_inside(Path(out), folder)
                 maps = read_shot(shot, options)
-                surface = surface_maps(maps, camera_of(shot, maps.size, intrinsics), refractive_index)
-                write_maps(maps, surface, folder, formats)
+                write_maps(
+                    maps,
+                    surface_maps(maps, camera_of(shot, maps.size, intrinsics), refractive_index),
+                    folder,
+                    formats,
+                )
             except UNREADABLE as error:
                 fault = fault_of(shot, error)
                 if len(shots) == 1:
@@ -139,8 +145,9 @@ def write_view_maps(
         for number, view in enumerate(views, 1):
             require_inside(Path(out), folder := Path(out) / view.name)
             maps = read_shot(view, options)
-            surface = surface_maps(maps, view.camera, refractive_index)
-            folders[view.name] = write_maps(maps, surface, folder, formats)
+            folders[view.name] = write_maps(
+                maps, surface_maps(maps, view.camera, refractive_index), folder, formats
+            )
             advance(number)
     return folders
 
@@ -182,8 +189,10 @@ def write_maps(
         values = kind.values(maps, surface)
         if "png" in formats:
             stretch = stretch_of(kind, values, maps)
-            picture = with_legend(drawn(kind, values, maps, stretch), kind, stretch, maps.name)
-            figures.write_png(folder / f"{kind.key}.png", picture)
+            figures.write_png(
+                folder / f"{kind.key}.png",
+                with_legend(drawn(kind, values, maps, stretch), kind, stretch, maps.name),
+            )
         if "npy" in formats:
             with atomic(folder / f"{kind.key}.npy") as temporary, open(temporary, "wb") as file:
                 np.save(file, values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values)
@@ -520,8 +529,7 @@ def _colored(
     if kind.look == "radiance":
         return figures.radiance_to_rgb((numbers / (2 * stretch.high)).expand(-1, -1, 3))
     if kind.look == "angle":
-        strength = torch.from_numpy(np.ascontiguousarray(dolp)) / stretch.high
-        picture = figures.aolp_to_rgb(numbers, strength)
+        picture = figures.aolp_to_rgb(numbers, torch.from_numpy(np.ascontiguousarray(dolp)) / stretch.high)
     elif kind.look == "normal":
         return _normal_colors(numbers)
     else:
@@ -532,11 +540,20 @@ def _colored(
 
 
 def _normal_colors(normals: Tensor) -> Picture:
-    there = (normals != 0).any(dim=-1, keepdim=True)
     colors = torch.where(
-        there, (normals * torch.tensor([1.0, -1.0, -1.0]) + 1) / 2 * 255, torch.tensor(NOTHING)
+        (normals != 0).any(dim=-1, keepdim=True),
+        (normals * torch.tensor([1.0, -1.0, -1.0]) + 1) / 2 * 255,
+        torch.tensor(NOTHING),
     )
     return np.asarray(torch.floor(colors + 0.5).clamp(0, 255).to(torch.uint8).numpy())
+
+
+_GRAYS: dict[Look, str] = {
+    "scalar": "gray: dark, saturated or masked",
+    "angle": "gray: dark, saturated or masked",
+    "normal": "gray: no angle (noise, dark, saturated, masked)",
+}
+"""Meaning of gray pixels, by the way in which a map is drawn."""
 
 
 def with_legend(picture: Picture, kind: MapKind, stretch: Stretch, title: str) -> Picture:
@@ -555,19 +572,12 @@ def with_legend(picture: Picture, kind: MapKind, stretch: Stretch, title: str) -
         (f"{kind.label}   {title}", 0.75),
         (f"stretch: {stretch.text}" if stretch.text else kind.unit, 0.6),
     ]
-    grays = _grays(kind)
-    lines.append(("; ".join(filter(None, (kind.note, grays))), 0.5))
+    lines.append(("; ".join(filter(None, (kind.note, _GRAYS.get(kind.look)))), 0.5))
     y = 0.0
     for text, size in lines:
         y += 30 * scale
         _text(strip, text, round(14 * scale), round(y), size * scale, room)
     return np.concatenate((picture, strip))
-
-
-def _grays(kind: MapKind) -> str:
-    if kind.look in ("scalar", "angle"):
-        return "gray: dark, saturated or masked"
-    return "gray: no angle (noise, dark, saturated, masked)" if kind.look == "normal" else ""
 
 
 def _mark(kind: MapKind, stretch: Stretch, scale: float) -> Picture:
@@ -628,8 +638,7 @@ def _text(picture: Picture, text: str, x: int, y: int, size: float, room: int) -
     text = text.encode("ascii", "replace").decode()
     while size > 0.3 and cv2.getTextSize(text, FONT, size, 1)[0][0] > room:
         size *= 0.95
-    thickness = max(1, round(1.4 * size))
-    cv2.putText(picture, text, (x, y), FONT, size, INK, thickness, cv2.LINE_AA)
+    cv2.putText(picture, text, (x, y), FONT, size, INK, max(1, round(1.4 * size)), cv2.LINE_AA)
 
 
 def _quantile(values: NDArray[Any], where: NDArray[np.bool_], q: float = 0.995) -> float:

@@ -117,8 +117,9 @@ class MosaicFiles:
             require_mosaic(where, values, least=SMALLEST)
         values = self._turned_back(where, values)
         if self.analyzers is not None:
-            start = (self._options.offset_x, self._options.offset_y)
-            self.analyzers.require_region(start, values.shape[::-1], self._options.analyzers)
+            self.analyzers.require_region(
+                (self._options.offset_x, self._options.offset_y), values.shape[::-1], self._options.analyzers
+            )
         return values
 
     def _require_memory(self, path: Path) -> None:
@@ -128,8 +129,9 @@ class MosaicFiles:
         if path.suffix.lower() != ".raw":
             require_memory_of_each([path], worked, "a mosaic", remedy=remedy)
         elif raw.width is not None and raw.height is not None:
-            what = f"a mosaic of {raw.width}x{raw.height}"
-            require_memory(path, worked * raw.width * raw.height, what, remedy=remedy)
+            require_memory(
+                path, worked * raw.width * raw.height, f"a mosaic of {raw.width}x{raw.height}", remedy=remedy
+            )
 
     def _turned_back(self, where: Path | str, values: NDArray[Any]) -> NDArray[Any]:
         """Return a stored mosaic without the mirroring or the quarter turn that ``flip`` names.
@@ -572,7 +574,6 @@ class LinearShots:
         values = linear_intensities(shots.pictures, transfer)
         shifts = estimate_shifts(values) if align else [Shift(0.0, 0.0, True)] * len(values)
         values, (saturated, dark), outside = align_shots(values, (shots.clipped, shots.dark), shifts)
-        clipped_share = float(shots.clipped.any(axis=0).mean())
         return cls(
             values,
             saturated,
@@ -580,7 +581,7 @@ class LinearShots:
             outside,
             shifts,
             shots.orientation,
-            clipped_share,
+            float(shots.clipped.any(axis=0).mean()),
             float(shots.dark.mean()),
         )
 

@@ -85,8 +85,9 @@ def reconciled(
     weight = FILE_ERROR**2 / (FILE_ERROR**2 + max(scatter, POINTS_ERROR) ** 2)
     odd = both & (np.abs(difference) > max(LARGEST_DOUBT, 4 * scatter))
     correction = weight * difference / (1 + (difference / (3 * FILE_ERROR)) ** 2)
-    known = np.where(odd, points, shifted + correction)
-    logs = np.where(both, known, np.where(np.isfinite(points), points, shifted))
+    logs = np.where(
+        both, np.where(odd, points, shifted + correction), np.where(np.isfinite(points), points, shifted)
+    )
     return Exposures(logs, tuple(int(k) for k in np.flatnonzero(odd)), scatter)
 
 
@@ -141,7 +142,12 @@ def write_exposure_table(
             picture.log = 0.0
     else:
         _estimate(root, pictures, posed and gains == "auto", reporter)
-    _apply_given(pictures)
+    stated = [math.nan if (gain := p.record.given_gain) is None else math.log(gain) for p in pictures]
+    known = np.isfinite(stated)
+    logs = np.array([picture.log for picture in pictures])
+    shift = float(np.median((np.array(stated) - logs)[known])) if known.any() else -float(logs.mean())
+    for picture, fixed, is_fixed in zip(pictures, stated, known, strict=True):
+        picture.log = fixed if is_fixed else picture.log + shift
     for picture in pictures:
         picture.record.gain = float(f"{math.exp(picture.log):.6g}")
         picture.record.points = picture.points
@@ -179,8 +185,16 @@ def _estimate(root: Path, pictures: list[TableRow], posed: bool, reporter: Repor
         for k in rows[view]:
             pictures[k].log = float(log + within[k])
             pictures[k].points = int(numbers[place])
-    how = "" if compared is None else _significance(compared.significant[:, 0], errors)
-    _say_how(views, points, of_view, estimate.scatter, lost, how, reporter)
+    _say_how(
+        views,
+        points,
+        of_view,
+        estimate.scatter,
+        lost,
+        None if compared is None else compared.significant[:, 0],
+        errors,
+        reporter,
+    )
     _warn([views[k] for k in estimate.contradicted], pictures, of_view, reporter)
 
 
@@ -216,23 +230,14 @@ def _of_points(
             files = [root / "polar" / pictures[k].file for k in rows[view]]
             stored = [decode_picture(path, read_picture(path)) for path in files]
             path = root / "invalid" / f"{view}.png"
-            bad = decode_mask(path, read_picture(path), any_value=True)
-            samples = compared.samples(view, stored, bad, "linear")
+            samples = compared.samples(
+                view, stored, decode_mask(path, read_picture(path), any_value=True), "linear"
+            )
             assert samples is not None
             even = samples.values.mean(axis=2) / np.exp(within[rows[view]])
             values[compared.observed[:, column], column, 0] = even.mean(axis=1)
             advance(column + 1)
     return exposures_of_points(values, compared.places)
-
-
-def _apply_given(pictures: list[TableRow]) -> None:
-    """Take the gains that the user gave, and fit the others to them; without any, their geometric mean becomes 1."""
-    stated = [math.nan if (gain := p.record.given_gain) is None else math.log(gain) for p in pictures]
-    known = np.isfinite(stated)
-    logs = np.array([picture.log for picture in pictures])
-    shift = float(np.median((np.array(stated) - logs)[known])) if known.any() else -float(logs.mean())
-    for picture, fixed, is_fixed in zip(pictures, stated, known, strict=True):
-        picture.log = fixed if is_fixed else picture.log + shift
 
 
 def _say_how(
@@ -241,7 +246,8 @@ def _say_how(
     files: NDArray[np.float64],
     scatter: float | None,
     lost: list[str],
-    significance: str,
+    gains: Array | None,
+    errors: Array,
     reporter: Reporter,
 ) -> None:
     """Where the gains come from."""
@@ -250,7 +256,15 @@ def _say_how(
     if scatter is not None:
         origin = f"Gains: exposures that the files state, and points in common ({by_points} of {len(views)} views); "
         reporter.say(f"{origin}the two differ by {scatter:.1%} (robust standard deviation).")
-    elif by_points:
+    elif gains is not None and by_points:
+        applied = int(np.count_nonzero(np.nan_to_num(gains)))
+        usual = float(np.median(errors))
+        significance = f"They do not differ significantly (error {usual:.0%}): none is applied."
+        if applied:
+            known = int(np.isfinite(gains).sum())
+            significance = (
+                f"{known - applied} of {known} are not significant (error {usual:.0%}) and not applied."
+            )
         reporter.say(
             f"Gains: from points in common ({by_points} of {len(views)} views); the files do not state exposures. "
             f"{significance}"
@@ -262,16 +276,6 @@ def _say_how(
             f"The gains of {len(lost)} of {len(views)} views are not known ({listed(lost)}): their files state no "
             f"exposure, and fewer than {FEWEST} points tell it. They are taken for average; {TABLE} may say better."
         )
-
-
-def _significance(logs: Array, errors: Array) -> str:
-    """How many of the gains by points are applied."""
-    known = int(np.isfinite(logs).sum())
-    applied = int(np.count_nonzero(np.nan_to_num(logs)))
-    usual = float(np.median(errors))
-    if applied:
-        return f"{known - applied} of {known} are not significant (error {usual:.0%}) and not applied."
-    return f"They do not differ significantly (error {usual:.0%}): none is applied."
 
 
 def _warn(

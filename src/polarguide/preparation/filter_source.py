@@ -141,9 +141,11 @@ class ShotsSource(Source):
         Raises:
             PolarguideError: the largest is too large.
         """
-        pixel = max(map(len, self._of_view.values())) * _WORKED
         require_memory_of_each(
-            self._shots, pixel, what, remedy="Make all pictures smaller by the same factor."
+            self._shots,
+            max(map(len, self._of_view.values())) * _WORKED,
+            what,
+            remedy="Make all pictures smaller by the same factor.",
         )
 
     def _angles(self, view: str) -> Sequence[Angle]:
@@ -344,10 +346,18 @@ class SinglesSource(ShotsSource):
         stated_sizes = ((stated_size(path), path) for path in self._shots if not is_camera_raw(path))
         # Width and height may be exchanged by the side that the camera was held on.
         sizes = ((f"{max(size)}x{min(size)}", path) for size, path in stated_sizes if size is not None)
-        alike = "Export all pictures of one camera alike, without a crop."
-        require_one(self._root, sizes, "photographs of one size", alike)
-        kinds = ((kind_of_file(path), path) for path in self._shots)
-        require_one(self._root, kinds, "photographs of one kind of file", COMPARABLE)
+        require_one(
+            self._root,
+            sizes,
+            "photographs of one size",
+            "Export all pictures of one camera alike, without a crop.",
+        )
+        require_one(
+            self._root,
+            ((kind_of_file(path), path) for path in self._shots),
+            "photographs of one kind of file",
+            COMPARABLE,
+        )
         levels, counted = levels_of_pictures(self._shots, self._white, self._settings)
         decision = self._decided(levels)
         stated, missing = light_of_files(self._of_view, advance)
@@ -375,8 +385,14 @@ class SinglesSource(ShotsSource):
             for shot, angle in zip(singles, angles, strict=True)
         ]
         upright = np.stack([apply_orientation(picture, shots.orientation) for picture in shots.values])
-        notes = shift_notes(view, shots.shifts) if usual else []
-        return self._developed(shots, upright, shots.invalid, notes, angles, exposures=exposures)
+        return self._developed(
+            shots,
+            upright,
+            shots.invalid,
+            shift_notes(view, shots.shifts) if usual else [],
+            angles,
+            exposures=exposures,
+        )
 
     def _angles(self, view: str) -> list[Angle]:
         return [shot.angle for shot in self._singles[view]]

@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,20 +45,10 @@ from polarguide.preparation.settings import (
 from polarguide.preparation.source import MosaicSource, Source, StokesSource
 
 
-def _views_of_masks(files: Iterable[Path], views: Sequence[str]) -> dict[str, Path]:
-    """Masks by view: called like it, as COLMAP and Metashape name masks (``cup.jpg.png``, ``cup_mask.png``), or so."""
-    masks: dict[str, Path] = {}
-    pictures = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
-    for shorten in (str, view_of_name, lambda name: name.removesuffix("_mask")):
-        for path in pictures:
-            view = shorten(stem_of(path))
-            if view in views:
-                masks.setdefault(view, path)
-    return masks
-
-
 def _found_masks(folder: Path, views: Sequence[str]) -> dict[str, Path]:
-    """The object masks of a folder, by view.
+    """Return the object masks of a folder by view.
+
+    Masks are named like views, or as COLMAP and Metashape name them (``cup.jpg.png``, ``cup_mask.png``).
 
     Raises:
         PolarguideError: there is no such folder, or none of its pictures is named like a view.
@@ -70,12 +60,18 @@ def _found_masks(folder: Path, views: Sequence[str]) -> dict[str, Path]:
             found=f"{folder}, which is not a folder",
             remedy="Give the folder that holds <view>.png.",
         )
-    masks = _views_of_masks(folder.iterdir(), views)
+    files = sorted(folder.iterdir())
+    masks: dict[str, Path] = {}
+    for shorten in (str, view_of_name, lambda name: name.removesuffix("_mask")):
+        for path in files:
+            view = shorten(stem_of(path))
+            if view in views and path.suffix.lower() in SUFFIXES:
+                masks.setdefault(view, path)
     if not masks:
         raise PolarguideError(
             folder,
             expected=f"masks named like the views ({listed(list(views), 3)})",
-            found=listed(sorted(path.name for path in folder.iterdir()), 3) or "no file",
+            found=listed([path.name for path in files], 3) or "no file",
             remedy="Rename them; views without a mask are used whole.",
         )
     return masks
@@ -190,7 +186,13 @@ def _require_photographs(root: Path) -> None:
     files = list(index_files(root, SHOT_SUFFIXES).values())
     if not files or index_files(root, tuple(set(RAW_SUFFIXES) - set(SHOT_SUFFIXES))):
         raise _unknown_layout(root)
-    gray = [path.name for path in (files[0], files[-1]) if _may_be_mosaic(path)]
+    # Raw mosaics are gray.
+    gray = []
+    for path in (files[0], files[-1]):
+        if path.suffix.lower() in RAW_SUFFIXES:
+            pixels = decode_picture(path, read_picture(path))
+            if (pixels[..., 0] == pixels[..., 1]).all():
+                gray.append(path.name)
     if gray:
         raise PolarguideError(
             root,
@@ -217,14 +219,6 @@ def _require_photographs(root: Path) -> None:
             remedy=f"Give the angles in their order, such as --angles {angles} --shots-per-view {each}. Ordinary "
             "photographs, without a filter: --angles none.",
         )
-
-
-def _may_be_mosaic(path: Path) -> bool:
-    """True where a picture may be a raw mosaic: it is gray, and its file format can hold mosaics."""
-    if path.suffix.lower() not in RAW_SUFFIXES:
-        return False
-    pixels = decode_picture(path, read_picture(path))
-    return not (pixels[..., 0] != pixels[..., 1]).any()
 
 
 def frames_of_video(
@@ -297,9 +291,12 @@ def _unknown_layout(root: Path) -> PolarguideError:
     if mosaics:
         command = f"polarguide prepare {source} {out} --sensor IMX250MYR"
         remedy = f"Raw mosaics: {command}, or yours of {SENSOR_NAMES}. {remedy}"
-    inside = None if named else _folder_of_pictures(root)
-    if inside is not None:
-        remedy = f"Give the folder that the pictures are in, such as {inside}. {remedy}"
+    suffixes = SHOT_SUFFIXES + RAW_SUFFIXES
+    below = () if named else os.walk(root)
+    inside = (folder for folder, _, names in below if any(name.lower().endswith(suffixes) for name in names))
+    folder = next(inside, None)
+    if folder is not None:
+        remedy = f"Give the folder that the pictures are in, such as {Path(folder)}. {remedy}"
     return PolarguideError(
         root,
         expected="shots through a filter, raw mosaics with --sensor, or a published dataset",
@@ -308,26 +305,16 @@ def _unknown_layout(root: Path) -> PolarguideError:
     )
 
 
-def _folder_of_pictures(root: Path) -> Path | None:
-    """The first folder below that holds pictures, for a hint."""
-    for folder, _, names in os.walk(root):
-        if any(name.lower().endswith(SHOT_SUFFIXES + RAW_SUFFIXES) for name in names):
-            return Path(folder)
-    return None
-
-
-def poses_beside(root: Path) -> list[str]:
-    """Names of what holds poses in a folder of pictures, for a hint."""
-    names = (
-        "sparse",
-        "transforms.json",
-        "transforms_train.json",
-        "cameras.xml",
-        "cameras.npz",
-        "cameras_new.npz",
-        "cameras_sphere.npz",
-    )
-    return [name for name in names if (root / name).exists()]
+POSES_BESIDE = (
+    "sparse",
+    "transforms.json",
+    "transforms_train.json",
+    "cameras.xml",
+    "cameras.npz",
+    "cameras_new.npz",
+    "cameras_sphere.npz",
+)
+"""Names of files and folders of poses that may lie beside pictures."""
 
 
 def _source(

@@ -66,11 +66,11 @@ from polarguide.preparation.journal import (
     request_of,
 )
 from polarguide.preparation.open_source import (
+    POSES_BESIDE,
     frames_of_video,
     known_poses,
     open_source,
     origin_of_poses,
-    poses_beside,
     settle_pose_frames,
 )
 from polarguide.preparation.settings import PrepareSettings, known_intrinsics
@@ -264,15 +264,16 @@ class SceneFolder:
         angles: Sequence[Angle] = ANGLES,
     ) -> None:
         """Write the pictures of a view, then its record."""
-        codes = intensity_codes(intensities, invalid, getattr(self.measured, "rounding", EXACT))
-        record.files = write_view(self.root, view, codes, invalid, mask, angles)
+        record.files = write_view(
+            self.root,
+            view,
+            intensity_codes(intensities, invalid, getattr(self.measured, "rounding", EXACT)),
+            invalid,
+            mask,
+            angles,
+        )
         self.views[view] = record
         self.save()
-
-    def hold_out(self, views: Sequence[str]) -> None:
-        """Note which views are for tests, unless the user has."""
-        if views and not os.path.lexists(self.root / SPLIT):
-            write_whole(self.root / SPLIT, to_json({"test": list(views)}))
 
     def drop(self, view: str) -> None:
         """Remove a view that an earlier call without poses wrote, and that has none."""
@@ -495,8 +496,8 @@ def prepare_scene(
         reporter.say(note)
     for warning in poses.warnings if poses is not None else ():
         reporter.warn(warning)
-    beside = poses_beside(root) if settings.poses == "sfm" else []
-    if beside:
+    beside = [name for name in POSES_BESIDE if (root / name).exists()]
+    if beside and settings.poses == "sfm":
         ways = " or ".join(f"--poses {shlex.quote(str(root / name))}" for name in beside)
         reporter.say(
             f"Poses by structure from motion. The folder holds poses, too: {ways} takes them instead."
@@ -555,7 +556,9 @@ def _write_scene(
         reporter.say(note)
     if poses is not None:
         _write_model(folder, poses)
-        folder.hold_out([view for view in poses.views if view in tests])
+        held_out = [view for view in poses.views if view in tests]
+        if held_out and not os.path.lexists(folder.root / SPLIT):
+            write_whole(folder.root / SPLIT, to_json({"test": held_out}))
     if pictures.kind == "singles":
         write_exposure_table(
             folder.root, folder.views, settings.gains, posed=poses is not None, reporter=reporter

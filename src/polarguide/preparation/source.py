@@ -276,8 +276,9 @@ class StokesSource(Source):
             advance(number)
         bright = float(np.percentile(np.concatenate(peaks), _BRIGHT))
         if not largest > 0:
-            found = "intensities that are all 0 or less"
-            raise not_as_published(self.paths[0], "light in at least one view", found)
+            raise not_as_published(
+                self.paths[0], "light in at least one view", "intensities that are all 0 or less"
+            )
         white = min(largest, _HEADROOM * bright) if bright > 0 else largest
         share = negative / max(1, 12 * count)
         sense, note = self._settle_sense([rim for rim in rims if rim is not None])
@@ -562,16 +563,16 @@ class MosaicSource(Source):
             advance(count)
         assert shape is not None
         settings = self._settings
-        full = agreed_full_scale(stated)
         levels, counted = levels_of_capture(
-            counts, container, settings, black=settings.black_level, stated=full
+            counts, container, settings, black=settings.black_level, stated=agreed_full_scale(stated)
         )
         levels = replace(levels, gamma=settings.gamma if self._dataset is None else self._dataset.gamma)
         if self._dataset is None:
             assert settings.sensor is not None
             require_kind(settings.sensor, np.concatenate(blocks), levels)
-        dark = self._mosaics.dark(shape[0])
-        ratio, colors = self._mosaics.light_of_blocks(samples, levels, dark, cut.shape)
+        ratio, colors = self._mosaics.light_of_blocks(
+            samples, levels, self._mosaics.dark(shape[0]), cut.shape
+        )
         analyzers = self._mosaics.analyzers
         gains, notes = pair_gains(
             ratio,
@@ -621,8 +622,7 @@ class MosaicSource(Source):
 
     def develop(self, view: str, measured: MosaicMeasured) -> DevelopedView:
         """Read one mosaic: validity, levels, gains, then demosaicing, then the sense of the angles."""
-        path = self._files[view]
-        stored = self._mosaics.read(path)
+        stored = self._mosaics.read(self._files[view])
         dark = self._mosaics.dark(stored.shape)
         values = self._mosaics.cut(stored)
         levels = measured.levels

@@ -165,8 +165,7 @@ def shift_notes(view: str, shifts: Sequence[Shift]) -> list[str]:
 
 def _detail(shot: NDArray[np.float32]) -> NDArray[np.float32]:
     gray = np.log(shot.mean(axis=2) + np.float32(0.01))
-    fine = cv2.GaussianBlur(gray, (0, 0), 0.8) - cv2.GaussianBlur(gray, (0, 0), 5.0)
-    return np.asarray(fine, np.float32)
+    return np.asarray(cv2.GaussianBlur(gray, (0, 0), 0.8) - cv2.GaussianBlur(gray, (0, 0), 5.0), np.float32)
 
 
 def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
@@ -184,15 +183,17 @@ def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
         x = y = 0.0
     warp = np.array([[1, 0, x], [0, 1, y]], np.float32)
     try:
-        everywhere = np.ones(reference.shape, np.uint8)
         score, moved = cv2.findTransformECC(
-            reference, other, warp, cv2.MOTION_TRANSLATION, _CRITERIA, everywhere, 5
+            reference, other, warp, cv2.MOTION_TRANSLATION, _CRITERIA, np.ones(reference.shape, np.uint8), 5
         )
     except cv2.error:  # it does not converge where there is no detail to compare
         return Shift(0.0, 0.0, False)
     x, y = (float(value) for value in np.asarray(moved)[:, 2])
-    trusted = score > 0.3 and max(abs(x), abs(y)) <= limit and bool(np.isfinite([x, y]).all())
-    return Shift(round(x, 3), round(y, 3), trusted)
+    return Shift(
+        round(x, 3),
+        round(y, 3),
+        score > 0.3 and max(abs(x), abs(y)) <= limit and bool(np.isfinite([x, y]).all()),
+    )
 
 
 _TURN_SIDE = 1024

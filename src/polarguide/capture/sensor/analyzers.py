@@ -71,8 +71,7 @@ def correction_matrices(analyzers: list[Array], nominal: NDArray[Any]) -> Array:
         minor = minor + w[i] * (u[k] * v[m] - u[m] * v[k])
         left.append(minor if j % 2 == 0 else -minor)
     rest = [0.5 if int(angle) % 90 == 0 else -0.5 for angle in nominal]
-    along = dot(rest, left)
-    length = np.copysign(np.sqrt(dot(left, left)), along)
+    length = np.copysign(np.sqrt(dot(left, left)), dot(rest, left))
     left = [part / length for part in left]
     cosine = [{0: 1.0, 90: -1.0}.get(int(angle), 0.0) for angle in nominal]
     sine = [{45: 1.0, 135: -1.0}.get(int(angle), 0.0) for angle in nominal]
@@ -484,8 +483,7 @@ def read_analyzers(path: Path) -> AnalyzerCalibration:
     try:
         with in_utf8(path) as name, safe_open(name, framework="numpy") as file:
             entries = file.metadata() or {}
-            names = list(file.keys())
-            vectors = file.get_tensor(_TENSOR) if names == [_TENSOR] else None
+            vectors = file.get_tensor(_TENSOR) if list(file.keys()) == [_TENSOR] else None
     except (SafetensorError, ValueError, OSError, RuntimeError, TypeError) as error:
         raise _damaged(path, f"damaged or foreign data ({str(error)[:200]})") from None
     if _ENTRY not in entries or vectors is None:
@@ -531,8 +529,9 @@ def _require_sound(path: Path, calibration: AnalyzerCalibration) -> None:
     if not (np.isfinite(calibration.vectors).all() and (gain > 0).all()):
         raise _damaged(path, "vectors that are not finite, or have no throughput")
     if gain.min() < 1 / MOST_THROUGHPUT or gain.max() > MOST_THROUGHPUT:
-        throughputs = f"throughputs of {gain.min():g} to {gain.max():g}, whose mean is 1/2 in such a file"
-        raise _damaged(path, throughputs)
+        raise _damaged(
+            path, f"throughputs of {gain.min():g} to {gain.max():g}, whose mean is 1/2 in such a file"
+        )
     if (
         np.hypot(calibration.vectors[..., 1], calibration.vectors[..., 2]) < LEAST_DIATTENUATION * gain
     ).any():
