@@ -63,7 +63,15 @@ def priors(
         PolarguideError: the scene cannot be read, a view has no such pictures, or an option is wrong or means nothing
             here.
     """
-    _require_options_of_maps(shots, maps=bool(formats))
+    given = [name for name in changed(shots) if not (formats and name in _OF_MAPS)]
+    if given:
+        hint = " With --formats it applies to the maps." if given[0] in _OF_MAPS else ""
+        raise PolarguideError(
+            shots.called(given[0]),
+            expected="shots",
+            found="a scene with poses",
+            remedy=f"Leave it out: the scene has developed pictures and cameras.{hint}",
+        )
     refuse_scene(Path(out))
     loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
     index = index_of(refractive_index, loaded.refractive_index)
@@ -115,16 +123,3 @@ def shot_priors(
         refractive_index=index_of(refractive_index, stated),
         reporter=reporter,
     )
-
-
-def _require_options_of_maps(shots: ShotOptions, *, maps: bool) -> None:
-    """Refuse options of shots that mean nothing for views of a scene; ``maps``: maps are written."""
-    given = [name for name in changed(shots) if not (maps and name in _OF_MAPS)]
-    if given:
-        more = " With --formats it applies to the maps." if given[0] in _OF_MAPS else ""
-        raise PolarguideError(
-            shots.called(given[0]),
-            expected="shots",
-            found="a scene with poses",
-            remedy=f"Leave it out: the scene has developed pictures and cameras.{more}",
-        )

@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from polarguide.capture.view import View
 from polarguide.core.errors import PolarguideError, optional_import
@@ -26,11 +25,19 @@ from polarguide.core.records import to_json
 from polarguide.visualization import figures
 from polarguide.visualization.figures import FONT, INK, Picture
 from polarguide.visualization.pages import data_uri, page, page_part, script_json
-from polarguide_shots.develop import check_files
 from polarguide_shots.exposures import find_shots, name_fault, require_elsewhere, require_own_folder
 from polarguide_shots.maps import REASONS, Reason, ShotMaps
 from polarguide_shots.options import ShotOptions
-from polarguide_shots.read import UNREADABLE, SurfaceMaps, camera_of, fault_of, read_shot, surface_maps, tiles
+from polarguide_shots.read import (
+    UNREADABLE,
+    SurfaceMaps,
+    camera_of,
+    check_files,
+    fault_of,
+    read_shot,
+    surface_maps,
+    tiles,
+)
 from polarguide_shots.sets import ExposureSet
 
 FORMATS = ("png", "exr", "npy", "page")
@@ -531,21 +538,17 @@ def _colored(
     if kind.look == "angle":
         picture = figures.aolp_to_rgb(numbers, torch.from_numpy(np.ascontiguousarray(dolp)) / stretch.high)
     elif kind.look == "normal":
-        return _normal_colors(numbers)
+        colors = torch.where(
+            (numbers != 0).any(dim=-1, keepdim=True),
+            (numbers * torch.tensor([1.0, -1.0, -1.0]) + 1) / 2 * 255,
+            torch.tensor(NOTHING),
+        )
+        return np.asarray(torch.floor(colors + 0.5).clamp(0, 255).to(torch.uint8).numpy())
     else:
         picture = figures.scalar_to_rgb(numbers * kind.factor, stretch.low, stretch.high, kind.color_map)
         picture[~np.isfinite(values)] = NOTHING
     picture[reason > Reason.NOISE] = NOTHING
     return picture
-
-
-def _normal_colors(normals: Tensor) -> Picture:
-    colors = torch.where(
-        (normals != 0).any(dim=-1, keepdim=True),
-        (normals * torch.tensor([1.0, -1.0, -1.0]) + 1) / 2 * 255,
-        torch.tensor(NOTHING),
-    )
-    return np.asarray(torch.floor(colors + 0.5).clamp(0, 255).to(torch.uint8).numpy())
 
 
 _GRAYS: dict[Look, str] = {

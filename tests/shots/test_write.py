@@ -260,7 +260,7 @@ def test_a_view_that_does_not_fit_into_memory_is_refused_by_its_header(
 ) -> None:
     (found, *_) = find_shots([demo_scene])
     monkeypatch.setattr("polarguide.capture.layout.free_memory", lambda: 1 << 20)
-    monkeypatch.setattr("polarguide_shots.develop.read_view", lambda *_, **__: pytest.fail("it was decoded"))
+    monkeypatch.setattr("polarguide_shots.read.read_view", lambda *_, **__: pytest.fail("it was decoded"))
     Fault(found="a view of 128x96 that take").raised_by(read_shot, found, ShotOptions())
 
 

@@ -32,9 +32,9 @@ from polarguide.capture.filter.camera_files import (
     orientation_calibration,
     read_exposure_data,
 )
-from polarguide.capture.filter.develop import Shift, align_shots, estimate_shifts, linear_intensities
+from polarguide.capture.filter.develop import Shift, align_shots, estimate_shifts
 from polarguide.capture.filter.shots import Shots, read_stack
-from polarguide.capture.formats.pictures import may_use_fewer_bits
+from polarguide.capture.formats.pictures import linear_codes, may_use_fewer_bits
 from polarguide.capture.layout import require_memory, require_memory_of_each
 from polarguide.capture.raw_options import GainOptions, RawMosaicOptions, SampledOptions
 from polarguide.capture.sensor.analyzers import (
@@ -54,6 +54,7 @@ from polarguide.capture.sensor.pattern import (
     tiled,
 )
 from polarguide.capture.sensor.raw_file import RawFormat, read_mosaic, require_mosaic
+from polarguide.capture.view import FULL_CODE
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_file
 from polarguide.core.progress import Advance
@@ -571,7 +572,7 @@ class LinearShots:
     @classmethod
     def of(cls, shots: Shots, transfer: str, *, align: bool) -> LinearShots:
         """Decode the stored values, and align the shots if ``align``."""
-        values = linear_intensities(shots.pictures, transfer)
+        values = linear_codes(shots.pictures, transfer).astype(np.float32) / np.float32(FULL_CODE)
         shifts = estimate_shifts(values) if align else [Shift(0.0, 0.0, True)] * len(values)
         values, (saturated, dark), outside = align_shots(values, (shots.clipped, shots.dark), shifts)
         return cls(

@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import os
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path, PurePath
 from typing import Annotated, Any, Generic, TypeVar
 
@@ -127,6 +128,7 @@ class Journal(msgspec.Struct, Generic[M]):
     prepare: State[M]
 
 
+_BLOCK = 1 << 20
 _PATHS = ("dark_frame", "analyzers", "angles", "poses", "masks")
 """Settings that may be paths; the files there are among those of the request."""
 
@@ -186,13 +188,16 @@ def _stamps(files: Mapping[str, Path], known: Mapping[str, FileStamp]) -> dict[s
 
 def _digest(path: Path) -> str:
     """Return the SHA-256 of a file; "" of a pipe, a device or an unreadable file, which its reader refuses."""
+    digest = hashlib.sha256()
     if not path.is_file():
         return ""
     try:
         with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+            for block in iter(partial(file.read, _BLOCK), b""):
+                digest.update(block)
     except OSError:
         return ""
+    return digest.hexdigest()
 
 
 def changed_entry(before: Request, now: Request) -> tuple[str, str, str] | None:

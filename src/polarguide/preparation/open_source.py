@@ -375,7 +375,10 @@ def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto
         def sizes(view: str) -> tuple[tuple[int, int], ...]:
             assumed.add(view)
             stored = pictures.stored(view if view in known else pictures.views[0])
-            return stored.turned_first if poses_of == "displayed" else stored.sizes
+            sizes = stored.sizes
+            if poses_of == "displayed" and stored.orientation in QUARTER_TURNS:
+                sizes = (*sizes[1:2], *sizes[:1], *sizes[2:])  # turned, stored, developed
+            return sizes
 
         cameras, tests = read_parts(parts, pictures.views, sizes)
         poses = Poses.of_cameras(cameras, path, pictures.views, list(parts.values()))

@@ -55,7 +55,7 @@ from polarguide.core.progress import Reporter
 from polarguide.core.records import decode, option_name, read_record, shortened, to_json
 from polarguide.core.system import hold_folder
 from polarguide.core.text import canonical, stem_of
-from polarguide.preparation.exposure_table import write_exposure_table
+from polarguide.preparation.filter_source import write_exposure_table
 from polarguide.preparation.journal import (
     Journal,
     Measured,

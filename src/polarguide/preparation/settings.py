@@ -210,7 +210,16 @@ class CalibrationOptions:
         else:
             calibration = read_calibration(self.calibration)
         if self.order is not None:
-            calibration = replace(calibration, order=_four_angles(self.order))
+            try:
+                first, second, third, fourth = (int(angle) for angle in self.order.split(","))
+            except ValueError:
+                raise PolarguideError(
+                    "--order",
+                    expected="four angles such as 90,45,0,135",
+                    found=repr(self.order),
+                    remedy="Name the angle of the pictures called 0, 45, 90 and 135, in this order.",
+                ) from None
+            calibration = replace(calibration, order=(first, second, third, fourth))
         if self.sense is not None:
             calibration = replace(calibration, sense=self.sense)
         return calibration if self.zero is None else replace(calibration, zero=self.zero)
@@ -289,19 +298,6 @@ def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
             remedy="Give four or eight numbers; the center of the first pixel is at 0.5.",
         )
     return ("PINHOLE" if len(numbers) == 4 else "OPENCV"), numbers
-
-
-def _four_angles(text: str) -> tuple[int, int, int, int]:
-    try:
-        first, second, third, fourth = (int(angle) for angle in text.split(","))
-    except ValueError:
-        raise PolarguideError(
-            "--order",
-            expected="four angles such as 90,45,0,135",
-            found=repr(text),
-            remedy="Name the angle of the pictures called 0, 45, 90 and 135, in this order.",
-        ) from None
-    return first, second, third, fourth
 
 
 def _absolute(path: Path | None) -> Path | None:

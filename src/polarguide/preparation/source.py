@@ -93,11 +93,6 @@ class Stored:
         turned = (self.size[::-1],) if self.orientation in QUARTER_TURNS else ()
         return (self.size, *turned, *(() if self.developed is None else (self.developed,)))
 
-    @property
-    def turned_first(self) -> tuple[tuple[int, int], ...]:
-        """``sizes`` with the turned one first, if the picture is turned by a quarter."""
-        return tuple(sorted(self.sizes, key=lambda size: self.size is None or size != self.size[::-1]))
-
 
 class Source(Protocol):
     """The pictures of one capture.

@@ -10,11 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.pictures import linear_codes
-from polarguide.capture.view import FULL_CODE
-from polarguide.capture.write import Rounding, rounding_of
 from polarguide.geometry.polarizer import ANGLES
-from polarguide.optics.color import srgb_decode_array
 
 SMALLEST = 0.2
 """Shifts below this many pixels are not corrected: resampling would blur more, and polarization causes errors of the
@@ -235,18 +231,3 @@ def _turn(reference: NDArray[np.float32], other: NDArray[np.float32], shift: Shi
         return shift
     x, y = (round(float(value), 3) for value in middle)
     return Shift(x, y, True, tuple(float(f"{value:.9g}") for value in warp[:2].ravel()))
-
-
-def linear_intensities(pictures: NDArray[Any], transfer: str) -> NDArray[np.float32]:
-    """Stored values -> linear intensities in [0, 1], same shape, float32."""
-    return linear_codes(pictures, transfer).astype(np.float32) / np.float32(FULL_CODE)
-
-
-def rounding_of_bytes(transfer: str, smallest: float) -> Rounding:
-    """Rounding of the codes of 8-bit pictures, by their steps, which grow with sRGB's.
-
-    Args:
-        transfer: "linear" or "srgb". smallest: factor of the linear intensities.
-    """
-    levels = np.arange(256) / 255
-    return rounding_of(FULL_CODE * smallest * (srgb_decode_array(levels) if transfer == "srgb" else levels))

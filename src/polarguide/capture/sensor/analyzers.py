@@ -248,7 +248,10 @@ class AnalyzerCalibration:
         for index, (row, column) in enumerate(np.ndindex(2, 2)):
             part[:] = 0
             for other, sample in enumerate(samples):
-                part += np.multiply(_expanded(matrices[index, other], rows, columns), sample, out=product)
+                plane = matrices[index, other]
+                if plane.shape != sample.shape:  # cells share matrices
+                    plane = plane[:, columns][rows]
+                part += np.multiply(plane, sample, out=product)
             out[inside][row::2, column::2] = part
         return out
 
@@ -315,7 +318,10 @@ class AnalyzerCalibration:
         order = [places.index(angle) for angle in ANGLES]
         cells = cells[order][:, order]
         if pattern.colors is None:
-            planes = [_resized(cells, scale)]
+            planes = [_repeated(cells, 2 // scale)]
+            if scale == 4:
+                parts = [cells[..., r::2, c::2] for r, c in np.ndindex(2, 2)]
+                planes = [np.mean(parts, axis=0, dtype=np.float32)]
         else:
             corners = [(row, column) for row, column in np.ndindex(2, 2)]
             planes = []
@@ -387,20 +393,6 @@ def grid_shape(offset: tuple[int, int], size: tuple[int, int], block: int) -> tu
 def _region(offset: tuple[int, int], size: tuple[int, int]) -> str:
     place = f" from column {offset[0]}, row {offset[1]} on" if any(offset) else ""
     return f"{size[0]}x{size[1]} pixels{place}"
-
-
-def _expanded(plane: Array, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
-    """The plane [R, C] at every cell; itself where each cell has a matrix of its own."""
-    if plane.shape == (len(rows), len(columns)):
-        return plane
-    return np.asarray(plane[:, columns][rows])
-
-
-def _resized(cells: Array, scale: int) -> Array:
-    """Matrices of cells [4, 4, h, w] at the pixels of intensities."""
-    if scale == 4:
-        return np.mean([cells[..., r::2, c::2] for r, c in np.ndindex(2, 2)], axis=0, dtype=np.float32)
-    return _repeated(cells, 2 // scale)
 
 
 def _repeated(planes: Array, times: int) -> Array:

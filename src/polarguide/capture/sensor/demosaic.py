@@ -309,7 +309,11 @@ def outliers(values: NDArray[Any], period: int) -> tuple[NDArray[np.bool_], NDAr
     places = [
         (y, x) for y in (0, period, 2 * period) for x in (0, period, 2 * period) if (y, x) != (period, period)
     ]
-    around = _sorted([padded[y : y + height, x : x + width] for y, x in places])
+    around = [padded[y : y + height, x : x + width] for y, x in places]
+    for low, high in _NETWORK:
+        a = around[low]
+        b = around[high]
+        around[low], around[high] = np.minimum(a, b), np.maximum(a, b)
     least = around[0].astype(np.float32)
     most = around[7].astype(np.float32)
     middle = (around[3].astype(np.float32) + around[4]) / 2
@@ -327,15 +331,6 @@ _NETWORK = (
 )  # fmt: skip
 """Comparisons that sort eight values (Batcher's odd-even merge sort): on whole pictures, faster than a sort of each
 pixel."""
-
-
-def _sorted(eight: list[NDArray[Any]]) -> list[NDArray[Any]]:
-    """Eight pictures, sorted at every pixel."""
-    for low, high in _NETWORK:
-        a = eight[low]
-        b = eight[high]
-        eight[low], eight[high] = np.minimum(a, b), np.maximum(a, b)
-    return eight
 
 
 def _noise(rise: NDArray[np.float32], middle: NDArray[np.float32]) -> NDArray[np.float32]:
