@@ -115,7 +115,7 @@ def _print_outcome(outcome: Any) -> None:
     say(f"table: {outcome.folder}/table.csv, .jsonl{pictures}")
 
 
-def priors(
+def run_priors(
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional],
     /,
     *,

@@ -15,7 +15,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.checks import measured_gains, pair_moments
-from polarguide.capture.develop import MosaicFiles, exposures_of_view, stated_exposures
+from polarguide.capture.develop import LinearShots, MosaicFiles, exposures_of_view, stated_exposures
 from polarguide.capture.filter.camera_files import exif_data
 from polarguide.capture.filter.develop import align_shots, estimate_shifts
 from polarguide.capture.filter.encoding import (
@@ -27,13 +27,14 @@ from polarguide.capture.filter.encoding import (
     stated_transfer,
     transfer_of_pictures,
 )
-from polarguide.capture.filter.shots import Shots, read_stack
+from polarguide.capture.filter.shots import Shots, read_stack, stacked
 from polarguide.capture.formats.pictures import decode_mask, decode_picture
 from polarguide.capture.sensor.demosaic import defects
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
 from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
 from polarguide.optics.color import srgb_encode_array as srgb_encode
 from polarguide.preparation.filter_source import SinglesSource
+from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.preparation.source import MosaicSource
 from polarguide_shots.options import ShotOptions
@@ -205,6 +206,26 @@ def test_mosaics_turned_by_a_quarter_are_turned_back(tmp_path, flip, turns, sens
     assert (MosaicFiles(settings).read(tmp_path / "v.png") == values).all()
     stored = MosaicSource(tmp_path, settings).stored("v")
     assert (stored.size, stored.developed) == ((128, 96), (64, 48))
+
+
+def test_a_mosaic_larger_than_the_sensor_is_refused(tmp_path):
+    np.save(tmp_path / "v.npy", np.random.default_rng(0).integers(0, 4096, (2100, 2500), np.uint16))
+    fault = Fault(str(tmp_path / "v.npy"), expected="2464x2056", found="2500x2100", remedy="--sensor")
+    settings = PrepareSettings(sensor="IMX250MZR", poses="none")
+    fault.raised_by(prepare_scene, tmp_path, tmp_path / "out", settings)
+    fault.raised_by(read_shot, tmp_path / "v.npy", ShotOptions(sensor="IMX250MZR"))
+
+
+def test_gains_of_a_calibration_are_not_measured_again():
+    """Pair sums would take them for exposures, and the pictures would be divided by both."""
+    gains = np.array([1.0, 1.15, 1.0, 1.0])
+    light = np.repeat((0.6 * four() * gains[:, None, None])[..., None], 3, axis=3)
+    shots = LinearShots.of(stacked(np.rint(light * 65535).astype(np.uint16)), "linear", align=False)
+    names = ["a", "b", "c", "d"]
+    for calibration, exposures in ((Calibration(), gains), (Calibration(gains=(1, 1.15, 1, 1)), np.ones(4))):
+        values, found, _ = shots.evenly_exposed(names, [1.0] * 4, PrepareSettings(calibration=calibration))
+        assert np.ptp(np.log(found) - np.log(exposures)) < 1e-2
+        assert values == pytest.approx(light / np.array(found)[:, None, None, None], rel=1e-3)
 
 
 def test_a_whole_sensor_that_stands_upright_is_refused(tmp_path):

@@ -37,7 +37,7 @@ VERBS = {
     "present": ("polarguide.cli.captures", "present"),
     "share": ("polarguide.cli.runs", "share"),
     "export": ("polarguide.cli.runs", "export"),
-    "priors": ("polarguide_shots.verbs", "priors"),
+    "priors": ("polarguide_shots.verbs", "run_priors"),
     "measure": ("polarguide_shots.verbs", "measure"),
     "compare": ("polarguide_bench.verbs.compare", "compare"),
     "ablate": ("polarguide_bench.verbs.compare", "ablate"),

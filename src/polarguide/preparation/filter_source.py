@@ -65,7 +65,7 @@ from polarguide.capture.point_exposures import (
 )
 from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.view import ANGLES, FULL_CODE, listed
-from polarguide.capture.write import EXACT, Rounding, picture_names, rounding_of
+from polarguide.capture.write import EXACT, picture_names, rounding_of
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import write_whole
 from polarguide.core.progress import Advance, Reporter
@@ -195,15 +195,15 @@ class ShotsSource(Source):
             warnings.warn(decision.doubt, PolarguideWarning, stacklevel=2)
         return decision
 
-    def _rounding(self, transfer: str, smallest: float) -> Rounding:
+    def _rounding(self, transfer: str, smallest: float) -> tuple[tuple[int, int], ...]:
         """Rounding of codes: by the steps of 8-bit values, which grow with sRGB's; none for 16 bits."""
         first = self._shots[:1]
         if self._settings.precision == "full" or read_stack(first, self._white).pictures.dtype != np.uint8:
-            return EXACT
+            return tuple(EXACT)
         levels = np.arange(256) / 255
         if transfer == "srgb":
             levels = srgb_decode_array(levels)
-        return rounding_of(FULL_CODE * smallest * levels)
+        return tuple(rounding_of(FULL_CODE * smallest * levels))
 
     def _name(self, path: Path) -> str:
         """A photograph's name in its folder."""
@@ -281,7 +281,7 @@ class FilterSource(ShotsSource):
         smallest = scale / (max(gains) if gains is not None else 1.0 / room)
         every = [value for of_view in stated.values() for value in of_view] or [1.0]
         return ShotsMeasured(
-            transfer=decision.transfer,
+            transfer="srgb" if decision.transfer == "srgb" else "linear",
             scale=scale * min(1.0, *every),
             rounding=self._rounding(decision.transfer, smallest * min(1.0, *every) / max(1.0, *every)),
             levels=levels,
@@ -370,7 +370,7 @@ class SinglesSource(ShotsSource):
         light = {self._name(path): value for path, value in stated.items()}
         stating = f"{'All' if light else 'None'} of {len(self._shots)} files state their exposure (EXIF)."
         return ShotsMeasured(
-            transfer=decision.transfer,
+            transfer="srgb" if decision.transfer == "srgb" else "linear",
             scale=1.0,
             rounding=self._rounding(decision.transfer, 1.0),
             levels=levels,
