@@ -701,7 +701,7 @@ def _tell(pictures: list[TableRow], reporter: Reporter) -> None:
     width = max(len("picture"), *(len(picture.file) for picture in listing))
     rows = [f"{'picture':<{width}}   angle    gain  stops  points"]
     for picture in listing:
-        gain = picture.record.gain
+        gain = picture.record.gain or 1.0
         angle = angle_text(picture.record.angle)
         stops = f"{math.log2(gain):+.2f}"
         rows.append(f"{picture.file:<{width}} {angle:>7} {gain:>7.3f} {stops:>6} {picture.points:>7}")
