@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from polarguide.api.captures import inspect, prepare, present
     from polarguide.api.runs import Run, demo_scene, open_run, train
     from polarguide.capture import Scene, load_scene
-    from polarguide.capture.sensor.analyzer_file import read_analyzers
-    from polarguide.capture.sensor.analyzers import AnalyzerCalibration
+    from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers
     from polarguide.core.errors import PolarguideError, PolarguideWarning
     from polarguide.core.options import SceneOptions, SessionOptions
     from polarguide.core.progress import Reporter
@@ -42,8 +41,7 @@ _NAMES = {
     "polarguide.api.captures": ("inspect", "prepare", "present"),
     "polarguide.api.runs": ("Run", "demo_scene", "open_run", "train"),
     "polarguide.capture": ("Scene", "load_scene"),
-    "polarguide.capture.sensor.analyzer_file": ("read_analyzers",),
-    "polarguide.capture.sensor.analyzers": ("AnalyzerCalibration",),
+    "polarguide.capture.sensor.analyzers": ("AnalyzerCalibration", "read_analyzers"),
     "polarguide.core.errors": ("PolarguideError", "PolarguideWarning"),
     "polarguide.core.options": ("SceneOptions", "SessionOptions"),
     "polarguide.core.progress": ("Reporter",),

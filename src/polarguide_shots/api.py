@@ -63,7 +63,15 @@ def priors(
         PolarguideError: the scene cannot be read, a view has no such pictures, or an option is wrong or means nothing
             here.
     """
-    _require_options_of_maps(shots, maps=bool(formats))
+    given = [name for name in changed(shots) if not (formats and name in _OF_MAPS)]
+    if given:
+        hint = " With --formats it applies to the maps." if given[0] in _OF_MAPS else ""
+        raise PolarguideError(
+            shots.called(given[0]),
+            expected="shots",
+            found="a scene with poses",
+            remedy=f"Leave it out: the scene has developed pictures and cameras.{hint}",
+        )
     refuse_scene(Path(out))
     loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
     index = index_of(refractive_index, loaded.refractive_index)
@@ -102,32 +110,16 @@ def shot_priors(
         PolarguideError: nothing can be read, or an option is wrong or means nothing here.
     """
     many = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
-    index = index_of(refractive_index, _index_from_scene_json(many))
+    metadata = Path(many[0]) / "scene.json" if len(many) == 1 else None
+    stated = None
+    if metadata is not None and metadata.is_file():
+        stated = refractive_index_of(metadata, read_file(metadata))
     return write_shots(
         many,
         out,
         shots,
         formats=FORMATS if formats is None else formats,
         intrinsics=intrinsics,
-        refractive_index=index,
+        refractive_index=index_of(refractive_index, stated),
         reporter=reporter,
     )
-
-
-def _index_from_scene_json(paths: Sequence[PathLike]) -> float | None:
-    """The refractive index in the ``scene.json`` of shots from one folder; None where it has none."""
-    file = Path(paths[0]) / "scene.json" if len(paths) == 1 else None
-    return refractive_index_of(file, read_file(file)) if file is not None and file.is_file() else None
-
-
-def _require_options_of_maps(shots: ShotOptions, *, maps: bool) -> None:
-    """Refuse options of shots that mean nothing for views of a scene; ``maps``: maps are written."""
-    given = [name for name in changed(shots) if not (maps and name in _OF_MAPS)]
-    if given:
-        more = " With --formats it applies to the maps." if given[0] in _OF_MAPS else ""
-        raise PolarguideError(
-            shots.called(given[0]),
-            expected="shots",
-            found="a scene with poses",
-            remedy=f"Leave it out: the scene has developed pictures and cameras.{more}",
-        )

@@ -174,9 +174,12 @@ def _or_fault(
     except PolarguideError as error:
         fault = error
     except OSError as error:
-        found = error.strerror or str(error)
-        remedy = "Check its permissions."
-        fault = PolarguideError(folder, expected="a folder that can be read", found=found, remedy=remedy)
+        fault = PolarguideError(
+            folder,
+            expected="a folder that can be read",
+            found=error.strerror or str(error),
+            remedy="Check its permissions.",
+        )
     return [ExposureSet(folder.resolve().name, "filter", {}, fault=fault, others=(folder,))]
 
 
@@ -243,7 +246,7 @@ def _named_apart(shots: list[ExposureSet]) -> list[ExposureSet]:
 
     So is a name that a folder cannot have.
     """
-    shots = [shot if usable_name(shot.name) else _unusable(shot) for shot in shots]
+    shots = [replace(shot, fault=shot.fault or name_fault(shot)) for shot in shots]
     names = Counter(shot.name for shot in shots)
     apart = [
         shot
@@ -254,27 +257,30 @@ def _named_apart(shots: list[ExposureSet]) -> list[ExposureSet]:
     named: dict[str, list[ExposureSet]] = {}
     for shot in apart:
         named.setdefault(shot.name, []).append(shot)
-    return [shot if len(named[shot.name]) == 1 else _ambiguous(shot, named[shot.name]) for shot in apart]
+    for place, shot in enumerate(apart):
+        others = [other for other in named[shot.name] if other is not shot]
+        if others:
+            fault = PolarguideError(
+                shot.paths[0],
+                expected="one shot of each name",
+                found=f"{shot.name} also at {others[0].paths[0]}",
+                remedy="Rename one of them, or give them in two calls.",
+            )
+            apart[place] = replace(shot, fault=shot.fault or fault)
+    return apart
 
 
-def usable_name(name: str) -> bool:
-    """Whether a shot of this name can have a folder of that name."""
-    return name not in ("", ".", "..") and os.sep not in name and not (os.altsep and os.altsep in name)
-
-
-def require_name(shot: ExposureSet) -> None:
-    """Raise an error if a shot's name cannot name a folder: its files would be written elsewhere.
-
-    Raises:
-        PolarguideError: no folder can have the shot's name.
-    """
-    if not usable_name(shot.name):
-        raise PolarguideError(
-            shot.paths[0],
-            expected="a name that a folder can have",
-            found=repr(shot.name),
-            remedy="Rename the file.",
-        )
+def name_fault(shot: ExposureSet) -> PolarguideError | None:
+    """Return the error of a shot whose name cannot name a folder: its files would be written elsewhere."""
+    name = shot.name
+    if name not in ("", ".", "..") and os.sep not in name and not (os.altsep and os.altsep in name):
+        return None
+    return PolarguideError(
+        shot.paths[0],
+        expected="a name that a folder can have",
+        found=repr(shot.name),
+        remedy="Rename the file.",
+    )
 
 
 def require_own_folder(shot: ExposureSet, folder: Path) -> None:
@@ -308,22 +314,3 @@ def require_elsewhere(paths: Sequence[str | os.PathLike[str]], out: Path) -> Non
                 found="that of the shots",
                 remedy="Give another --out.",
             )
-
-
-def _unusable(shot: ExposureSet) -> ExposureSet:
-    try:
-        require_name(shot)
-    except PolarguideError as error:
-        return replace(shot, fault=shot.fault or error)
-    return shot
-
-
-def _ambiguous(shot: ExposureSet, alike: Sequence[ExposureSet]) -> ExposureSet:
-    other = next(other for other in alike if other is not shot)
-    fault = PolarguideError(
-        shot.paths[0],
-        expected="one shot of each name",
-        found=f"{shot.name} also at {other.paths[0]}",
-        remedy="Rename one of them, or give them in two calls.",
-    )
-    return replace(shot, fault=shot.fault or fault)

@@ -209,8 +209,9 @@ def noise_line(x: NDArray[np.float64], y: NDArray[np.float64], least: float) -> 
     floor = float(y.mean())
     slope = 0.0
     for _ in range(3):
-        matrix = np.stack([np.ones_like(x), x], axis=1) * weight[:, None]
-        (floor, slope), *_ = np.linalg.lstsq(matrix, y * weight, rcond=None)
+        (floor, slope), *_ = np.linalg.lstsq(
+            np.stack([np.ones_like(x), x], axis=1) * weight[:, None], y * weight, rcond=None
+        )
         if slope < 0:
             floor = float((y * weight**2).sum() / (weight**2).sum())
             slope = 0.0

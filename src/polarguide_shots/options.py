@@ -9,27 +9,35 @@ from typing import Annotated, Literal
 import tyro
 from msgspec import Meta
 
-from polarguide.capture.raw_options import OWNERS, RawOptions, changed, misplaced
+from polarguide.capture.raw_options import (
+    CameraOptions,
+    EncodedOptions,
+    FilterOptions,
+    RawMosaicOptions,
+    RawOptions,
+    SetOptions,
+    changed,
+    misplaced,
+)
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import check_finite
 from polarguide.core.records import option_name
 
 Kind = Literal["mosaic", "filter", "set", "scene"]
-"""What a shot is made of: one file, one each at 0, 45, 90 and 135 degrees, others at any angles, a view of a scene."""
-_KINDS = {
-    "mosaic": "raw mosaics",
-    "filter": "shots through a filter",
-    "set": "sets at other angles",
-    "scene": "views of a scene",
+"""Kinds of shots: one file, one each at 0, 45, 90 and 135 degrees, others at any angles, a view of a scene."""
+_KINDS: dict[str, type[CameraOptions]] = {
+    "raw mosaics": RawMosaicOptions,
+    "shots through a filter": FilterOptions,
+    "sets at other angles": SetOptions,
+    "views of a scene": EncodedOptions,
 }
-_ONE: dict[Kind, str] = {
-    "mosaic": "a raw mosaic",
-    "filter": "a shot through a filter",
-    "set": "a set at other angles",
-    "scene": "a view of a scene",
+"""Types of options by the names of the kinds of shots in messages."""
+_ONE: dict[Kind, tuple[str, type[CameraOptions]]] = {
+    "mosaic": ("a raw mosaic", RawMosaicOptions),
+    "filter": ("a shot through a filter", FilterOptions),
+    "set": ("a set at other angles", SetOptions),
+    "scene": ("a view of a scene", EncodedOptions),
 }
-_OWNERS = OWNERS | {"align": ("filter",), "gains": ("mosaic", "filter")}
-"""Single shots are corrected for their own gains, and only four are aligned."""
 _OPTION_OF = {"analyzers": "--calibration (of polarguide calibrate)", "align": "--no-align"}
 
 
@@ -46,15 +54,15 @@ class ShotOptions(RawOptions):
             scale.
         demosaic: full, half or quarter resolution of the sensor.
         align: Estimate and correct small shifts between the four shots of a filter; sets at other angles are not moved.
-        gains: none corrects only exposures that the files state (EXIF), auto also what the light of each shot tells of
-            the gains of the angles.
+        gains: exif corrects only exposures that the files state, auto also what the light of each shot tells of the
+            gains of the angles; none leaves both.
         full_well: Electrons of a sample at full scale, for its noise; without it the noise is estimated from each shot.
         read_noise: Electrons of noise without light; goes with the full well.
         snr: DoLP in units of its standard deviation from which on an angle counts.
     """
 
     demosaic: Literal["half", "quarter", "full"] = "full"
-    gains: Literal["auto", "none"] = "none"
+    gains: Literal["auto", "exif", "none"] = "exif"
     full_well: Annotated[float, Meta(ge=10, le=1e9)] | None = None
     read_noise: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
     snr: Annotated[float, Meta(ge=0, le=1000)] = 3.0
@@ -90,9 +98,10 @@ class ShotOptions(RawOptions):
         Raises:
             PolarguideError: one is set.
         """
-        here = f"{name}, {_ONE[kind]}"
-        for option, owners in misplaced(self, kind, _KINDS, _OWNERS):
-            alone = owners == [_KINDS["mosaic"]] and self.sensor is None
+        words, owner = _ONE[kind]
+        here = f"{name}, {words}"
+        for option, owners in misplaced(self, owner, _KINDS):
+            alone = owners == ["raw mosaics"] and self.sensor is None
             more = " Raw mosaics need --sensor." if alone else ""
             raise PolarguideError(
                 self.called(option),

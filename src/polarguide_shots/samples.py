@@ -15,7 +15,7 @@ from torch import Tensor
 
 from polarguide.capture import checks
 from polarguide.capture.calibration import ANGLES, Calibration
-from polarguide.capture.develop import COMPARABLE, require_one, stated_exposures
+from polarguide.capture.develop import COMPARABLE, levels_of_shot, require_one, stated_exposures
 from polarguide.capture.exposures import Angle, Exposure, analyzers, turned
 from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
 from polarguide.capture.filter.encoding import VIDEO, kind_of_file, transfer_of_pictures
@@ -24,7 +24,6 @@ from polarguide.capture.formats.headers import rescaled
 from polarguide.capture.formats.pictures import linear_codes
 from polarguide.capture.layout import require_memory
 from polarguide.capture.picture_sets import Mask, SetSamples
-from polarguide.capture.sensor.pattern import FULL_16, Levels, clipping_bits, estimate_levels
 from polarguide.capture.view import FULL_CODE, View
 from polarguide.capture.view_reader import ViewData, require_alike
 from polarguide.core.errors import PolarguideError
@@ -123,7 +122,10 @@ def _samples(
     known = [picture for picture in pictures if not isinstance(picture.angle, str)]
     angles = [float(picture.angle) for picture in known]
     code = read.orientation
-    levels, level_notes = levels_of_shot(read.pictures, 8 * kind.itemsize, options)
+    container = 8 * kind.itemsize
+    bits = options.bits or container
+    measured, level_notes = levels_of_shot(read.pictures, container, options, bits=bits)
+    levels = None if measured.is_full(container) else measured
     every = np.arange(np.iinfo(kind).max + 1, dtype=kind)
     step = 1 / float(np.iinfo(kind).max)
     if levels is not None:
@@ -135,9 +137,8 @@ def _samples(
     )
     linear = linear_codes(every, decision.transfer)
     as_stored = levels is None and kind == np.uint16 and decision.transfer == "linear"
-    for picture, clipped in zip(
-        read.pictures, read.clipped, strict=True
-    ):  # one after the other, as memory is
+    # One picture at a time limits memory.
+    for picture, clipped in zip(read.pictures, read.clipped, strict=True):
         if levels is not None:
             clipped |= (picture >= levels.saturation).any(axis=2)
         if not as_stored:
@@ -168,44 +169,6 @@ def _judged(read: Shots, every: NDArray[Any]) -> Shots:
     pictures = checks.sampled(read.pictures)
     sample = checks.sampled(usable[None])
     return Shots(every[pictures], 1, ~sample, np.zeros(sample.shape[1:], bool))
-
-
-def levels_of_shot(
-    values: NDArray[Any], container: int, options: ShotOptions
-) -> tuple[Levels | None, list[str]]:
-    """Full scale and saturation of the pictures of one shot, and notes; None where they are those of the files.
-
-    Full scale is never guessed from the values of one shot, or shots of a series would be on several scales.
-
-    Args:
-        values: [K, ...] stored values. container: bits of a value in the files.
-
-    Raises:
-        PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.
-    """
-    pile, notes = piled_up(values, container, options)
-    if pile is None and options.bits is None and options.saturation is None:
-        return None, []
-    bits = options.bits or container
-    top = options.saturation or pile
-    return estimate_levels(int(values.max()), 1, container, bits=bits, black=0.0, saturation=top), notes
-
-
-def piled_up(values: NDArray[Any], container: int, options: ShotOptions) -> tuple[int | None, list[str]]:
-    """The value below full scale at which samples of 16-bit files clip, unless options state it; and a note of it."""
-    top = int(values.max())
-    bits = top.bit_length()
-    specified = options.bits is not None or options.saturation is not None
-    # The last condition is cheaper than counting values, and follows from the rule of ``clipping_bits``.
-    if container != 16 or top == FULL_16 or specified or top != (1 << bits) - 1:
-        return None, []
-    counts = sum((np.bincount(part.ravel(), minlength=FULL_16 + 1) for part in values), np.zeros(1, np.int64))
-    if clipping_bits(counts) is None:
-        return None, []
-    return top, [
-        f"Values pile up at {top} ({counts[top] / counts.sum():.1%} of the samples): taken as saturated. "
-        f"--bits {bits} makes it full scale."
-    ]
 
 
 def require_no_order(calibration: Calibration, name: str) -> None:

@@ -79,9 +79,12 @@ def measure(
         print_error(outcome.trouble)
     if outcome.waiting:
         names = ", ".join(outcome.waiting[:4]) + (", ..." if len(outcome.waiting) > 4 else "")
-        unmeasured = f"{len(outcome.waiting)} that are not, and were not measured ({names})"
-        remedy = "Complete, rename or remove their files; the same command goes on."
-        error = PolarguideError(watching.watch, expected="complete shots", found=unmeasured, remedy=remedy)
+        error = PolarguideError(
+            watching.watch,
+            expected="complete shots",
+            found=f"{len(outcome.waiting)} that are not, and were not measured ({names})",
+            remedy="Complete, rename or remove their files; the same command goes on.",
+        )
         print_error(str(error))
     status: int = outcome.exit_status
     return status
@@ -112,7 +115,7 @@ def _print_outcome(outcome: Any) -> None:
     say(f"table: {outcome.folder}/table.csv, .jsonl{pictures}")
 
 
-def priors(
+def run_priors(
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional],
     /,
     *,

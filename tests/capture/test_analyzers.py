@@ -12,8 +12,13 @@ import pytest
 from faults import Fault
 from made_sensor import COLORS, MadeSensor, made_sensor, true_calibration
 
-from polarguide.capture.sensor.analyzer_file import read_analyzers, write_analyzers
-from polarguide.capture.sensor.analyzers import AnalyzerCalibration, correction_matrices, spread_to_cells
+from polarguide.capture.sensor.analyzers import (
+    AnalyzerCalibration,
+    correction_matrices,
+    read_analyzers,
+    spread_to_cells,
+    write_analyzers,
+)
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.geometry.polarizer import ANGLES
 

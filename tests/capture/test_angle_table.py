@@ -20,7 +20,7 @@ from polarguide.capture.filter.shots import find_single_shots
 from polarguide.capture.point_exposures import PointExposures, exposures_of_points
 from polarguide.geometry.polarizer import ANGLES, malus, stokes_of_four
 from polarguide.inspection.capture import read_capture
-from polarguide.preparation.exposure_table import reconciled
+from polarguide.preparation.filter_source import reconciled
 from tests.helpers.tiny_capture import NAMES, TinyCapture, write_picture, write_tiny_capture
 
 

@@ -14,7 +14,7 @@ from faults import Fault
 from made_sensor import made_sensor, true_calibration, write_codes
 
 from polarguide.capture.calibration import Calibration
-from polarguide.capture.sensor.analyzer_file import write_analyzers
+from polarguide.capture.sensor.analyzers import write_analyzers
 from polarguide.geometry.polarizer import ANGLES, stokes_of_four
 from polarguide.inspection.capture import read_capture
 from polarguide.inspection.corrections import analyzer_check, corrected

@@ -15,7 +15,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.checks import measured_gains, pair_moments
-from polarguide.capture.develop import MosaicFiles, exposures_of_view, stated_exposures
+from polarguide.capture.develop import LinearShots, MosaicFiles, exposures_of_view, stated_exposures
 from polarguide.capture.filter.camera_files import exif_data
 from polarguide.capture.filter.develop import align_shots, estimate_shifts
 from polarguide.capture.filter.encoding import (
@@ -27,15 +27,16 @@ from polarguide.capture.filter.encoding import (
     stated_transfer,
     transfer_of_pictures,
 )
-from polarguide.capture.filter.shots import Shots, read_stack
+from polarguide.capture.filter.shots import Shots, read_stack, stacked
 from polarguide.capture.formats.pictures import decode_mask, decode_picture
 from polarguide.capture.sensor.demosaic import defects
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
 from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
 from polarguide.optics.color import srgb_encode_array as srgb_encode
 from polarguide.preparation.filter_source import SinglesSource
-from polarguide.preparation.mosaic_source import MosaicSource
+from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
+from polarguide.preparation.source import MosaicSource
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.read import read_shot
 
@@ -207,6 +208,26 @@ def test_mosaics_turned_by_a_quarter_are_turned_back(tmp_path, flip, turns, sens
     assert (stored.size, stored.developed) == ((128, 96), (64, 48))
 
 
+def test_a_mosaic_larger_than_the_sensor_is_refused(tmp_path):
+    np.save(tmp_path / "v.npy", np.random.default_rng(0).integers(0, 4096, (2100, 2500), np.uint16))
+    fault = Fault(str(tmp_path / "v.npy"), expected="2464x2056", found="2500x2100", remedy="--sensor")
+    settings = PrepareSettings(sensor="IMX250MZR", poses="none")
+    fault.raised_by(prepare_scene, tmp_path, tmp_path / "out", settings)
+    fault.raised_by(read_shot, tmp_path / "v.npy", ShotOptions(sensor="IMX250MZR"))
+
+
+def test_gains_of_a_calibration_are_not_measured_again():
+    """Pair sums would take them for exposures, and the pictures would be divided by both."""
+    gains = np.array([1.0, 1.15, 1.0, 1.0])
+    light = np.repeat((0.6 * four() * gains[:, None, None])[..., None], 3, axis=3)
+    shots = LinearShots.of(stacked(np.rint(light * 65535).astype(np.uint16)), "linear", align=False)
+    names = ["a", "b", "c", "d"]
+    for calibration, exposures in ((Calibration(), gains), (Calibration(gains=(1, 1.15, 1, 1)), np.ones(4))):
+        values, found, _ = shots.evenly_exposed(names, [1.0] * 4, PrepareSettings(calibration=calibration))
+        assert np.ptp(np.log(found) - np.log(exposures)) < 1e-2
+        assert values == pytest.approx(light / np.array(found)[:, None, None, None], rel=1e-3)
+
+
 def test_a_whole_sensor_that_stands_upright_is_refused(tmp_path):
     np.save(tmp_path / "v.npy", np.random.default_rng(0).integers(0, 4096, (2448, 2048), np.uint16))
     fault = Fault(found="2048x2448", remedy="--flip 90")
@@ -268,8 +289,8 @@ def test_a_turned_camera_is_turned_back():
     motions = estimate_shifts(stack)
     turns = [np.degrees(np.arcsin(motion.warp[1])) for motion in motions[1:]]
     assert turns == pytest.approx([0.4, 0.8, 1.2], abs=0.06)
-    moved, bad = align_shots(stack, np.zeros(stack.shape[:3], bool), motions)
-    off = np.abs(moved[..., 0] - light)[:, ~bad.any(axis=0)]
+    moved, _, outside = align_shots(stack, (), motions)
+    off = np.abs(moved[..., 0] - light)[:, ~outside]
     assert np.median(off) < 0.3 * np.median(np.abs(shots - light))
 
 
@@ -423,10 +444,10 @@ def test_the_full_scale_that_a_file_states_is_used(tmp_path, kind, full):
     settings = PrepareSettings(sensor="IMX250MZR", poses="none", gains="none", calibration=Calibration())
     source = MosaicSource(tmp_path, settings)
     measured = source.measure(lambda done: None)
-    assert (measured["levels"]["white"], measured["levels"]["saturation"]) == (full, full)
-    assert f"{full} is full scale, as the files state" in measured["notes"][-1]
+    assert (measured.levels.white, measured.levels.saturation) == (full, full)
+    assert f"{full} is full scale, as the files state" in measured.notes[-1]
     shot = read_shot(path, ShotOptions(sensor="IMX250MZR"))
-    assert any("as the file states" in note for note in shot.notes)
+    assert any("full scale, as the file" in note for note in shot.notes)
 
 
 def test_significant_bits_of_png_may_be_at_the_top(tmp_path):
@@ -441,8 +462,8 @@ def test_significant_bits_of_png_may_be_at_the_top(tmp_path):
             values / 1023, abs=2e-3
         )
         settings = PrepareSettings(sensor="IMX250MZR")
-        levels = MosaicSource(folder, settings).measure(lambda done: None)["levels"]
-        assert levels["saturation"] == 65472
+        levels = MosaicSource(folder, settings).measure(lambda done: None).levels
+        assert levels.saturation == 65472
 
 
 def test_full_scales_that_contradict_one_another_or_the_values_are_refused(tmp_path):
@@ -482,7 +503,7 @@ def test_a_tag_that_one_file_of_several_lacks_corrects_nothing(tmp_path, name, v
     assert "EXIF corrects no exposure" in missing
     assert missing in read_shot(tmp_path, ShotOptions()).notes
     measured = SinglesSource(tmp_path, PrepareSettings(poses="none")).measure(lambda done: None)
-    assert (measured["light"], measured["notes"][-1]) == ({}, missing)
+    assert (measured.light, measured.notes[-1]) == ({}, missing)
     for path, time in zip(files, (100, 100, 50), strict=True):
         exposed(path, **{"TIME": IFDRational(1, time), name: value})
     gains, missing = stated_exposures({"cup": files})

@@ -257,7 +257,7 @@ def measured(root: Path, given: str | None = None) -> str:
     settings = PrepareSettings(calibration=Calibration(sense=given))  # type: ignore[arg-type]
     kind = detect_dataset(root)
     assert kind is not None
-    return StokesSource(open_dataset(root, kind), settings).measure(lambda count: None)["sense"]
+    return StokesSource(open_dataset(root, kind), settings).measure(lambda count: None).sense
 
 
 def test_geometry_decides_where_the_release_does_not(tmp_path: Path) -> None:
@@ -281,7 +281,7 @@ def test_a_sense_that_was_found_is_the_one_that_views_are_written_in(tmp_path: P
     source = StokesSource(open_dataset(tmp_path / "in", "nersp"), replace(PrepareSettings(), gains="none"))
     found = source.measure(lambda count: None)
     four = source.develop("0000", found).intensities
-    s0, s1, s2 = ball(-1) * found["scale"]
+    s0, s1, s2 = ball(-1) * found.scale
     np.testing.assert_allclose(four[1] - four[3], -s2, atol=1e-5)
     np.testing.assert_allclose(four[0] - four[2], s1, atol=1e-5)
     np.testing.assert_allclose(four.sum(axis=0) / 2, s0, atol=1e-5)

@@ -71,7 +71,7 @@ def test_chunks_of_png_state_the_encoding(tmp_path, kind, content, transfer, bit
     path = with_chunk(write(tmp_path / "v.png", light([0])[0][0], bits), kind, content)
     stated = stated_transfer([path])
     assert (stated and stated[0]) == transfer
-    assert measured(tmp_path, angles="none")["transfer"] == (transfer or {8: "srgb", 16: "linear"}[bits])
+    assert measured(tmp_path, angles="none").transfer == (transfer or {8: "srgb", 16: "linear"}[bits])
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_chunks_of_png_state_the_encoding(tmp_path, kind, content, transfer, bit
 def test_other_encodings_of_png_are_refused(tmp_path, kind, content, found):
     path = with_chunk(write(tmp_path / "v.png", light([0])[0][0]), kind, content)
     Fault(str(path), found=found).raised_by(measured, tmp_path, angles="none")
-    assert measured(tmp_path, angles="none", transfer="srgb")["transfer"] == "srgb"
+    assert measured(tmp_path, angles="none", transfer="srgb").transfer == "srgb"
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg", ".webp"])
@@ -140,8 +140,8 @@ def test_photographs_of_8_bits_are_srgb(tmp_path, suffix):
     for number in range(2):
         write(tmp_path / f"v{number}{suffix}", srgb_encode(light([0])[0][0]))
     found = measured(tmp_path, angles="none")
-    assert found["transfer"] == "srgb"
-    assert sum("Transfer srgb, as 8-bit" in note for note in found["notes"]) == 1
+    assert found.transfer == "srgb"
+    assert sum("Transfer srgb, as 8-bit" in note for note in found.notes) == 1
 
 
 SIX, THREE = (10, 40, 70, 100, 130, 160), (0, 60, 120)
@@ -156,7 +156,7 @@ def test_pairs_at_right_angles_tell_the_encoding(tmp_path, suffix, encode):
         write(tmp_path / f"cup_a{angle}{suffix}", encode(picture))
     maps = read_shot(tmp_path, ShotOptions())
     assert np.median(np.abs(maps.dolp - degree)) < 0.01
-    assert measured(tmp_path)["transfer"] == ("srgb" if encode is srgb_encode else "linear")
+    assert measured(tmp_path).transfer == ("srgb" if encode is srgb_encode else "linear")
 
 
 def test_three_angles_of_8_bits_are_linear_with_a_warning(tmp_path):
@@ -164,11 +164,11 @@ def test_three_angles_of_8_bits_are_linear_with_a_warning(tmp_path):
     for angle, picture in zip(THREE, light(THREE)[0], strict=True):
         write(tmp_path / f"cup_a{angle}.png", srgb_encode(picture))
     with pytest.warns(PolarguideWarning, match="state no encoding"):
-        assert measured(tmp_path)["transfer"] == "linear"
+        assert measured(tmp_path).transfer == "linear"
     assert any("state no encoding" in note for note in read_shot(tmp_path, ShotOptions()).notes)
     for path in tmp_path.iterdir():
         with_chunk(path, b"sRGB", b"\0")
-    assert measured(tmp_path)["transfer"] == "srgb"
+    assert measured(tmp_path).transfer == "srgb"
 
 
 def test_pair_sums_are_believed_against_a_statement(tmp_path):
@@ -176,7 +176,7 @@ def test_pair_sums_are_believed_against_a_statement(tmp_path):
     for angle, picture in zip(SIX, light(SIX)[0], strict=True):
         with_chunk(write(tmp_path / f"cup_a{angle}.png", picture), b"gAMA", struct.pack(">I", 45455))
     with pytest.warns(PolarguideWarning, match="state srgb .a gAMA chunk"):
-        assert measured(tmp_path)["transfer"] == "linear"
+        assert measured(tmp_path).transfer == "linear"
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from polarguide.capture.sensor.pattern import SENSORS
 from polarguide.capture.sensor.raw_file import PACKINGS
 from polarguide.core import files
 from polarguide.core.system import only_writer
-from polarguide.preparation import folder as folder_module
+from polarguide.preparation import prepare as prepare_module
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 
@@ -75,7 +75,7 @@ def test_a_preparation_that_could_not_write_at_all_is_begun_again(
 def test_a_stopped_preparation_gives_the_same_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_mosaics(tmp_path / "in", 3)
     prepare_scene(tmp_path / "in", tmp_path / "whole", MOSAIC)
-    write, count = folder_module.SceneFolder.write_view, [0]
+    write, count = prepare_module.SceneFolder.write_view, [0]
 
     def stop(self: object, *arguments: object) -> None:
         count[0] += 1
@@ -83,7 +83,7 @@ def test_a_stopped_preparation_gives_the_same_files(tmp_path: Path, monkeypatch:
             raise KeyboardInterrupt
         write(self, *arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(folder_module.SceneFolder, "write_view", stop)
+    monkeypatch.setattr(prepare_module.SceneFolder, "write_view", stop)
     with pytest.raises(KeyboardInterrupt):
         prepare_scene(tmp_path / "in", tmp_path / "out", MOSAIC)
     assert not (tmp_path / "out" / "scene.json").exists()
@@ -288,7 +288,7 @@ def test_a_fault_of_ours_is_not_said_to_be_one_of_the_folder(
     def fails(*_: object, **__: object) -> None:
         raise ValueError("of ours")
 
-    monkeypatch.setattr("polarguide.preparation.mosaic_source.demosaic", fails)
+    monkeypatch.setattr("polarguide.preparation.source.demosaic", fails)
     with pytest.raises(ValueError, match="of ours"):
         prepare_scene(tmp_path / "source", tmp_path / "out", MOSAIC)
 

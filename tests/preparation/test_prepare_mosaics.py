@@ -25,7 +25,7 @@ from heard import Heard
 from made_sensor import MadeSensor, made_sensor, true_calibration, write_codes
 
 from polarguide.capture.calibration import Calibration
-from polarguide.capture.sensor.analyzer_file import write_analyzers
+from polarguide.capture.sensor.analyzers import write_analyzers
 from polarguide.geometry.polarizer import stokes_of_four
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings

@@ -32,7 +32,7 @@ IDEAL = np.tile(ONE_BLOCK, (24, 32, 1, 1, 1)).astype(np.float32)
 @deferred
 def _made(vectors: Any = IDEAL, mono: bool = True, **changed: Any) -> None:
     """A file with any metadata, and the checksum that belongs to it; mosaics of the monochrome sensor that it is of."""
-    files = importlib.import_module("polarguide.capture.sensor.analyzer_file")
+    files = importlib.import_module("polarguide.capture.sensor.analyzers")
     record = {"format": files.FORMAT, "version": files.VERSION, "units": files.UNITS, "sensor": "IMX250MZR", "lens": "",
               "width": 64, "height": 48, "offset_x": 0, "offset_y": 0, "block": 2, "reference": "mean",
               "polarizer_extinction": None, **changed}  # fmt: skip

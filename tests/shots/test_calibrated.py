@@ -11,7 +11,7 @@ from faults import Fault
 from heard import Heard
 from made_sensor import made_sensor, true_calibration, write_codes
 
-from polarguide.capture.sensor.analyzer_file import write_analyzers
+from polarguide.capture.sensor.analyzers import write_analyzers
 from polarguide_shots.measurement.line import measure_shots
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.read import read_shot

@@ -309,6 +309,34 @@ def test_exposures_that_files_state_are_taken_back(tmp_path: Path, angles: tuple
     assert any("exposures that differ by a factor of 1.25" in note for note in maps.notes)
 
 
+def test_gains_none_leaves_exposures_that_files_state(tmp_path: Path) -> None:
+    paths = []
+    for angle in ANGLES:
+        time = 80 if angle == 90 else 100
+        values = np.full((16, 16, 3), 10000 // time, np.uint8)
+        exif = Image.Exif()
+        exif.get_ifd(0x8769).update({0x829A: 1 / time, 0x829D: 8.0, 0x8827: 100})
+        paths.append(tmp_path / f"cup_{angle}.jpg")
+        Image.fromarray(values).save(paths[-1], quality=100, exif=exif)
+    stated, left = (read_shot(paths, replace(PLAIN, gains=gains)) for gains in ("exif", "none"))
+    assert stated.dolp.max() < 2e-3
+    assert left.dolp == pytest.approx(np.full((16, 16), 25 / 212.5), abs=2e-3)
+
+
+def test_an_edge_without_a_partner_is_masked(tmp_path: Path) -> None:
+    """The camera moved by three pixels before the second shot: dark pixels move along, others leave the picture."""
+    rng = np.random.default_rng(4)
+    scene = cv2.GaussianBlur(rng.random((128, 168)).astype(np.float32), (0, 0), 2)
+    scene = (scene - scene.min()) / np.ptp(scene) * 0.8 + 0.1
+    paths = [tmp_path / name for name in CUP]
+    for path, shift in zip(paths, (0, 3, 0, 0), strict=True):
+        values = np.rint(scene[:, 4 - shift : 164 - shift] * 65535).astype(np.uint16)
+        cv2.imwrite(str(path), np.repeat(values[..., None], 3, axis=2))
+    maps = read_shot(paths, replace(PLAIN, align=True))
+    assert (maps.reason[:, -3:] == Reason.MASKED).all()
+    assert not (maps.reason == Reason.SATURATED).any()
+
+
 @pytest.mark.parametrize("flip", ["x", "y", "xy"])
 def test_a_mirrored_mosaic_with_a_gamma(tmp_path: Path, flip: str) -> None:
     values = malus(light(), np.deg2rad(tiled(sensor_pattern("IMX250MZR").angles, SHAPE))) ** 0.8

@@ -13,8 +13,13 @@ from faults import Fault
 
 import polarguide
 from polarguide.capture.calibration import Calibration
-from polarguide.capture.raw_options import OWNERS, RawOptions
-from polarguide.preparation.settings import PrepareSettings
+from polarguide.capture.raw_options import (
+    EncodedOptions,
+    FilterOptions,
+    RawMosaicOptions,
+    RawOptions,
+    SetOptions,
+)
 from polarguide_shots.exposures import find_shots
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.read import read_shot
@@ -29,13 +34,12 @@ MOSAIC_ONLY: list[dict[str, Any]] = [
 ]  # fmt: skip
 
 
-def test_every_option_with_owners_is_one() -> None:
-    """A name that no option has would refuse nothing."""
-    prepared, shots, common = (
-        {f.name for f in fields(kind)} for kind in (PrepareSettings, ShotOptions, RawOptions)
-    )
-    assert set(OWNERS) <= prepared | shots
-    assert common - set(OWNERS) == {"gains", "calibration"}
+def test_every_option_of_camera_files_has_a_kind() -> None:
+    """An option that no kind has would be allowed everywhere."""
+    kinds = (RawMosaicOptions, FilterOptions, SetOptions, EncodedOptions)
+    of_kinds = {f.name for kind in kinds for f in fields(kind)}
+    assert {f.name for f in fields(RawOptions)} == of_kinds
+    assert {f.name for f in fields(ShotOptions)} - of_kinds == {"full_well", "read_noise", "snr"}
 
 
 @pytest.mark.parametrize("given", MOSAIC_ONLY)

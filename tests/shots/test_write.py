@@ -22,9 +22,8 @@ from polarguide.core.options import SceneOptions
 from polarguide_shots.exposures import find_shots
 from polarguide_shots.maps import Reason, ShotMaps
 from polarguide_shots.options import ShotOptions
-from polarguide_shots.pictures import KINDS, drawn, stretch_of, with_legend
 from polarguide_shots.read import SurfaceMaps, parse_intrinsics, read_shot, surface_maps
-from polarguide_shots.write import PAGE, write_shots
+from polarguide_shots.write import KINDS, PAGE, drawn, stretch_of, with_legend, write_shots
 from tests.helpers.browsers import chromium
 from tests.helpers.heard import Heard
 from tests.helpers.tiny_capture import NAMES, write_tiny_capture
@@ -261,7 +260,7 @@ def test_a_view_that_does_not_fit_into_memory_is_refused_by_its_header(
 ) -> None:
     (found, *_) = find_shots([demo_scene])
     monkeypatch.setattr("polarguide.capture.layout.free_memory", lambda: 1 << 20)
-    monkeypatch.setattr("polarguide_shots.develop.read_view", lambda *_, **__: pytest.fail("it was decoded"))
+    monkeypatch.setattr("polarguide_shots.read.read_view", lambda *_, **__: pytest.fail("it was decoded"))
     Fault(found="a view of 128x96 that take").raised_by(read_shot, found, ShotOptions())
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -31,12 +32,17 @@ from polarguide.capture.filter.camera_files import (
     orientation_calibration,
     read_exposure_data,
 )
-from polarguide.capture.filter.shots import read_stack
-from polarguide.capture.formats.pictures import may_use_fewer_bits
+from polarguide.capture.filter.develop import Shift, align_shots, estimate_shifts
+from polarguide.capture.filter.shots import Shots, read_stack
+from polarguide.capture.formats.pictures import linear_codes, may_use_fewer_bits
 from polarguide.capture.layout import require_memory, require_memory_of_each
-from polarguide.capture.raw_options import RawOptions
-from polarguide.capture.sensor.analyzer_file import read_analyzers
-from polarguide.capture.sensor.analyzers import AnalyzerCalibration, imbalance_notes, spread_to_cells
+from polarguide.capture.raw_options import GainOptions, RawMosaicOptions, SampledOptions
+from polarguide.capture.sensor.analyzers import (
+    AnalyzerCalibration,
+    imbalance_notes,
+    read_analyzers,
+    spread_to_cells,
+)
 from polarguide.capture.sensor.pattern import (
     FULL_16,
     SENSOR_NAMES,
@@ -44,17 +50,17 @@ from polarguide.capture.sensor.pattern import (
     Levels,
     estimate_levels,
     level_notes,
-    require_kind,
     sensor_pattern,
     tiled,
 )
 from polarguide.capture.sensor.raw_file import RawFormat, read_mosaic, require_mosaic
+from polarguide.capture.view import FULL_CODE
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_file
 from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES
 
-QUARTER_TURNS = ("90", "270")
+QUARTER_FLIPS = ("90", "270")
 """Values of ``flip`` for mosaics that were turned, in degrees counter-clockwise."""
 SMALLEST = 16
 """Pixels of the shorter side of a mosaic."""
@@ -72,7 +78,7 @@ class MosaicFiles:
         analyzers: calibration of the sensor, or None.
     """
 
-    def __init__(self, options: RawOptions) -> None:
+    def __init__(self, options: RawMosaicOptions) -> None:
         """Take sensor, region, packing, dark frame and calibration from the options.
 
         Raises:
@@ -112,8 +118,9 @@ class MosaicFiles:
             require_mosaic(where, values, least=SMALLEST)
         values = self._turned_back(where, values)
         if self.analyzers is not None:
-            start = (self._options.offset_x, self._options.offset_y)
-            self.analyzers.require_region(start, values.shape[::-1], self._options.analyzers)
+            self.analyzers.require_region(
+                (self._options.offset_x, self._options.offset_y), values.shape[::-1], self._options.analyzers
+            )
         return values
 
     def _require_memory(self, path: Path) -> None:
@@ -123,26 +130,32 @@ class MosaicFiles:
         if path.suffix.lower() != ".raw":
             require_memory_of_each([path], worked, "a mosaic", remedy=remedy)
         elif raw.width is not None and raw.height is not None:
-            what = f"a mosaic of {raw.width}x{raw.height}"
-            require_memory(path, worked * raw.width * raw.height, what, remedy=remedy)
+            require_memory(
+                path, worked * raw.width * raw.height, f"a mosaic of {raw.width}x{raw.height}", remedy=remedy
+            )
 
     def _turned_back(self, where: Path | str, values: NDArray[Any]) -> NDArray[Any]:
-        """A stored mosaic without the mirroring or the quarter turn that ``flip`` names.
+        """Return a stored mosaic without the mirroring or the quarter turn that ``flip`` names.
 
         Raises:
-            PolarguideError: it fits the sensor on its side alone.
+            PolarguideError: it is larger than the sensor, maybe because it was turned.
         """
         flip = self._options.flip
-        if flip in QUARTER_TURNS:
-            return np.rot90(values, -1 if flip == "90" else 1)
-        size = SENSOR_SIZES[self._sensor]
-        across = values.shape
-        if across[0] > size[1] and across[0] <= size[0] and across[1] <= size[1]:
+        if flip in QUARTER_FLIPS:
+            values = np.rot90(values, -1 if flip == "90" else 1)
+        width, height = SENSOR_SIZES[self._sensor]
+        left = self._options.offset_x
+        top = self._options.offset_y
+        rows, columns = values.shape
+        if columns > width - left or rows > height - top:
+            turned = rows <= width and columns <= height and flip not in QUARTER_FLIPS
             raise PolarguideError(
                 where,
-                expected=f"a mosaic as the sensor lies, at most {size[0]}x{size[1]} pixels",
-                found=f"{across[1]}x{across[0]}, one that was turned by a quarter",
-                remedy="Give --flip 90 if it was turned counter-clockwise before it was saved, 270 if clockwise.",
+                expected=f"a mosaic as the sensor lies, at most {width - left}x{height - top} pixels of {self._sensor}",
+                found=f"{columns}x{rows}" + (", one that was turned by a quarter" if turned else ""),
+                remedy="Give --flip 90 if it was turned counter-clockwise before it was saved, 270 if clockwise."
+                if turned
+                else "Check --sensor, --offset-x and --offset-y.",
             )
         values = values[:, ::-1] if flip in ("x", "xy") else values
         return values[::-1] if flip in ("y", "xy") else values
@@ -153,10 +166,6 @@ class MosaicFiles:
         """
         stated = self._raw.full_scale(path, values) if self._options.bits is None else None
         return self._raw.container(path, values.dtype), stated
-
-    def require_kind(self, blocks: NDArray[Any], levels: Levels) -> None:
-        """Refuse mosaics of the other kind of sensor: nothing later would tell."""
-        require_kind(self._sensor, blocks, levels)
 
     def cut(self, values: NDArray[Any]) -> NDArray[Any]:
         """Crop to whole cells."""
@@ -256,7 +265,7 @@ class MosaicFiles:
         return tiled(factors.astype(np.float32), shape)
 
 
-def calibration_of(options: RawOptions) -> AnalyzerCalibration | None:
+def calibration_of(options: RawMosaicOptions) -> AnalyzerCalibration | None:
     """The calibration of the sensor, read once for all mosaics.
 
     Raises:
@@ -293,27 +302,32 @@ LARGE_IMBALANCE = 0.01
 """Share by which pair sums differ that is worth a note where it is not corrected."""
 
 
-def gains_of(ratio: float | None, options: RawOptions, notes: Mapping[str, str]) -> tuple[Gains, list[str]]:
-    """Gains of the four angles, and what to say of them.
+def pair_gains(
+    ratio: float | None, options: GainOptions, notes: Mapping[str, str], *, calibrated: bool = False
+) -> tuple[Gains, list[str]]:
+    """Return the gains of the four angles, and notes for the user.
 
     Args:
-        ratio: of the pair sums; None where it is too dark to tell.
-        options: ``analyzers`` and gains of a calibration go first, and ``gains``.
+        ratio: ratio of the pair sums; None where it is too dark to measure.
+        options: gains of a calibration take precedence over ``gains``.
         notes: sentence for each outcome, with a place for the ratio's deviation from 1. Outcomes are "dark", "off" (too
             much for gains), "corrected" and "left" (uncorrected, by more than ``LARGE_IMBALANCE``).
+        calibrated: whether the intensities were corrected by analyzer vectors, which include gains.
     """
-    if options.analyzers is not None:
+    if calibrated:
         return UNIT_GAINS, imbalance_notes(ratio)
     if options.calibration.gains is not None:
         return options.calibration.gains, []
     gains = balancing_gains(ratio)
-    outcome = "dark" if ratio is None else "off"
     deviation = 0.0 if ratio is None else ratio - 1
-    if gains is not None:
-        outcome = "corrected" if options.gains == "auto" else "left"
-    said = outcome in notes and (outcome != "left" or abs(deviation) > LARGE_IMBALANCE)
+    if gains is None:
+        outcome = "dark" if ratio is None else "off"
+    elif options.gains == "auto":
+        outcome = "corrected"
+    else:
+        outcome = "left" if abs(deviation) > LARGE_IMBALANCE else ""
     used = gains if gains is not None and outcome == "corrected" else UNIT_GAINS
-    return used, [notes[outcome].format(deviation)] if said else []
+    return used, [notes[outcome].format(deviation)] if outcome in notes else []
 
 
 def as_displayed(
@@ -402,7 +416,7 @@ def exposures_of_view(
     measured = measured_gains(pair_moments(gray, usable))
     off = {} if measured is None else measured.deviating(list(logs - mean))
     if measured is None or not off:
-        return _gains(logs), ""
+        return _as_gains(np.exp(logs)), ""
     differ = float(np.ptp(logs)) >= _EQUAL
     named = ", ".join(
         f"{names[ANGLES.index(angle)]} ({angle} degrees) by {factor - 1:+.0%}"
@@ -413,11 +427,11 @@ def exposures_of_view(
         f"exposed otherwise {than}, by the pair sums: {named}. The pair sums are believed. Automatic exposure, edited "
         "pictures, or a filter that was not turned?"
     )
-    return _gains(np.asarray(measured.logs) + mean), warning
+    return _as_gains(np.exp(np.asarray(measured.logs) + mean)), warning
 
 
-def _gains(logs: NDArray[np.float64]) -> Gains:
-    first, second, third, fourth = (float(value) for value in np.exp(logs))
+def _as_gains(values: Iterable[float]) -> Gains:
+    first, second, third, fourth = map(float, values)
     return first, second, third, fourth
 
 
@@ -442,20 +456,77 @@ def require_one(where: Path, found: Iterable[tuple[str, Path]], expected: str, r
         raise PolarguideError(where, expected=expected, found=named, remedy=remedy)
 
 
-def levels_of_shots(
-    paths: Sequence[Path], white: tuple[float, float, float], options: RawOptions
-) -> tuple[Levels | None, list[str]]:
-    """Levels of the stored values where the files do not state them, and notes for the user.
+def levels_of_capture(
+    counts: NDArray[np.int64],
+    container: int,
+    options: SampledOptions,
+    *,
+    black: float = 0.0,
+    stated: int | None = None,
+) -> tuple[Levels, list[str]]:
+    """Return the levels of the stored values of a capture, and notes for the user.
 
     Args:
-        paths: all files of the capture. white: gains of R, G and B, for camera raw files.
+        counts: number of occurrences of each stored value, from 0. container: bits of a value in the files.
         options: ``bits`` and ``saturation``.
-
-    Returns:
-        None where every file states its full scale, and nothing else is given.
+        black: black level. stated: full scale that all files state.
 
     Raises:
         PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.
+    """
+    occurring = np.flatnonzero(counts)
+    levels = estimate_levels(
+        int(occurring[-1]), int(np.bitwise_or.reduce(occurring)), container,
+        bits=options.bits, black=black, saturation=options.saturation, counts=counts, stated=stated,
+    )  # fmt: skip
+    return levels, level_notes(levels, counts, container, options.bits, stated)
+
+
+def levels_of_shot(
+    values: NDArray[Any],
+    container: int,
+    options: SampledOptions,
+    *,
+    bits: int | None,
+    black: float = 0.0,
+    stated: int | None = None,
+) -> tuple[Levels, list[str]]:
+    """Return the levels of the stored values of a single shot, and notes for the user.
+
+    Values that pile up are saturated, but do not change the full scale: it is the same for all shots of a series.
+
+    Args:
+        values: [K, ...] stored values. bits: bits of a sensor value, if they are known.
+        container, options, black, stated: as for ``levels_of_capture``.
+
+    Raises:
+        PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.
+    """
+    largest = int(values.max())
+    counts = None
+    # Only values that end at a power of two can pile up. Counting takes longer than this test.
+    may_pile_up = container == 16 and largest < FULL_16 and largest & (largest + 1) == 0
+    if may_pile_up and options.bits is None and options.saturation is None:
+        parts = (np.bincount(part.ravel(), minlength=FULL_16 + 1) for part in values)
+        counts = sum(parts, np.zeros(1, np.int64))
+    levels = estimate_levels(
+        largest, int(np.bitwise_or.reduce(values, None)), container,
+        bits=bits, black=black, saturation=options.saturation, counts=counts, stated=stated, alone=True,
+    )  # fmt: skip
+    return levels, level_notes(levels, counts, container, bits, stated)
+
+
+def levels_of_pictures(
+    paths: Sequence[Path], white: tuple[float, float, float], options: SampledOptions
+) -> tuple[Levels | None, list[str]]:
+    """Return the levels of all pictures of a capture, and notes; None where every file states its full scale.
+
+    Args:
+        paths: files of the capture. white: gains of R, G and B, for camera raw files.
+        options: as for ``levels_of_capture``.
+
+    Raises:
+        PolarguideError: as for ``levels_of_capture``.
     """
     wide = [path for path in paths if not is_camera_raw(path) and may_use_fewer_bits(path)]
     if not wide and options.bits is None and options.saturation is None:
@@ -466,10 +537,69 @@ def levels_of_shots(
         values = read_stack([path], white).pictures
         container = 8 * values.dtype.itemsize
         counts += np.bincount(values.ravel(), minlength=len(counts))
-    occurring = np.flatnonzero(counts)
-    levels = estimate_levels(
-        int(occurring[-1]), int(np.bitwise_or.reduce(occurring)), container,
-        bits=options.bits, black=0.0, saturation=options.saturation, counts=counts,
-    )  # fmt: skip
-    usual = levels.bits == container and levels.saturation == levels.white
-    return levels, [] if usual else level_notes(levels, counts, container, options.bits)
+    levels, notes = levels_of_capture(counts, container, options)
+    return levels, [] if levels.is_full(container) else notes
+
+
+@dataclass(frozen=True, eq=False)
+class LinearShots:
+    """Linear intensities of the shots of a view, of which four may be aligned.
+
+    Attributes:
+        values: [K, H, W, 3] linear intensities, full scale 1.
+        saturated: pixels with a saturated sample, [H, W].
+        dark: pixels without light in any shot, [H, W].
+        outside: pixels that the camera's motion moved out of a shot, [H, W].
+        shifts: shifts of the shots.
+        orientation: EXIF orientation of the shots.
+        clipped_share, dark_share: shares of such pixels before the alignment.
+    """
+
+    values: NDArray[np.float32]
+    saturated: NDArray[np.bool_]
+    dark: NDArray[np.bool_]
+    outside: NDArray[np.bool_]
+    shifts: list[Shift]
+    orientation: int
+    clipped_share: float
+    dark_share: float
+
+    @property
+    def invalid(self) -> NDArray[np.bool_]:
+        """Pixels without a measurement, [H, W]."""
+        return self.saturated | self.dark | self.outside
+
+    @classmethod
+    def of(cls, shots: Shots, transfer: str, *, align: bool) -> LinearShots:
+        """Decode the stored values, and align the shots if ``align``."""
+        values = linear_codes(shots.pictures, transfer).astype(np.float32) / np.float32(FULL_CODE)
+        shifts = estimate_shifts(values) if align else [Shift(0.0, 0.0, True)] * len(values)
+        values, (saturated, dark), outside = align_shots(values, (shots.clipped, shots.dark), shifts)
+        return cls(
+            values,
+            saturated,
+            dark,
+            outside,
+            shifts,
+            shots.orientation,
+            float(shots.clipped.any(axis=0).mean()),
+            float(shots.dark.mean()),
+        )
+
+    def evenly_exposed(
+        self, names: Sequence[str], stated: Sequence[float], options: GainOptions
+    ) -> tuple[NDArray[np.float32], Gains, str]:
+        """Divide four shots by their exposures.
+
+        Args:
+            names: names of the shots, for messages. stated: exposures that the files state, or ones.
+            options: ``gains`` auto without gains of a calibration measures exposures by the pair sums.
+
+        Returns:
+            The intensities, the exposures, and the warning of ``exposures_of_view``.
+        """
+        exposures = _as_gains(stated)
+        warning = ""
+        if options.gains == "auto" and options.calibration.gains is None:
+            exposures, warning = exposures_of_view(names, self.values.mean(axis=3), ~self.invalid, stated)
+        return self.values / np.asarray(exposures, np.float32)[:, None, None, None], exposures, warning

@@ -57,15 +57,10 @@ def angle_labels(angles: Sequence[Angle]) -> list[str]:
     """Parts of file names that identify the pictures of a view: 045, 012.5, unknown, none, unknown-2, ..."""
     labels: list[str] = []
     for angle in angles:
-        label = angle if isinstance(angle, str) else _angle_digits(angle)
+        label = angle if isinstance(angle, str) else f"{angle % 180:06.2f}".rstrip("0").rstrip(".")
         same = sum(other == label or other.startswith(f"{label}-") for other in labels)
         labels.append(label if not same else f"{label}-{same + 1}")
     return labels
-
-
-def _angle_digits(angle: float) -> str:
-    whole, _, rest = f"{angle % 180:.2f}".rstrip("0").rstrip(".").partition(".")
-    return whole.zfill(3) + (f".{rest}" if rest else "")
 
 
 WELL_CONDITIONED = 0.15
@@ -258,9 +253,11 @@ def files_of(root: Path, table: Path, lines: Sequence[Line]) -> list[Path]:
 
 def _listed_twice(where: str, first: Line, second: Line) -> PolarguideError:
     names = " and ".join(dict.fromkeys((first.file, second.file)))
-    found = f"two for {names}, lines {first.number} and {second.number}"
     return PolarguideError(
-        where, expected="one line for each file", found=found, remedy="Remove one of them."
+        where,
+        expected="one line for each file",
+        found=f"two for {names}, lines {first.number} and {second.number}",
+        remedy="Remove one of them.",
     )
 
 

@@ -114,8 +114,11 @@ def exposures_of_points(values: Array, places: Array) -> PointExposures:
     logs = unknown.copy()
     logs[chosen] = _solved(values[:, chosen])
     divisions = int(np.log2(max(1.0, float(np.median(numbers[chosen])) / FEWEST)))
-    parts = _parts(places, int(np.clip(divisions, _LEAST_DIVISIONS, _MOST_DIVISIONS)))
-    errors[:, chosen] = _errors(values[:, chosen], parts, logs[chosen])
+    errors[:, chosen] = _errors(
+        values[:, chosen],
+        _parts(places, int(np.clip(divisions, _LEAST_DIVISIONS, _MOST_DIVISIONS))),
+        logs[chosen],
+    )
     return PointExposures(logs, errors[0], errors[1], numbers)
 
 
@@ -288,8 +291,12 @@ class ComparedPoints:
         observed = observed[longest]
         if not observed.any():
             return None
-        places = model.points.double().numpy()[longest]
-        return cls(model, places, {view: column for column, view in enumerate(views)}, observed)
+        return cls(
+            model,
+            model.points.double().numpy()[longest],
+            {view: column for column, view in enumerate(views)},
+            observed,
+        )
 
     def samples(
         self, view: str, raw: Sequence[NDArray[Any]], bad: NDArray[np.bool_] | None, transfer: str
@@ -298,8 +305,13 @@ class ComparedPoints:
         if view not in self.columns:
             return None
         height, width = raw[0].shape[:2]
-        camera = fit_camera(self.model.camera(view), width, height, folder=self.model.folder, view=view)
-        return samples_at(self.places[self.observed[:, self.columns[view]]], camera, raw, bad, transfer)
+        return samples_at(
+            self.places[self.observed[:, self.columns[view]]],
+            fit_camera(self.model.camera(view), width, height, folder=self.model.folder, view=view),
+            raw,
+            bad,
+            transfer,
+        )
 
     def exposures(self, samples: Mapping[str, PointSamples | None], full_scale: int | None) -> PointExposures:
         """Exposures of views of four angles, in their order.

@@ -102,7 +102,7 @@ VERBS = {
     ),
     "priors": Verb(
         "polarguide_shots.verbs",
-        "priors",
+        "run_priors",
         "Polarization maps of a shot, many shots or a scene: pictures, numbers and a page.",
     ),
     "measure": Verb(

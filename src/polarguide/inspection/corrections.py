@@ -23,8 +23,7 @@ from polarguide.capture.colmap.poses import Geometry, undistortion
 from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.layout import describe_contents, index_files
 from polarguide.capture.presentation import PRESENTATION_FILE
-from polarguide.capture.sensor.analyzer_file import read_analyzers
-from polarguide.capture.sensor.analyzers import AnalyzerCalibration
+from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
 from polarguide.capture.write import intensity_codes, write_view

@@ -7,7 +7,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,25 +35,20 @@ from polarguide.core.files import require_folder
 from polarguide.core.progress import Reporter
 from polarguide.core.text import stem_of
 from polarguide.preparation.filter_source import FilterSource, ShotsSource, SinglesSource
-from polarguide.preparation.mosaic_source import MosaicSource
-from polarguide.preparation.settings import PrepareSettings, check_format
-from polarguide.preparation.source import Source, StokesSource
-
-
-def _views_of_masks(files: Iterable[Path], views: Sequence[str]) -> dict[str, Path]:
-    """Masks by view: called like it, as COLMAP and Metashape name masks (``cup.jpg.png``, ``cup_mask.png``), or so."""
-    masks: dict[str, Path] = {}
-    pictures = sorted(path for path in files if path.suffix.lower() in SUFFIXES)
-    for shorten in (str, view_of_name, lambda name: name.removesuffix("_mask")):
-        for path in pictures:
-            view = shorten(stem_of(path))
-            if view in views:
-                masks.setdefault(view, path)
-    return masks
+from polarguide.preparation.settings import (
+    FilterSettings,
+    MosaicSettings,
+    PrepareSettings,
+    SinglesSettings,
+    settings_of_format,
+)
+from polarguide.preparation.source import MosaicSource, Source, StokesSource
 
 
 def _found_masks(folder: Path, views: Sequence[str]) -> dict[str, Path]:
-    """The object masks of a folder, by view.
+    """Return the object masks of a folder by view.
+
+    Masks are named like views, or as COLMAP and Metashape name them (``cup.jpg.png``, ``cup_mask.png``).
 
     Raises:
         PolarguideError: there is no such folder, or none of its pictures is named like a view.
@@ -65,12 +60,18 @@ def _found_masks(folder: Path, views: Sequence[str]) -> dict[str, Path]:
             found=f"{folder}, which is not a folder",
             remedy="Give the folder that holds <view>.png.",
         )
-    masks = _views_of_masks(folder.iterdir(), views)
+    files = sorted(folder.iterdir())
+    masks: dict[str, Path] = {}
+    for shorten in (str, view_of_name, lambda name: name.removesuffix("_mask")):
+        for path in files:
+            view = shorten(stem_of(path))
+            if view in views and path.suffix.lower() in SUFFIXES:
+                masks.setdefault(view, path)
     if not masks:
         raise PolarguideError(
             folder,
             expected=f"masks named like the views ({listed(list(views), 3)})",
-            found=listed(sorted(path.name for path in folder.iterdir()), 3) or "no file",
+            found=listed([path.name for path in files], 3) or "no file",
             remedy="Rename them; views without a mask are used whole.",
         )
     return masks
@@ -82,8 +83,11 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
     Raises:
         PolarguideError: there is no such folder, or nothing in it that can be read.
     """
-    remedy = "Give the folder that holds the raw mosaics, or the shots through the filter."
-    require_folder(root, expected="a folder of camera files", remedy=remedy)
+    require_folder(
+        root,
+        expected="a folder of camera files",
+        remedy="Give the folder that holds the raw mosaics, or the shots through the filter.",
+    )
     kind: str = settings.format
     settings, shots, assumed = _consecutive(root, settings)
     if shots is not None and kind == "auto":
@@ -100,11 +104,7 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
                 kind = "singles"
                 settings = replace(settings, angles="none")
                 assumed = (_ORDINARY,)
-    check_format(settings, kind)
-    if kind == "filter":
-        source: Source = FilterSource(root, settings, shots)
-    else:
-        source = _source(root, settings, kind)
+    source = _source(root, settings, kind, shots)
     if isinstance(source, ShotsSource):
         source.assumed = assumed
     if not source.views:
@@ -186,7 +186,13 @@ def _require_photographs(root: Path) -> None:
     files = list(index_files(root, SHOT_SUFFIXES).values())
     if not files or index_files(root, tuple(set(RAW_SUFFIXES) - set(SHOT_SUFFIXES))):
         raise _unknown_layout(root)
-    gray = [path.name for path in (files[0], files[-1]) if _may_be_mosaic(path)]
+    # Raw mosaics are gray.
+    gray = []
+    for path in (files[0], files[-1]):
+        if path.suffix.lower() in RAW_SUFFIXES:
+            pixels = decode_picture(path, read_picture(path))
+            if (pixels[..., 0] == pixels[..., 1]).all():
+                gray.append(path.name)
     if gray:
         raise PolarguideError(
             root,
@@ -213,14 +219,6 @@ def _require_photographs(root: Path) -> None:
             remedy=f"Give the angles in their order, such as --angles {angles} --shots-per-view {each}. Ordinary "
             "photographs, without a filter: --angles none.",
         )
-
-
-def _may_be_mosaic(path: Path) -> bool:
-    """True where a picture may be a raw mosaic: it is gray, and its file format can hold mosaics."""
-    if path.suffix.lower() not in RAW_SUFFIXES:
-        return False
-    pixels = decode_picture(path, read_picture(path))
-    return not (pixels[..., 0] != pixels[..., 1]).any()
 
 
 def frames_of_video(
@@ -250,8 +248,11 @@ def frames_of_video(
     folder = out.resolve().with_name(f"{out.resolve().name}-frames")
     count = extract_frames(videos[0], folder, reporter)
     reporter.say(f"{count} frames of {names} are in {folder}: the sharpest of equal spans of time.")
-    transfer = "srgb" if settings.transfer == "auto" else settings.transfer
-    return folder, replace(settings, angles=settings.angles or "none", transfer=transfer)
+    return folder, replace(
+        settings,
+        angles=settings.angles or "none",
+        transfer="srgb" if settings.transfer == "auto" else settings.transfer,
+    )
 
 
 def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
@@ -290,46 +291,53 @@ def _unknown_layout(root: Path) -> PolarguideError:
     if mosaics:
         command = f"polarguide prepare {source} {out} --sensor IMX250MYR"
         remedy = f"Raw mosaics: {command}, or yours of {SENSOR_NAMES}. {remedy}"
-    inside = None if named else _folder_of_pictures(root)
-    if inside is not None:
-        remedy = f"Give the folder that the pictures are in, such as {inside}. {remedy}"
-    expected = "shots through a filter, raw mosaics with --sensor, or a published dataset"
-    return PolarguideError(root, expected=expected, found=found or "nothing to read", remedy=remedy)
-
-
-def _folder_of_pictures(root: Path) -> Path | None:
-    """The first folder below that holds pictures, for a hint."""
-    for folder, _, names in os.walk(root):
-        if any(name.lower().endswith(SHOT_SUFFIXES + RAW_SUFFIXES) for name in names):
-            return Path(folder)
-    return None
-
-
-def poses_beside(root: Path) -> list[str]:
-    """Names of what holds poses in a folder of pictures, for a hint."""
-    names = (
-        "sparse",
-        "transforms.json",
-        "transforms_train.json",
-        "cameras.xml",
-        "cameras.npz",
-        "cameras_new.npz",
-        "cameras_sphere.npz",
+    suffixes = SHOT_SUFFIXES + RAW_SUFFIXES
+    below = () if named else os.walk(root)
+    inside = (folder for folder, _, names in below if any(name.lower().endswith(suffixes) for name in names))
+    folder = next(inside, None)
+    if folder is not None:
+        remedy = f"Give the folder that the pictures are in, such as {Path(folder)}. {remedy}"
+    return PolarguideError(
+        root,
+        expected="shots through a filter, raw mosaics with --sensor, or a published dataset",
+        found=found or "nothing to read",
+        remedy=remedy,
     )
-    return [name for name in names if (root / name).exists()]
 
 
-def _source(root: Path, settings: PrepareSettings, kind: str) -> Source:
-    if kind == "singles":
-        return SinglesSource(root, settings)
-    if kind == "mosaic":
-        return MosaicSource(root, settings)
-    dataset = open_dataset(root, kind, transfer=settings.transfer)
-    if dataset.mosaics is None:
-        return StokesSource(dataset, settings)
-    calibration = replace(settings.calibration, sense=settings.calibration.sense or dataset.sense)
-    settings = replace(settings, sensor=settings.sensor or PISR_SENSOR, calibration=calibration)
-    return MosaicSource(dataset.mosaics, settings, dataset)
+POSES_BESIDE = (
+    "sparse",
+    "transforms.json",
+    "transforms_train.json",
+    "cameras.xml",
+    "cameras.npz",
+    "cameras_new.npz",
+    "cameras_sphere.npz",
+)
+"""Names of files and folders of poses that may lie beside pictures."""
+
+
+def _source(
+    root: Path, settings: PrepareSettings, kind: str, shots: dict[str, dict[int, Path]] | None
+) -> Source:
+    match settings_of_format(settings, kind):
+        case SinglesSettings() as singles:
+            return SinglesSource(root, singles)
+        case FilterSettings() as pictures:
+            return FilterSource(root, pictures, shots)
+        case MosaicSettings() as mosaics if kind == "mosaic":
+            return MosaicSource(root, mosaics)
+        case others:
+            dataset = open_dataset(root, kind, transfer=settings.transfer)
+            sense = settings.calibration.sense or dataset.sense
+            if dataset.mosaics is None or not isinstance(others, MosaicSettings):
+                return StokesSource(dataset, others)
+            mosaics = replace(
+                others,
+                sensor=settings.sensor or PISR_SENSOR,
+                calibration=replace(settings.calibration, sense=sense),
+            )
+            return MosaicSource(dataset.mosaics, mosaics, dataset)
 
 
 def origin_of_poses(pictures: Source, origin: str) -> str:
@@ -367,7 +375,10 @@ def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto
         def sizes(view: str) -> tuple[tuple[int, int], ...]:
             assumed.add(view)
             stored = pictures.stored(view if view in known else pictures.views[0])
-            return stored.turned_first if poses_of == "displayed" else stored.sizes
+            sizes = stored.sizes
+            if poses_of == "displayed" and stored.orientation in QUARTER_TURNS:
+                sizes = (*sizes[1:2], *sizes[:1], *sizes[2:])  # turned, stored, developed
+            return sizes
 
         cameras, tests = read_parts(parts, pictures.views, sizes)
         poses = Poses.of_cameras(cameras, path, pictures.views, list(parts.values()))

@@ -1,42 +1,402 @@
-"""``prepare_scene``: camera files -> a scene folder."""
+"""The scene folder while it is written: nothing half-written looks whole, and what is done is done once.
+
+``prepare.json`` keeps what was asked and which views are written; ``scene.json`` takes its place as the last file.
+A folder without ``scene.json`` is not finished; the same command goes on with it.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
+import re
 import shlex
 import shutil
 from collections import Counter
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Geometry, Poses
-from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError
+from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError, reconstruct, tone_mapped
+from polarguide.capture.colmap.triangulate import add_points
+from polarguide.capture.exposures import Angle
 from polarguide.capture.filter.camera_files import TURNS
+from polarguide.capture.filter.consecutive import chosen_matching
+from polarguide.capture.raw_options import SampledOptions, changed
+from polarguide.capture.sensor.pattern import MosaicOptions
 from polarguide.capture.view import ANGLES, listed
+from polarguide.capture.write import (
+    EXACT,
+    intensity_codes,
+    picture_name,
+    picture_names,
+    write_png,
+    write_view,
+)
 from polarguide.core.errors import PolarguideError
-from polarguide.core.files import make_folder, writing
+from polarguide.core.files import (
+    check_out,
+    holds_files,
+    make_folder,
+    read_file,
+    require_inside,
+    write_whole,
+    writing,
+)
 from polarguide.core.progress import Reporter
-from polarguide.core.records import option_name
-from polarguide.preparation.exposure_table import write_exposure_table
-from polarguide.preparation.folder import JOURNAL, PARTIAL, PHOTOGRAPHS, SCENE, SFM, SceneFolder, Workshop
+from polarguide.core.records import decode, option_name, read_record, shortened, to_json
+from polarguide.core.system import only_writer
+from polarguide.core.text import canonical, stem_of
+from polarguide.preparation.filter_source import write_exposure_table
+from polarguide.preparation.journal import (
+    Journal,
+    Measured,
+    Request,
+    State,
+    ViewRecord,
+    changed_entry,
+    request_of,
+)
 from polarguide.preparation.open_source import (
+    POSES_BESIDE,
     frames_of_video,
     known_poses,
     open_source,
     origin_of_poses,
-    poses_beside,
     settle_pose_frames,
 )
-from polarguide.preparation.request import request_of
-from polarguide.preparation.settings import PrepareSettings
-from polarguide.preparation.source import Source, developed, measured_source
+from polarguide.preparation.settings import PrepareSettings, known_intrinsics
+from polarguide.preparation.source import Source, developed
+
+JOURNAL = "prepare.json"
+SCENE = "scene.json"
+SPLIT = "split.json"
+SFM = ".sfm"
+PARTIAL = ".sparse.partial"
+FOLDERS = ("polar", "invalid", "masks", "sparse")
+"""What is written into."""
+REMEDY = "Give another --out; nothing was written."
+# Of a picture's angle, in its name.
+_LABEL = r"(\d{3}(\.\d+)?|unknown|none)(-\d+)?"
+_OF_POSES = ("poses", "poses_of", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
+_EARLIER_SETTINGS = {"analyzers": None, "angles": None, "poses_of": "auto", "shots_per_view": None}
+"""Settings that earlier journals do not have."""
+
+
+class SceneFolder:
+    """An ``--out`` folder, new or gone on with."""
+
+    def __init__(self, root: Path, request: Request, measured_type: type[Measured]) -> None:
+        """Open the folder; nothing is written yet.
+
+        Args:
+            root: the folder.
+            request: source, files and settings of this call. ``settings.poses`` may follow on none.
+            measured_type: type of the measurements of the source.
+
+        Raises:
+            PolarguideError: the folder holds something else, or a preparation of something else.
+        """
+        self.root = root
+        self.state = State[Any](request)
+        self.finished = False
+        self._finished_before: bytes | None = None
+        self._there_before = root.exists()
+        check_out(root)
+        finished = root / SCENE
+        unfinished = root / JOURNAL
+        path = unfinished if unfinished.exists() else finished
+        if path.exists():
+            follows_none = self._resume(path, request, measured_type)
+            self.finished = path == finished and not follows_none
+        elif root.exists() and holds_files(root):
+            raise PolarguideError(
+                root,
+                expected="a new or empty folder, or an unfinished preparation",
+                found="other files",
+                remedy=REMEDY,
+            )
+
+    def _resume(self, path: Path, request: Request, measured_type: type[Measured]) -> bool:
+        """Read the state of an earlier call; return whether this call adds poses to views without poses."""
+        content = read_record(path, dict[str, Any])
+        if "prepare" not in content:
+            raise PolarguideError(
+                self.root,
+                expected="a new folder, or one that prepare wrote",
+                found=f"a {path.name} of another origin",
+                remedy=REMEDY,
+            )
+        journal: Journal[Any] = decode(content, Journal[measured_type], path, remedy=REMEDY)  # type: ignore[valid-type]
+        before = journal.prepare
+        for view, record in before.views.items():
+            _require_own_files(path, view, record.files)
+            if before.request.format == "singles":
+                _require_exposures(path, view, record)
+        settings = {**_EARLIER_SETTINGS, **before.request.settings}
+        now = dict(request.settings)
+        if settings.get("white_balance") == "grey":  # its name in earlier journals
+            settings["white_balance"] = "gray"
+        if settings.get("matching") == "exhaustive" and now["matching"] == "auto":
+            now["matching"] = "exhaustive"  # the default of earlier journals
+        follows_none = settings.get("poses") == "none" != now["poses"]
+        ignored = _OF_POSES if follows_none else ()
+        old, new = (
+            msgspec.structs.replace(
+                each,
+                settings={name: value for name, value in given.items() if name not in ignored},
+                model={} if follows_none else each.model,
+            )
+            for each, given in ((before.request, settings), (request, now))
+        )
+        difference = changed_entry(old, new)
+        if difference is not None:
+            name, was, is_now = difference
+            raise PolarguideError(
+                self.root,
+                expected=f"a preparation with {name} {was}",
+                found=f"{name} {is_now}",
+                remedy="Repeat the command as it was, or give another --out; nothing was written.",
+            )
+        views = {canonical(view): record for view, record in before.views.items()}
+        self.state = State(request, before.measured, views)
+        return follows_none
+
+    @property
+    def views(self) -> dict[str, ViewRecord]:
+        """Records of the views that are written."""
+        return self.state.views
+
+    @property
+    def measured(self) -> Measured:
+        """Measurements of the capture."""
+        assert self.state.measured is not None
+        measured: Measured = self.state.measured
+        return measured
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Create the folder, and keep other calls out of it.
+
+        Raises:
+            PolarguideError: one is at work in it, or it cannot be created.
+        """
+        make_folder(self.root)
+        with only_writer(
+            self.root,
+            expected="a folder that nobody else writes",
+            found="another polarguide prepare at work on it",
+        ):
+            yield
+
+    def start(self) -> None:
+        """Take note of the request."""
+        work = self.root / SFM
+        require_inside(self.root, *(self.root / name for name in (*FOLDERS, PARTIAL, SFM)), *work.rglob("*"))
+        if (self.root / SCENE).exists():
+            self._finished_before = read_file(self.root / SCENE)
+        make_folder(self.root)
+        self.save()  # first: without it nobody could go on with the folder
+        make_folder(self.root / "polar")
+        make_folder(self.root / "invalid")
+        (self.root / SCENE).unlink(missing_ok=True)
+
+    def abandon(self) -> None:
+        """Take back what was begun: a scene without poses is as it was, and of a new folder nothing is left.
+
+        Views that an earlier call has written stay for the next one.
+        """
+        shutil.rmtree(self.root / SFM, ignore_errors=True)
+        if self._finished_before is not None:
+            write_whole(self.root / SCENE, self._finished_before)
+            (self.root / JOURNAL).unlink(missing_ok=True)
+        elif not self.views:
+            for name in FOLDERS:
+                shutil.rmtree(self.root / name, ignore_errors=True)
+            (self.root / JOURNAL).unlink(missing_ok=True)
+            if not self._there_before:
+                with contextlib.suppress(OSError):  # not empty: somebody put something there
+                    self.root.rmdir()
+
+    def save(self) -> None:
+        """Write the journal."""
+        write_whole(self.root / JOURNAL, to_json({"prepare": msgspec.to_builtins(self.state)}))
+
+    def finish(self, summary: dict[str, Any]) -> None:
+        """Write ``scene.json``, the sign that the scene is whole, and drop the journal."""
+        write_whole(self.root / SCENE, to_json({**summary, "prepare": msgspec.to_builtins(self.state)}))
+        (self.root / JOURNAL).unlink(missing_ok=True)
+
+    def has(self, view: str, warp: object) -> bool:
+        """Whether a view is written as it would be now."""
+        record = self.views.get(view)
+        return (
+            record is not None
+            and record.warp == warp
+            and all(
+                (self.root / name).is_file() and (self.root / name).stat().st_size == size
+                for name, size in record.files.items()
+            )
+        )
+
+    def write_view(
+        self,
+        view: str,
+        intensities: NDArray[np.float32],
+        invalid: NDArray[np.bool_],
+        record: ViewRecord,
+        mask: NDArray[np.bool_] | None = None,
+        angles: Sequence[Angle] = ANGLES,
+    ) -> None:
+        """Write the pictures of a view, then its record."""
+        record.files = write_view(
+            self.root,
+            view,
+            intensity_codes(intensities, invalid, getattr(self.measured, "rounding", EXACT)),
+            invalid,
+            mask,
+            angles,
+        )
+        self.views[view] = record
+        self.save()
+
+    def drop(self, view: str) -> None:
+        """Remove a view that an earlier call without poses wrote, and that has none."""
+        for name in self.views.pop(view).files:
+            (self.root / name).unlink(missing_ok=True)
+        self.save()
+
+
+def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
+    """Refuse a journal that counts files as a view's that are not: what is noted there may be removed.
+
+    Raises:
+        PolarguideError: there is one.
+    """
+    pictures = re.compile(rf"polar/{re.escape(view)}_{_LABEL}\.png")
+    own = {f"invalid/{view}.png", f"masks/{view}.png"}
+    strangers = sorted(name for name in set(files) - own if not pictures.fullmatch(name))
+    if strangers or "/" in view or "\\" in view or "\0" in view:
+        raise PolarguideError(
+            f"{journal} (views, {shortened(view)})",
+            expected=f"pictures of this view, {picture_name('VIEW', 0)} and so on",
+            found=shortened(strangers[0] if strangers else view),
+            remedy=REMEDY,
+        )
+
+
+def _require_exposures(journal: Path, view: str, record: ViewRecord) -> None:
+    """Refuse a journal that does not say what the pictures of a view are.
+
+    Raises:
+        PolarguideError: the journal lacks it.
+    """
+    named = picture_names(view, [exposure.angle for exposure in record.exposures or ()])
+    pictures = sorted(name for name in record.files if name.startswith("polar/"))
+    if sorted(named) != pictures or not named:
+        raise PolarguideError(
+            f"{journal} (views, {shortened(view)})",
+            expected=f"the exposures of {shortened(pictures)}",
+            found=shortened(named),
+            remedy=REMEDY,
+        )
+
+
+class Workshop:
+    """A hidden folder in the scene while it is made."""
+
+    def __init__(
+        self, folder: SceneFolder, pictures: Source, settings: PrepareSettings, reporter: Reporter
+    ) -> None:
+        self._folder = folder
+        self._pictures = pictures
+        self._settings = settings
+        self._reporter = reporter
+        self._root = folder.root / SFM
+
+    def structure(self) -> Path:
+        """The model that structure from motion finds for all views.
+
+        Raises:
+            PolarguideError: too few views are registered.
+        """
+        sizes = {view: geometry.size for view, geometry in self._photographs(self._pictures.views).items()}
+        matching = chosen_matching(self._pictures.views, self._settings.matching, self._reporter)
+        settings = replace(self._settings, matching=matching)  # type: ignore[arg-type]
+        return reconstruct(
+            self._root,
+            sizes,
+            matching=matching,
+            seed=settings.seed,
+            reporter=self._reporter,
+            untried=_untried(settings, self._pictures.kind),
+            intrinsics=None if settings.intrinsics is None else known_intrinsics(settings.intrinsics),
+            refine=settings.refine_intrinsics,
+            lenses=self._pictures.lenses(),
+        )
+
+    def points(self, poses: Poses) -> tuple[Poses, dict[str, Any]]:
+        """The same poses with points, and how these came about.
+
+        Raises:
+            PolarguideError: there is no place that the cameras look at.
+        """
+        cameras = poses.developed(self._photographs(poses.views))
+        settings = self._settings
+        model, record = add_points(
+            self._root,
+            cameras,
+            poses.folder,
+            matching=chosen_matching(poses.views, settings.matching, self._reporter),
+            seed=settings.seed,
+            reporter=self._reporter,
+        )
+        return Poses.read(model, self._pictures.views), record
+
+    def _photographs(self, views: list[str]) -> dict[str, Geometry]:
+        """Tone-mapped pictures and object masks of views, and how they lie in the files."""
+        images = self._root / "images"
+        masks = self._root / "masks"
+        measured = self._folder.measured
+        known = measured.photographs or {}
+        measured.photographs = known
+        if images.is_dir() and any(stem_of(path) not in views for path in images.iterdir()):
+            shutil.rmtree(self._root, ignore_errors=True)  # of an earlier call with other poses
+            known.clear()
+        for path in (images, masks):
+            make_folder(path)
+        with self._reporter.track("photographs", len(views)) as advance:
+            for count, view in enumerate(views, 1):
+                path = images / f"{view}.png"
+                if view not in known or not path.exists():
+                    done = developed(self._pictures, view, measured)
+                    if done.mask is not None:
+                        write_png(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
+                    write_png(path, tone_mapped(done.intensities, self._settings.sfm_pictures))
+                    known[view] = done.record.geometry
+                    self._folder.save()
+                advance(count)
+        return {view: known[view] for view in views}
+
+
+def _untried(settings: PrepareSettings, kind: str) -> str:
+    """The options that change something about structure from motion, for a message."""
+    ways = ["--matching exhaustive (compares all pairs)"] if settings.matching != "exhaustive" else []
+    if settings.sfm_pictures != "minimum" and kind != "singles":  # of one picture, the minimum is the picture
+        ways.append("--sfm-pictures minimum (less glare)")
+    if settings.intrinsics is None:
+        ways.append("--intrinsics fx,fy,cx,cy (in pixels of the developed pictures)")
+    ways.append("--poses PATH (a COLMAP model, or cameras of another program)")
+    return f"Options that may help: {', '.join(ways)}."
+
 
 MOSTLY = 0.5
 """Share of saturated pixels from which on a view is warned of."""
@@ -118,8 +478,7 @@ def prepare_scene(
         [*pictures.paths, *pictures.masks.values()],
         poses.files if poses is not None else (),
     )
-    folder = SceneFolder(target, request)
-    folder.require_measured(pictures.needs)
+    folder = SceneFolder(target, request, pictures.measured_type)
     if folder.finished:
         reporter.say(f"{target} is complete already; nothing to do.")
         return _outcome(folder, pictures, settings, new=False)
@@ -130,16 +489,21 @@ def prepare_scene(
         reporter.say(note)
     for warning in poses.warnings if poses is not None else ():
         reporter.warn(warning)
-    beside = poses_beside(root) if settings.poses == "sfm" else []
-    if beside:
+    beside = [name for name in POSES_BESIDE if (root / name).exists()]
+    if beside and settings.poses == "sfm":
         ways = " or ".join(f"--poses {shlex.quote(str(root / name))}" for name in beside)
         reporter.say(
             f"Poses by structure from motion. The folder holds poses, too: {ways} takes them instead."
         )
-    if folder.measured is None:
+    if folder.state.measured is None:
         with reporter.track("measuring", len(pictures.views)) as advance:
-            folder.measured = measured_source(pictures, advance)
-        for note in folder.measured["notes"]:
+            folder.state.measured = pictures.measure(advance)
+        bare = [view for view in pictures.views if view not in pictures.masks]
+        if pictures.masks and bare:
+            folder.measured.notes.append(
+                f"{len(bare)} of {len(pictures.views)} views have no mask and are used whole ({listed(bare)})."
+            )
+        for note in folder.measured.notes:
             reporter.say(note)
     with folder.held():
         return _write_scene(root, folder, pictures, settings, poses, reporter)
@@ -185,10 +549,13 @@ def _write_scene(
         reporter.say(note)
     if poses is not None:
         _write_model(folder, poses)
-        folder.hold_out([view for view in poses.views if view in tests])
+        held_out = [view for view in poses.views if view in tests]
+        if held_out and not os.path.lexists(folder.root / SPLIT):
+            write_whole(folder.root / SPLIT, to_json({"test": held_out}))
     if pictures.kind == "singles":
-        estimate = settings.gains == "auto"
-        write_exposure_table(folder, estimate=estimate, posed=poses is not None, reporter=reporter)
+        write_exposure_table(
+            folder.root, folder.views, settings.gains, posed=poses is not None, reporter=reporter
+        )
     folder.finish(_summary(folder, pictures, settings, points))
     shutil.rmtree(folder.root / SFM, ignore_errors=True)
     return _outcome(folder, pictures, settings, new=True)
@@ -203,23 +570,9 @@ def _without_poses(root: Path, pictures: Source, settings: PrepareSettings) -> s
         return (
             f"Without poses: --poses none develops the views, then polarguide priors SCENE {out} shows each."
         )
-    default = PrepareSettings()
-    names = (
-        "sensor",
-        "packing",
-        "width",
-        "height",
-        "bits",
-        "offset_x",
-        "offset_y",
-        "black_level",
-        "saturation",
-    )
-    flags = [
-        f" {option_name(name)} {getattr(settings, name)}"
-        for name in names
-        if getattr(settings, name) != getattr(default, name)
-    ]
+    differing = changed(settings)
+    names = [f.name for f in (*fields(MosaicOptions), *fields(SampledOptions)) if f.name != "calibration"]
+    flags = [f" {option_name(name)} {getattr(settings, name)}" for name in names if name in differing]
     command = f"polarguide priors {shlex.quote(str(root))} {out}{''.join(flags)}"
     return (
         f"Each view alone has S0, DoLP, AoLP, normals and separations: {command}. "
@@ -228,7 +581,6 @@ def _without_poses(root: Path, pictures: Source, settings: PrepareSettings) -> s
 
 
 def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, reporter: Reporter) -> None:
-    assert folder.measured is not None
     views = pictures.views if poses is None else poses.views
     for view in folder.views.keys() - set(views):
         folder.drop(view)
@@ -238,11 +590,11 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
         for count, view in enumerate(views, 1):
             known = folder.views.get(view)
             warp = None
-            if known is not None and known.get("orientation", 1) != 1 and pictures.used_as_stored(view):
+            if known is not None and known.turned and pictures.used_as_stored(view):
                 folder.drop(view)  # an earlier call without poses turned it for display
                 known = None
             if known is not None and poses is not None:
-                warp = poses.warp(view, msgspec.convert(known["geometry"], Geometry)).record()
+                warp = poses.warp(view, known.geometry).record()
             if not folder.has(view, warp):
                 found_faults, found_notes = _write_view(folder, pictures, view, poses)
                 faults += found_faults
@@ -264,22 +616,20 @@ def _write_view(
     folder: SceneFolder, pictures: Source, view: str, poses: Poses | None
 ) -> tuple[list[str], tuple[str, ...]]:
     """Write the pictures of a view; returns what makes it useless, and the notes about it."""
-    assert folder.measured is not None
     done = developed(pictures, view, folder.measured)
     intensities = done.intensities
     invalid = done.invalid
     mask = done.mask
-    warped = None
+    record = done.record
     if poses is not None:
-        warp = poses.warp(view, done.geometry)
+        warp = poses.warp(view, record.geometry)
         intensities, invalid = warp.apply(intensities, invalid)
         mask = None if mask is None else warp.apply_mask(mask)
-        warped = warp.record()
-    record = {**done.record, "geometry": asdict(done.geometry), "warp": warped}
+        record.warp = warp.record()
     folder.write_view(view, intensities, invalid, record, mask, done.angles)
     faults = [] if mask is None or mask.any() else [f"{view}: its mask shows no object."]
-    if record["clipped_share"] > MOSTLY:
-        faults.append(f"{view}: {record['clipped_share']:.0%} of its pixels are saturated.")
+    if record.clipped_share > MOSTLY:
+        faults.append(f"{view}: {record.clipped_share:.0%} of its pixels are saturated.")
     elif not all(picture.any() for picture in intensities):
         faults.append(f"{view}: a picture of it is black throughout.")
     elif len(intensities) > 1 and all(np.array_equal(intensities[0], other) for other in intensities[1:]):
@@ -297,22 +647,16 @@ def _write_view(
 
 def _turns(folder: SceneFolder) -> str:
     """Which views were turned for display, and their polarizer angles with them; empty where none was."""
-    records = folder.views.values()
-    counts = Counter(record.get("orientation", 1) for record in records)
-    del counts[1]
-    if not counts:
+    records = [record for record in folder.views.values() if record.turned]
+    if not records:
         return ""
-    turned = listed([f"{counts[code]} {TURNS[code]}" for code in sorted(counts)])
-    noted = [
-        shot["angle"]
-        for record in records
-        for shot in record.get("exposures", ())
-        if record["orientation"] > 1
-    ]
+    counts = sorted(Counter(int(record.orientation or 1) for record in records).items())
+    turned = listed([f"{count} {TURNS[code]}" for code, count in counts])
+    noted = [shot.angle for record in records for shot in record.exposures or ()]
     # Shots of a view at the usual four angles have no list of exposures.
     angles = not noted or any(not isinstance(angle, str) for angle in noted)
     also = ", and the polarizer angles with them" if angles else ""
-    return f"EXIF orientation: {counts.total()} of {len(records)} views were turned for display{also} ({turned})."
+    return f"EXIF orientation: {len(records)} of {len(folder.views)} views were turned for display{also} ({turned})."
 
 
 def _write_model(folder: SceneFolder, poses: Poses) -> None:
@@ -335,12 +679,12 @@ def _summary(
     folder: SceneFolder, pictures: Source, settings: PrepareSettings, points: dict[str, Any] | None
 ) -> dict[str, Any]:
     """The notes in ``scene.json`` for readers; everything else is under "prepare"."""
-    measured = dict(folder.measured or {})
-    for name in (PHOTOGRAPHS, "light"):
+    measured = msgspec.to_builtins(folder.measured)
+    for name in ("photographs", "light"):
         measured.pop(name, None)
     calibration = settings.calibration.record()
     calibration["sense"] = measured.pop("sense", calibration["sense"])
-    shares = [record["clipped_share"] for record in folder.views.values()]
+    shares = [record.clipped_share for record in folder.views.values()]
     return {
         "prepared_by": f"polarguide {__version__}",
         "format": pictures.kind,

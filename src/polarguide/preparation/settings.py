@@ -13,8 +13,16 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from polarguide.capture.calibration import Calibration, Sense, read_calibration
-from polarguide.capture.raw_options import RawOptions, misplaced
-from polarguide.capture.sensor.analyzer_file import is_analyzer_file
+from polarguide.capture.raw_options import (
+    EncodedOptions,
+    FilterOptions,
+    GainOptions,
+    RawMosaicOptions,
+    RawOptions,
+    SampledOptions,
+    misplaced,
+)
+from polarguide.capture.sensor.analyzers import is_analyzer_file
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import option_name
 from polarguide.core.text import decimals
@@ -22,18 +30,73 @@ from polarguide.geometry.polarizer import ANGLES
 
 Dataset = Literal["pandora", "pisr", "nersp", "neisf", "gnerp", "phygap"]
 ORIGINS = ("auto", "dataset", "sfm", "none")
-"""What poses can be instead of a path."""
-_WORDS = {
-    "mosaic": "raw mosaics",
-    "pisr": "pisr",
-    "filter": "rotating filters",
-    "singles": "single shots",
-    "gnerp": "gnerp",
-}
+"""Values of ``poses`` besides a path."""
 
 
 @dataclass(frozen=True)
-class PrepareSettings(RawOptions):
+class PictureSettings(SampledOptions):
+    """Settings of sources that are developed.
+
+    Attributes:
+        white_balance: none, gray (the mean color becomes gray), or gains of R, G and B such as 1.9,1,1.6.
+        precision: source rounds the intensities to less than a fifth of a step of the camera's values, full to 16 bits,
+            in larger files.
+    """
+
+    white_balance: str = "none"
+    precision: Literal["source", "full"] = "source"
+
+
+@dataclass(frozen=True)
+class MosaicSettings(RawMosaicOptions, PictureSettings):
+    """Settings of raw mosaics.
+
+    Attributes:
+        register: Bring the four angles of half size, which lie half a pixel apart, to one place.
+    """
+
+    register: bool = True
+
+
+@dataclass(frozen=True)
+class FilterSettings(FilterOptions, PictureSettings):
+    """Settings of views of four shots through a filter."""
+
+
+@dataclass(frozen=True)
+class SinglesSettings(FilterSettings):
+    """Settings of photographs through a filter at any angles.
+
+    Attributes:
+        angles: Polarizer angles of singles: unknown or none for all, numbers in the order of the files that repeat
+            (such as 0,60,120), or the path of a table (.csv); without it angles.csv, folders or names say them.
+        shots_per_view: Consecutive photographs, by name, that are one view; --angles has as many angles, or a word.
+            Without it, groups that show one place are found.
+    """
+
+    angles: str | None = None
+    shots_per_view: Annotated[int, Meta(ge=1, le=72)] | None = None
+
+
+@dataclass(frozen=True)
+class EncodedStokesSettings(EncodedOptions, GainOptions):
+    """Settings of Stokes vectors made of encoded pictures."""
+
+
+_KINDS: dict[str, type[GainOptions]] = {
+    "raw mosaics": MosaicSettings,
+    "pisr": MosaicSettings,
+    "rotating filters": FilterSettings,
+    "single shots": SinglesSettings,
+    "gnerp": EncodedStokesSettings,
+}
+"""Types of settings by the names of the sources in messages."""
+_NAMES = {"mosaic": "raw mosaics", "filter": "rotating filters", "singles": "single shots"}
+"""Names of formats in messages, where they differ from the formats."""
+
+
+@dataclass(frozen=True)
+class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
     """Source of a scene folder, and how it is prepared.
 
     Attributes:
@@ -42,18 +105,11 @@ class PrepareSettings(RawOptions):
         bits: Bits of a sensor value in 16-bit files; without it those of the value at which samples pile up, else 12 if
             no value exceeds 4095, else 16.
         saturation: Stored value from which the sensor saturates; without it full scale.
-        white_balance: none, gray (the mean color becomes gray), or gains of R, G and B such as 1.9,1,1.6.
         demosaic: half, quarter or full resolution of the sensor.
-        register: Bring the four angles of half size, which lie half a pixel apart, to one place.
         transfer: Encoding of filter shots (auto: by the curvature of the response, as inspect judges it) and of GNeRP.
-        angles: Polarizer angles of singles: unknown or none for all, numbers in the order of the files that repeat
-            (such as 0,60,120), or the path of a table (.csv); without it angles.csv, folders or names say them.
-        shots_per_view: Consecutive photographs, by name, that are one view; --angles has as many angles, or a word.
-            Without it, groups that show one place are found.
-        gains: auto corrects what the light tells of the gains of the angles, and estimates the exposure of every single
-            shot; none leaves them. Gains of a calibration go first.
-        precision: source rounds the intensities to less than a fifth of a step of the camera's values, full to 16 bits,
-            in larger files.
+        gains: auto corrects the exposures that files state (EXIF) and what the light tells of the gains of the angles,
+            and estimates the exposure of every single shot; exif corrects only what files state; none leaves all.
+            Gains of a calibration go first.
         poses: sfm, dataset, none, or the path of a COLMAP model, transforms.json (nerfstudio), cameras.xml (Metashape)
             or cameras.npz (IDR); auto takes those of a dataset, else sfm.
         poses_of: Whether the poses of a path are of the pixels as stored, or of pictures as EXIF orientation displays
@@ -68,11 +124,6 @@ class PrepareSettings(RawOptions):
     """
 
     format: Literal["auto", "mosaic", "filter", "singles"] | Dataset = "auto"
-    white_balance: str = "none"
-    register: bool = True
-    angles: str | None = None
-    shots_per_view: Annotated[int, Meta(ge=1, le=72)] | None = None
-    precision: Literal["source", "full"] = "source"
     poses: str = "auto"
     poses_of: Literal["auto", "stored", "displayed"] = "auto"
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
@@ -159,7 +210,16 @@ class CalibrationOptions:
         else:
             calibration = read_calibration(self.calibration)
         if self.order is not None:
-            calibration = replace(calibration, order=_four_angles(self.order))
+            try:
+                first, second, third, fourth = (int(angle) for angle in self.order.split(","))
+            except ValueError:
+                raise PolarguideError(
+                    "--order",
+                    expected="four angles such as 90,45,0,135",
+                    found=repr(self.order),
+                    remedy="Name the angle of the pictures called 0, 45, 90 and 135, in this order.",
+                ) from None
+            calibration = replace(calibration, order=(first, second, third, fourth))
         if self.sense is not None:
             calibration = replace(calibration, sense=self.sense)
         return calibration if self.zero is None else replace(calibration, zero=self.zero)
@@ -171,13 +231,14 @@ class CalibrationOptions:
         )
 
 
-def check_format(settings: PrepareSettings, kind: str) -> None:
-    """Refuse settings that mean nothing for a format.
+def settings_of_format(settings: PrepareSettings, kind: str) -> GainOptions:
+    """Return the settings that apply to a format, as the type of that format.
 
     Raises:
-        PolarguideError: one is set.
+        PolarguideError: another setting differs from its default.
     """
-    for name, owners in sorted(misplaced(settings, kind, _WORDS)):
+    owner = _KINDS.get(_NAMES.get(kind, kind), GainOptions)
+    for name, owners in sorted(misplaced(settings, owner, _KINDS)):
         *others, last = owners
         raise PolarguideError(
             option_name(name),
@@ -200,6 +261,7 @@ def check_format(settings: PrepareSettings, kind: str) -> None:
             found=str(settings.calibration.gains),
             remedy="Leave the gains out; order, sense and zero apply.",
         )
+    return owner(**{f.name: getattr(settings, f.name) for f in dataclasses.fields(owner)})
 
 
 def white_gains(text: str) -> tuple[float, float, float] | None:
@@ -236,19 +298,6 @@ def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
             remedy="Give four or eight numbers; the center of the first pixel is at 0.5.",
         )
     return ("PINHOLE" if len(numbers) == 4 else "OPENCV"), numbers
-
-
-def _four_angles(text: str) -> tuple[int, int, int, int]:
-    try:
-        first, second, third, fourth = (int(angle) for angle in text.split(","))
-    except ValueError:
-        raise PolarguideError(
-            "--order",
-            expected="four angles such as 90,45,0,135",
-            found=repr(text),
-            remedy="Name the angle of the pictures called 0, 45, 90 and 135, in this order.",
-        ) from None
-    return first, second, third, fourth
 
 
 def _absolute(path: Path | None) -> Path | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,19 +15,39 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.calibration import Sense, oriented
+from polarguide.capture.calibration import UNIDENTIFIED, Sense, oriented
 from polarguide.capture.colmap.model import PosedCamera
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.datasets.dataset import Dataset, not_as_published, read_mask, resized_mask
+from polarguide.capture.develop import (
+    QUARTER_FLIPS,
+    MosaicFiles,
+    levels_of_capture,
+    pair_gains,
+    sample_blocks,
+)
 from polarguide.capture.exposures import Angle
 from polarguide.capture.filter.camera_files import INVERSE, QUARTER_TURNS, Lens, apply_orientation
 from polarguide.capture.formats.pictures import stated_size
-from polarguide.capture.layout import require_memory_of_each
-from polarguide.capture.view import listed
+from polarguide.capture.layout import index_files, require_memory_of_each
+from polarguide.capture.raw_options import CameraOptions
+from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic
+from polarguide.capture.sensor.pattern import (
+    FULL_16,
+    SIDE,
+    Levels,
+    agreed_full_scale,
+    require_kind,
+    unusable_samples,
+)
+from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
+from polarguide.capture.view import FULL_CODE
+from polarguide.capture.write import EXACT, rounding_of
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES, four_intensities
-from polarguide.preparation.settings import PrepareSettings
+from polarguide.preparation.journal import Factor, Measured, StoredRounding, ViewRecord
+from polarguide.preparation.settings import MosaicSettings, white_gains
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,17 +57,15 @@ class DevelopedView:
     Attributes:
         intensities: [4, H, W, 3] float32 in [0, 1], linear, at 0, 45, 90 and 135 degrees; or [K, H, W, 3].
         invalid: pixels that depend on an unusable sample, [H, W].
-        geometry: crop and scale relative to the stored picture.
         mask: object mask, [H, W], or None.
         angles: angles of the pictures, counter-clockwise as displayed.
-        record: measurements for ``scene.json``.
+        record: record of the view; ``geometry`` is part of it.
         notes: messages for the user.
     """
 
     intensities: NDArray[np.float32]
     invalid: NDArray[np.bool_]
-    geometry: Geometry
-    record: dict[str, Any]
+    record: ViewRecord
     notes: tuple[str, ...] = ()
     mask: NDArray[np.bool_] | None = None
     angles: Sequence[Angle] = ANGLES
@@ -74,11 +93,6 @@ class Stored:
         turned = (self.size[::-1],) if self.orientation in QUARTER_TURNS else ()
         return (self.size, *turned, *(() if self.developed is None else (self.developed,)))
 
-    @property
-    def turned_first(self) -> tuple[tuple[int, int], ...]:
-        """``sizes`` with the turned one first, if the picture is turned by a quarter."""
-        return tuple(sorted(self.sizes, key=lambda size: self.size is None or size != self.size[::-1]))
-
 
 class Source(Protocol):
     """The pictures of one capture.
@@ -89,20 +103,20 @@ class Source(Protocol):
         views: view names, sorted.
         paths: all files that are read, but for masks.
         masks: object masks of the user by view; the object is where one has at least half of its maximum.
-        needs: keys of what ``measure`` returns that ``develop`` reads.
+        measured_type: type of what ``measure`` returns.
     """
 
-    needs: tuple[str, ...]
+    measured_type: type[Measured]
     kind: str
     cameras: Mapping[str, PosedCamera] | None
     views: list[str]
     paths: list[Path]
     masks: Mapping[str, Path] = MappingProxyType({})
 
-    def measure(self, advance: Advance) -> dict[str, Any]:
-        """Measure what is common to the whole capture, as JSON types; ``notes`` are messages for the user."""
+    def measure(self, advance: Advance) -> Measured:
+        """Measure what is common to the whole capture."""
 
-    def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
+    def develop(self, view: str, measured: Any) -> DevelopedView:
         """Read one view."""
 
     def stored(self, view: str) -> Stored:
@@ -124,17 +138,7 @@ class Source(Protocol):
         return False
 
 
-def measured_source(pictures: Source, advance: Advance) -> dict[str, Any]:
-    """The result of ``Source.measure``, with a note on views without a mask."""
-    measured = pictures.measure(advance)
-    bare = [view for view in pictures.views if view not in pictures.masks]
-    if pictures.masks and bare:
-        note = f"{len(bare)} of {len(pictures.views)} views have no mask and are used whole ({listed(bare)})."
-        measured["notes"] = [*measured["notes"], note]
-    return measured
-
-
-def developed(pictures: Source, view: str, measured: dict[str, Any]) -> DevelopedView:
+def developed(pictures: Source, view: str, measured: Measured) -> DevelopedView:
     """The result of ``Source.develop``, with the view's mask.
 
     Raises:
@@ -159,7 +163,7 @@ def _fitted(path: Path, view: DevelopedView, code: int) -> NDArray[np.bool_]:
         code: orientation that makes the used picture of the other one.
     """
     mask = read_mask(path)
-    geometry = view.geometry
+    geometry = view.record.geometry
     turned = mask.shape
     size = mask.shape[::-1]
     fitting = (geometry.size, geometry.stored)
@@ -195,12 +199,29 @@ _SAMPLES = 20_000
 _WORKED = 4 * 3 * (3 + 3 + 4 + 4)
 
 
+class StokesMeasured(Measured, kw_only=True):
+    """Measurements of Stokes vectors.
+
+    Attributes:
+        scale: factor of the dataset's intensities. full_scale: the dataset's intensity that becomes 1.
+        negative_share, not_finite_share: shares of intensities and of pixels.
+        pair_sums: result of the four-angle sum check. sense: sense of the angles.
+    """
+
+    scale: Factor
+    full_scale: float = 0.0
+    negative_share: float = 0.0
+    not_finite_share: float = 0.0
+    pair_sums: str = PAIR_SUMS
+    sense: Sense
+
+
 class StokesSource(Source):
     """Stokes vectors in any unit, without a full scale."""
 
-    needs = ("scale", "sense")
+    measured_type = StokesMeasured
 
-    def __init__(self, dataset: Dataset, settings: PrepareSettings) -> None:
+    def __init__(self, dataset: Dataset, settings: CameraOptions) -> None:
         """Use a dataset with ``read_stokes``; its sense of angles applies unless the settings name one."""
         self.kind = dataset.name
         self.cameras = dataset.cameras
@@ -215,14 +236,18 @@ class StokesSource(Source):
         """By the header of a file that has the size of the Stokes vectors."""
         return Stored(stated_size(self._dataset.files[view]))
 
-    def measure(self, advance: Advance) -> dict[str, Any]:
+    def measure(self, advance: Advance) -> StokesMeasured:
         """Determine one scale for the whole capture, and the share of clipped pixels; every file is read once.
 
         The largest intensity becomes 1 where it is at most twice the one that 0.1 % of the pixels exceed;
         else twice this one does, and what exceeds it clips.
         """
-        remedy = "Make the files smaller, all by the same factor, or prepare the dataset on a larger machine."
-        require_memory_of_each(self.paths, _WORKED, "Stokes vectors", remedy=remedy)
+        require_memory_of_each(
+            self.paths,
+            _WORKED,
+            "Stokes vectors",
+            remedy="Make the files smaller, all by the same factor, or prepare the dataset on a larger machine.",
+        )
         peaks: list[NDArray[np.float32]] = []
         rims: list[RimAgreement | None] = []
         largest = 0.0
@@ -246,8 +271,9 @@ class StokesSource(Source):
             advance(number)
         bright = float(np.percentile(np.concatenate(peaks), _BRIGHT))
         if not largest > 0:
-            found = "intensities that are all 0 or less"
-            raise not_as_published(self.paths[0], "light in at least one view", found)
+            raise not_as_published(
+                self.paths[0], "light in at least one view", "intensities that are all 0 or less"
+            )
         white = min(largest, _HEADROOM * bright) if bright > 0 else largest
         share = negative / max(1, 12 * count)
         sense, note = self._settle_sense([rim for rim in rims if rim is not None])
@@ -258,34 +284,32 @@ class StokesSource(Source):
         )
         if broken:
             notes.append(f"{broken / count:.3%} of the pixels are not finite and become invalid.")
-        return {
-            "scale": 1.0 / (white * self._calibration.peak),
-            "full_scale": white,
-            "negative_share": round(share, 6),
-            "not_finite_share": round(broken / count, 6),
-            "pair_sums": PAIR_SUMS,
-            "sense": sense,
-            "notes": notes,
-        }
+        return StokesMeasured(
+            scale=1.0 / (white * self._calibration.peak),
+            full_scale=white,
+            negative_share=round(share, 6),
+            not_finite_share=round(broken / count, 6),
+            sense=sense,
+            notes=notes,
+        )
 
-    def develop(self, view: str, measured: dict[str, Any]) -> DevelopedView:
+    def develop(self, view: str, measured: StokesMeasured) -> DevelopedView:
         """Read one view, scale it, form the four intensities and correct the sense of the angles."""
         stokes, finite, clipped = self._stokes(view)
-        intensities = np.stack(four_intensities(stokes * np.float32(measured["scale"])))
+        intensities = np.stack(four_intensities(stokes * np.float32(measured.scale)))
         # Rounding of the scale may leave the largest intensity a hair above 1.
         clipped = clipped | (intensities > 1.0 + 1e-5).any(axis=(0, 3))
         height, width = clipped.shape
-        calibration = replace(self._calibration, sense=measured["sense"])
-        rotated = oriented(np.clip(intensities, 0.0, 1.0), calibration)
+        calibration = replace(self._calibration, sense=measured.sense)
         return DevelopedView(
-            intensities=rotated,
+            intensities=oriented(np.clip(intensities, 0.0, 1.0), calibration),
             invalid=clipped | ~finite,
-            geometry=Geometry((width, height), (0, 0), 1, (width, height)),
-            record={
-                "clipped_share": round(float(clipped.mean()), 6),
-                "negative_share": round(float((intensities < 0).mean()), 6),
-                "invalid_share": round(float((clipped | ~finite).mean()), 6),
-            },
+            record=ViewRecord(
+                clipped_share=round(float(clipped.mean()), 6),
+                negative_share=round(float((intensities < 0).mean()), 6),
+                invalid_share=round(float((clipped | ~finite).mean()), 6),
+                geometry=Geometry((width, height), (0, 0), 1, (width, height)),
+            ),
             mask=resized_mask(self._dataset, view, (height, width)),
         )
 
@@ -416,3 +440,212 @@ def sense_of_rims(agreements: Sequence[RimAgreement]) -> Sense | None:
     if abs(mean) < _CLEAR or agreeing < _MOST:
         return None
     return "ccw" if mean > 0 else "cw"
+
+
+_JUDGED = 8
+"""Mosaics of a capture that are looked through for defects of the sensor."""
+_GAINS = {
+    "dark": "The pictures are too dark to estimate the gains of the angles.",
+    "off": "I0 + I90 is {:+.2%} off I45 + I135, too much for gains: not corrected. Check --sensor, --offset-x, "
+    "--offset-y and --order.",
+    "corrected": f"I0 + I90 is {{:+.2%}} off I45 + I135; corrected. {UNIDENTIFIED}",
+}
+
+
+class MosaicMeasured(Measured, kw_only=True):
+    """Measurements of the mosaics of a capture.
+
+    Attributes:
+        levels: levels of the stored values. pattern: rows of the sensor's pattern. crop: columns and rows cut off.
+        pair_ratio: ratio of the pair sums. gains: gains of the four angles. white_balance: gains of R, G and B.
+        analyzers: calibration of the sensor. scale: factor of the linear values.
+        rounding: rounding of codes. defects: number of defective samples.
+    """
+
+    levels: Levels
+    pattern: tuple[str, ...] = ()
+    crop: tuple[int, int] = (0, 0)
+    pair_ratio: float | None = None
+    gains: tuple[Factor, Factor, Factor, Factor]
+    analyzers: dict[str, str] | None = None
+    white_balance: tuple[Factor, Factor, Factor]
+    scale: Factor
+    rounding: StoredRounding = tuple(EXACT)
+    defects: int = 0
+
+
+class MosaicSource(Source):
+    """Raw mosaics of a division-of-focal-plane sensor."""
+
+    measured_type = MosaicMeasured
+
+    def __init__(self, root: Path, settings: MosaicSettings, dataset: Dataset | None = None) -> None:
+        """Find the files.
+
+        Args:
+            root: the folder of mosaics.
+            settings: settings of the preparation.
+            dataset: the published dataset of the mosaics, if they belong to one.
+
+        Raises:
+            PolarguideError: the sensor is not named, or a setting does not fit it.
+        """
+        self.kind = "mosaic" if dataset is None else dataset.name
+        self.cameras = None if dataset is None else dataset.cameras
+        self._dataset = dataset
+        self._mosaics = MosaicFiles(settings)
+        self._settings = settings
+        self._dark_path = settings.dark_frame
+        files = index_files(root, RAW_SUFFIXES)
+        if self._dark_path is not None:
+            dark = os.path.realpath(self._dark_path)
+            files = {view: path for view, path in files.items() if os.path.realpath(path) != dark}
+        names = files.keys() if dataset is None else dataset.views
+        self._files = {view: files[view] for view in sorted(names)}
+        self.views = list(self._files)
+        self.paths = list(self._files.values() if dataset is None else dataset.paths)
+        self.paths += [path for path in (self._dark_path, settings.analyzers) if path is not None]
+        self._crop = self._mosaics.crop
+        self._pattern = self._mosaics.pattern
+        self._white = white_gains(settings.white_balance)
+        self._defective: NDArray[np.bool_] | None = None
+        if self._pattern.colors is None and settings.white_balance != "none":
+            raise PolarguideError(
+                "--white-balance",
+                expected="none for a monochrome sensor",
+                found=settings.white_balance,
+                remedy="Omit it.",
+            )
+
+    def stored(self, view: str) -> Stored:
+        """By the header of the mosaic, or as the settings say."""
+        width = self._settings.width
+        height = self._settings.height
+        stated = None if width is None or height is None else (width, height)
+        size = stated_size(self._files[view]) or stated
+        if size is not None and self._settings.flip in QUARTER_FLIPS:
+            size = size[::-1]
+        step = DEMOSAIC_MODES[self._settings.demosaic]
+        if size is None or step == 1:
+            return Stored(size)
+        across, down = ((side - cut) // 2 * 2 // step for side, cut in zip(size, self._crop, strict=True))
+        return Stored(size, developed=(across, down))
+
+    def measure(self, advance: Advance) -> MosaicMeasured:
+        """Levels, gains of the angles and white balance of the capture; every file is read once."""
+        counts = np.zeros(FULL_16 + 1, np.int64)
+        container = 0
+        shape = None
+        stated: dict[Path, int | None] = {}
+        samples: list[NDArray[Any]] = []
+        blocks: list[NDArray[Any]] = []
+        for count, path in enumerate(self._files.values(), 1):
+            values = self._mosaics.read(path)
+            shape = shape or (values.shape, values.dtype)
+            if (values.shape, values.dtype) != shape:
+                (height, width), kind = shape
+                raise PolarguideError(
+                    path,
+                    expected=f"{width}x{height} pixels of {kind}, as in the first file",
+                    found=f"{values.shape[1]}x{values.shape[0]} pixels of {values.dtype}",
+                    remedy="Prepare captures that differ in size or bit depth separately, each with its own --out.",
+                )
+            container, stated[path] = self._mosaics.depth(path, values)
+            counts += np.bincount(values.ravel(), minlength=len(counts))
+            cut = self._mosaics.cut(values)
+            samples.append(sample_blocks(cut, 2 * self._pattern.period))
+            blocks.append(sample_blocks(cut, SIDE))
+            advance(count)
+        assert shape is not None
+        settings = self._settings
+        levels, counted = levels_of_capture(
+            counts, container, settings, black=settings.black_level, stated=agreed_full_scale(stated)
+        )
+        levels = replace(levels, gamma=settings.gamma if self._dataset is None else self._dataset.gamma)
+        if self._dataset is None:
+            assert settings.sensor is not None
+            require_kind(settings.sensor, np.concatenate(blocks), levels)
+        ratio, colors = self._mosaics.light_of_blocks(
+            samples, levels, self._mosaics.dark(shape[0]), cut.shape
+        )
+        analyzers = self._mosaics.analyzers
+        gains, notes = pair_gains(
+            ratio,
+            settings,
+            _GAINS if settings.gains == "auto" else {},
+            calibrated=analyzers is not None,
+        )
+        notes += [] if self._dataset is None else self._dataset.notes
+        notes += counted
+        standing_out = int(self._defects(levels).sum())
+        if standing_out:
+            notes.append(defects_note(standing_out, shape[0][0] * shape[0][1]))
+        mean = np.maximum(colors.mean(axis=1) if colors.size else np.ones(3), 1e-6)
+        white = self._white or (float(mean[1] / mean[0]), 1.0, float(mean[1] / mean[2]))
+        peak = max(white) / min(gains) * settings.calibration.peak
+        if analyzers is not None:
+            peak *= analyzers.peak(self._mosaics.corner, cut.shape[::-1])
+        rounding = EXACT
+        if settings.precision == "source" and levels.gamma == 1.0:
+            # By the smallest factor that a sample is multiplied by.
+            factor = min(white) / max(gains) / max(1.0, peak)
+            rounding = rounding_of(np.array([0.0, FULL_CODE * factor / ((1 << levels.bits) - 1)]))
+        return MosaicMeasured(
+            levels=levels,
+            pattern=tuple(self._pattern.rows()),
+            crop=self._crop,
+            pair_ratio=ratio,
+            gains=gains,
+            analyzers=None if analyzers is None else analyzers.record(),
+            white_balance=white,
+            scale=1.0 / max(1.0, peak),
+            rounding=tuple(rounding),
+            defects=standing_out,
+            notes=notes,
+        )
+
+    def _defects(self, levels: Levels) -> NDArray[np.bool_]:
+        """The samples of a mosaic, cut to whole cells, that are no measure of light; saturated ones are told later."""
+        if self._defective is None:
+            files = list(self._files.values())
+            judged = files[:: max(1, math.ceil(len(files) / _JUDGED))]
+            mosaics = (
+                np.minimum(self._mosaics.cut(self._mosaics.read(path)), levels.white) for path in judged
+            )
+            self._defective = defects(mosaics, self._pattern.period)
+        return self._defective
+
+    def develop(self, view: str, measured: MosaicMeasured) -> DevelopedView:
+        """Read one mosaic: validity, levels, gains, then demosaicing, then the sense of the angles."""
+        stored = self._mosaics.read(self._files[view])
+        dark = self._mosaics.dark(stored.shape)
+        values = self._mosaics.cut(stored)
+        levels = measured.levels
+        saturated, black = unusable_samples(values, levels, dark)
+        linear, (bad,) = self._mosaics.linear(values, levels, dark, saturated | black | self._defects(levels))
+        linear = linear * self._mosaics.sample_factors(
+            values.shape, measured.gains, measured.white_balance, measured.scale
+        )
+        settings = self._settings
+        picture = demosaic(
+            linear, bad, self._pattern,
+            mode=settings.demosaic, interpolation=settings.interpolation, registered=settings.register,
+        )  # fmt: skip
+        intensities = oriented(np.clip(picture.intensities, 0.0, 1.0), settings.calibration)
+        height, width = picture.invalid.shape
+        return DevelopedView(
+            intensities=intensities,
+            invalid=picture.invalid,
+            record=ViewRecord(
+                clipped_share=round(float(saturated.mean()), 6),
+                dark_share=round(float(black.mean()), 6),
+                invalid_share=round(float(picture.invalid.mean()), 6),
+                geometry=Geometry(
+                    (stored.shape[1], stored.shape[0]),
+                    self._crop,
+                    DEMOSAIC_MODES[settings.demosaic],
+                    (width, height),
+                ),
+            ),
+            mask=None if self._dataset is None else resized_mask(self._dataset, view, (height, width)),
+        )

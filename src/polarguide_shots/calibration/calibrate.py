@@ -11,12 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.sensor.analyzer_file import SUFFIX, write_analyzers
 from polarguide.capture.sensor.analyzers import (
     FARTHEST_ANGLE,
     LEAST_DIATTENUATION,
+    SUFFIX,
     AnalyzerCalibration,
     grid_shape,
+    write_analyzers,
 )
 from polarguide.capture.sensor.pattern import Pattern, tiled
 from polarguide.core.errors import PolarguideError

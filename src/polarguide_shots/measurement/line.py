@@ -20,7 +20,6 @@ from polarguide.core.files import make_folder, require_inside
 from polarguide.core.options import PathLike
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.visualization.figures import write_png
-from polarguide_shots.develop import check_files
 from polarguide_shots.exposures import find_shots, require_elsewhere
 from polarguide_shots.maps import ShotMaps
 from polarguide_shots.measurement.fields import (
@@ -48,7 +47,16 @@ from polarguide_shots.measurement.regions import (
 )
 from polarguide_shots.measurement.table import Entry, FileStamp, Table, stamps
 from polarguide_shots.options import MeasureOptions, ShotOptions
-from polarguide_shots.read import NAME, UNREADABLE, array_shot, fault_of, is_array, read_shot, stacked_array
+from polarguide_shots.read import (
+    NAME,
+    UNREADABLE,
+    array_shot,
+    check_files,
+    fault_of,
+    is_array,
+    read_shot,
+    stacked_array,
+)
 from polarguide_shots.sets import ExposureSet
 
 

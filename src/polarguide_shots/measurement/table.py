@@ -32,7 +32,7 @@ from polarguide.core.files import (
     write_whole,
     writing,
 )
-from polarguide.core.records import decode, read_record, shortened, to_json
+from polarguide.core.records import decode, first_differing_value, read_record, shortened, to_json
 from polarguide.core.system import only_writer
 from polarguide.core.text import csv_lines
 from polarguide_shots.measurement.fields import FORMAT, KEYS, Status, Value

@@ -20,8 +20,7 @@ from made_sensor import (
     write_polarizer_shots,
 )
 
-from polarguide.capture.sensor.analyzer_file import read_analyzers
-from polarguide.capture.sensor.analyzers import AnalyzerCalibration
+from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers
 from polarguide.core.progress import Reporter
 from polarguide_shots.calibration.calibrate import Calibrated, calibrate_sensor
 from polarguide_shots.calibration.settings import CalibrateSettings

@@ -69,7 +69,12 @@ def read_camera_raw(
             raise ValueError(f"{raw.sizes.raw_width}x{raw.sizes.raw_height} pixels")
         flip = int(raw.sizes.flip)  # before user_flip takes its place
         pixels = np.asarray(raw.postprocess(**libraw_parameters(gains)))
-        reached = _reached(raw)
+        reached = float(_FULL)
+        if raw.raw_type.name == "Stack":
+            # Of files that are no mosaics (linear DNG, such as a telephone's ProRAW) LibRaw subtracts the black levels
+            # of three channels from the samples, and that of a fourth one, which is 0, from the white level.
+            black = raw.black_level_per_channel
+            reached = float((raw.white_level - max(black[:3])) / (raw.white_level - min(black)) * _FULL)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint16:
         raise PolarguideError(
             path,
@@ -77,27 +82,11 @@ def read_camera_raw(
             found=array_kind(pixels),
             remedy="Develop it to 16-bit linear TIFF.",
         )
-    return _to_full_scale(pixels, reached), _EXIF_OF_FLIP.get(flip, 1)
-
-
-def _reached(raw: Any) -> float:
-    """The code at which LibRaw puts the white level.
-
-    Of files that are no mosaics (linear DNG, such as a telephone's ProRAW) it subtracts the black levels of three
-    channels from the samples, and that of a fourth one, which is 0, from the white level.
-    """
-    if raw.raw_type.name != "Stack":
-        return _FULL
-    black = raw.black_level_per_channel
-    white = raw.white_level
-    return float((white - max(black[:3])) / (white - min(black)) * _FULL)
-
-
-def _to_full_scale(pixels: NDArray[np.uint16], reached: float) -> NDArray[np.uint16]:
-    """Pixels whose white level is at 65535: what clipped in the camera has to be known. LibRaw rounds down."""
+    # The white level becomes 65535, as saturation in the camera has to be known. LibRaw rounds down.
     if reached < _FULL:
         pixels = np.minimum(np.rint(pixels * np.float32(_FULL / reached)), _FULL).astype(np.uint16)
-    return np.where(pixels >= _FULL - 1, np.uint16(_FULL), pixels)
+    pixels = np.where(pixels >= _FULL - 1, np.uint16(_FULL), pixels)
+    return pixels, _EXIF_OF_FLIP.get(flip, 1)
 
 
 def stored_frame(path: Path) -> tuple[tuple[int, int], int]:

@@ -44,7 +44,8 @@ def shots_of_one_place(paths: Sequence[Path]) -> int | None:
     if not sizes:
         return None
     pictures = [_edges(path) for path in paths[: max(_SAMPLED, 3 * max(sizes))]]
-    steps = np.array([_difference(a, b) for a, b in itertools.pairwise(pictures)])
+    # One minus the correlation.
+    steps = np.array([1.0 - float((a * b).mean()) for a, b in itertools.pairwise(pictures)])
     places = np.arange(1, len(steps) + 1)
     for size in sizes:
         between = places % size == 0
@@ -71,15 +72,11 @@ def _edges(path: Path) -> NDArray[np.float32]:
     """A small gray picture without what is smooth, of deviation 1."""
     raw = is_camera_raw(path)
     pixels = read_camera_raw(path, (1.0, 1.0, 1.0))[0] if raw else decode_picture(path, read_picture(path))
-    gray = np.sqrt(pixels.mean(axis=2, dtype=np.float32))
-    small = cv2.resize(gray, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(
+        np.sqrt(pixels.mean(axis=2, dtype=np.float32)), (_SIDE, _SIDE), interpolation=cv2.INTER_AREA
+    )
     fine = small - cv2.GaussianBlur(small, (0, 0), _BLUR)
     return np.asarray(fine / max(float(fine.std()), 1e-6), np.float32)
-
-
-def _difference(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
-    """One minus the correlation."""
-    return 1.0 - float((first * second).mean())
 
 
 FRAMES_A_SECOND = 2.0
@@ -135,21 +132,23 @@ def extract_frames(video: Path, folder: Path, reporter: Reporter) -> int:
                 break
             span = number * wanted // total
             if best is not None and best[0] != span:
-                written += _write(folder, written, best[2])
+                _write(folder, written, best[2])
+                written += 1
                 best = None
             sharpness = float(cv2.Laplacian(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), cv2.CV_32F).var())
             if best is None or sharpness > best[1]:
                 best = span, sharpness, np.asarray(picture, np.uint8)
             advance(number + 1)
     reader.release()
-    written += 0 if best is None else _write(folder, written, best[2])
+    if best is not None:
+        _write(folder, written, best[2])
+        written += 1
     write_text(done, record)
     return written
 
 
-def _write(folder: Path, number: int, picture: NDArray[np.uint8]) -> int:
+def _write(folder: Path, number: int, picture: NDArray[np.uint8]) -> None:
     write_png(folder / f"frame_{number:04d}.png", np.ascontiguousarray(picture[..., ::-1]))
-    return 1
 
 
 _MANY = 100

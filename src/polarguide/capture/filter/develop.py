@@ -10,11 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.pictures import linear_codes
-from polarguide.capture.view import FULL_CODE
-from polarguide.capture.write import Rounding, rounding_of
 from polarguide.geometry.polarizer import ANGLES
-from polarguide.optics.color import srgb_decode_array
 
 SMALLEST = 0.2
 """Shifts below this many pixels are not corrected: resampling would blur more, and polarization causes errors of the
@@ -66,25 +62,29 @@ def estimate_shifts(linear: NDArray[np.float32]) -> list[Shift]:
     """
     detail = [_detail(shot) for shot in linear]
     shifts = [Shift(0.0, 0.0, True), *(_shift(detail[0], other) for other in detail[1:])]
-    whole = np.zeros(linear.shape[:3], bool)
-    least = _disagreement(linear, whole)
+    least = _disagreement(linear, np.zeros(linear.shape[1:3], bool))
     if any(shift.corrected for shift in shifts):
-        after = _disagreement(*align_shots(linear, whole, shifts))
+        after = _aligned_disagreement(linear, shifts)
         if after < _BETTER * least:
             least = after
         else:
             shifts = [shifts[0], *(replace(shift, trusted=False) for shift in shifts[1:])]
     turned = [shifts[0], *(_turn(detail[0], detail[k], shifts[k]) for k in (1, 2, 3))]
-    if turned != shifts and _disagreement(*align_shots(linear, whole, turned)) < _BETTER * least:
+    if turned != shifts and _aligned_disagreement(linear, turned) < _BETTER * least:
         return turned
     if least < AGREEING:  # nothing moved, whatever the details say
         return [shift if shift.trusted else Shift(0.0, 0.0, True) for shift in shifts]
     return shifts
 
 
+def _aligned_disagreement(linear: NDArray[np.float32], shifts: Sequence[Shift]) -> float:
+    moved, _, outside = align_shots(linear, (), shifts)
+    return _disagreement(moved, outside)
+
+
 def _disagreement(linear: NDArray[np.float32], bad: NDArray[np.bool_]) -> float:
     """Mean |I0 + I90 - I45 - I135| relative to S0, after removing a common gain."""
-    i0, i45, i90, i135 = linear.mean(axis=3)[:, ~bad.any(axis=0)]
+    i0, i45, i90, i135 = linear.mean(axis=3)[:, ~bad]
     first = i0 + i90
     second = i45 + i135
     if not second.sum() > 0:
@@ -93,21 +93,23 @@ def _disagreement(linear: NDArray[np.float32], bad: NDArray[np.bool_]) -> float:
 
 
 def align_shots(
-    linear: NDArray[np.float32], clipped: NDArray[np.bool_], shifts: list[Shift]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    linear: NDArray[np.float32], masks: Sequence[NDArray[np.bool_]], shifts: Sequence[Shift]
+) -> tuple[NDArray[np.float32], list[NDArray[np.bool_]], NDArray[np.bool_]]:
     """Shift the shots back.
 
     Args:
-        linear: [4, H, W, 3] linear intensities.
-        clipped: unusable pixels of each shot, [4, H, W].
-        shifts: shifts of the four shots.
+        linear: [K, H, W, 3] linear intensities.
+        masks: pixels of each shot, [K, H, W], or of all shots, [H, W].
+        shifts: shifts of the shots.
 
     Returns:
-        The moved intensities; and pixels for which an unusable one or one outside the picture was used, [4, H, W].
+        The moved intensities; for each mask the pixels that depend on a marked one of any shot, [H, W]; and the pixels
+        that depend on one outside of a shot, [H, W].
     """
-    height, width = clipped.shape[1:]
+    height, width = linear.shape[1:3]
     moved = linear.copy()
-    bad = clipped.copy()
+    each = [np.broadcast_to(mask, linear.shape[:3]).copy() for mask in masks]
+    outside = np.zeros((height, width), bool)
     for index, shift in enumerate(shifts):
         if not shift.corrected:
             continue
@@ -120,8 +122,11 @@ def align_shots(
             matrix = np.array(shift.warp, np.float64).reshape(2, 3)
             x, y = cv2.transform(places, matrix)[:, 0].T.reshape(2, height, width)
         moved[index] = cv2.remap(linear[index], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        bad[index] = remapped_mask(clipped[index], x, y)
-    return moved, bad
+        beyond = remapped_mask(np.zeros((height, width), bool), x, y)
+        for mask in each:
+            mask[index] = remapped_mask(mask[index], x, y) & ~beyond
+        outside |= beyond
+    return moved, [np.asarray(mask.any(axis=0)) for mask in each], outside
 
 
 def remapped_mask(mask: NDArray[np.bool_], x: Any, y: Any) -> NDArray[np.bool_]:
@@ -156,8 +161,7 @@ def shift_notes(view: str, shifts: Sequence[Shift]) -> list[str]:
 
 def _detail(shot: NDArray[np.float32]) -> NDArray[np.float32]:
     gray = np.log(shot.mean(axis=2) + np.float32(0.01))
-    fine = cv2.GaussianBlur(gray, (0, 0), 0.8) - cv2.GaussianBlur(gray, (0, 0), 5.0)
-    return np.asarray(fine, np.float32)
+    return np.asarray(cv2.GaussianBlur(gray, (0, 0), 0.8) - cv2.GaussianBlur(gray, (0, 0), 5.0), np.float32)
 
 
 def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
@@ -175,15 +179,17 @@ def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
         x = y = 0.0
     warp = np.array([[1, 0, x], [0, 1, y]], np.float32)
     try:
-        everywhere = np.ones(reference.shape, np.uint8)
         score, moved = cv2.findTransformECC(
-            reference, other, warp, cv2.MOTION_TRANSLATION, _CRITERIA, everywhere, 5
+            reference, other, warp, cv2.MOTION_TRANSLATION, _CRITERIA, np.ones(reference.shape, np.uint8), 5
         )
     except cv2.error:  # it does not converge where there is no detail to compare
         return Shift(0.0, 0.0, False)
     x, y = (float(value) for value in np.asarray(moved)[:, 2])
-    trusted = score > 0.3 and max(abs(x), abs(y)) <= limit and bool(np.isfinite([x, y]).all())
-    return Shift(round(x, 3), round(y, 3), trusted)
+    return Shift(
+        round(x, 3),
+        round(y, 3),
+        score > 0.3 and max(abs(x), abs(y)) <= limit and bool(np.isfinite([x, y]).all()),
+    )
 
 
 _TURN_SIDE = 1024
@@ -225,18 +231,3 @@ def _turn(reference: NDArray[np.float32], other: NDArray[np.float32], shift: Shi
         return shift
     x, y = (round(float(value), 3) for value in middle)
     return Shift(x, y, True, tuple(float(f"{value:.9g}") for value in warp[:2].ravel()))
-
-
-def linear_intensities(pictures: NDArray[Any], transfer: str) -> NDArray[np.float32]:
-    """Stored values -> linear intensities in [0, 1], same shape, float32."""
-    return linear_codes(pictures, transfer).astype(np.float32) / np.float32(FULL_CODE)
-
-
-def rounding_of_bytes(transfer: str, smallest: float) -> Rounding:
-    """Rounding of the codes of 8-bit pictures, by their steps, which grow with sRGB's.
-
-    Args:
-        transfer: "linear" or "srgb". smallest: factor of the linear intensities.
-    """
-    levels = np.arange(256) / 255
-    return rounding_of(FULL_CODE * smallest * (srgb_decode_array(levels) if transfer == "srgb" else levels))

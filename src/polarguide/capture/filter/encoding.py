@@ -10,10 +10,9 @@ import math
 import re
 import struct
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tifffile
@@ -87,7 +86,11 @@ def stated_encoding(data: bytes) -> Encoding | None:
         else:
             with Image.open(io.BytesIO(data)) as image:
                 profile = image.info.get("icc_profile")
-                rest = _of_png(image.info)
+                gamma = image.info.get("gamma")
+                if "srgb" in image.info:
+                    rest = Encoding(SRGB_EXPONENT, "an sRGB chunk")
+                elif gamma:
+                    rest = Encoding(1 / gamma, f"a gAMA chunk of {gamma:.5g}")
             stated = png_chunk(data, b"cICP") if kind == "PNG" else None
             if stated and not stated[3]:
                 return Encoding(None, "its cICP chunk (values of narrow range, from 16 to 235 of 255)")
@@ -98,15 +101,13 @@ def stated_encoding(data: bytes) -> Encoding | None:
     exponent = None if profile is None else profile_exponent(profile)
     if exponent is not None:
         return Encoding(exponent, "a color profile (ICC)")
-    return rest or _of_exif(tags_of(data))
-
-
-def _of_png(info: Mapping[str | tuple[int, int], Any]) -> Encoding | None:
-    """The encoding that the chunks sRGB and gAMA state, as Pillow reads them."""
-    if "srgb" in info:
-        return Encoding(SRGB_EXPONENT, "an sRGB chunk")
-    gamma = info.get("gamma")
-    return Encoding(1 / gamma, f"a gAMA chunk of {gamma:.5g}") if gamma else None
+    if rest is not None:
+        return rest
+    tags = tags_of(data)
+    gamma = number_of(tags.get(_GAMMA))
+    if gamma is not None and gamma > 0:
+        return Encoding(gamma, f"EXIF gamma {gamma:.3g}")
+    return Encoding(SRGB_EXPONENT, "EXIF color space sRGB") if tags.get(_COLOR_SPACE) == 1 else None
 
 
 def _of_tiff(data: bytes) -> tuple[bytes | None, Encoding | None]:
@@ -121,14 +122,6 @@ def _of_tiff(data: bytes) -> tuple[bytes | None, Encoding | None]:
     middle = float(curve[place]) / 65535 if len(curve) >= count else 0.0
     exponent = math.log(middle) / math.log(place / (count - 1)) if 0 < middle < 1 else None
     return profile, None if exponent is None else Encoding(exponent, "a TransferFunction")
-
-
-def _of_exif(tags: Mapping[int, Any]) -> Encoding | None:
-    """What EXIF says: the tag Gamma, or sRGB as the color space."""
-    gamma = number_of(tags.get(_GAMMA))
-    if gamma is not None and gamma > 0:
-        return Encoding(gamma, f"EXIF gamma {gamma:.3g}")
-    return Encoding(SRGB_EXPONENT, "EXIF color space sRGB") if tags.get(_COLOR_SPACE) == 1 else None
 
 
 def profile_exponent(profile: bytes) -> float | None:
@@ -288,8 +281,11 @@ def stated_video_transfer(path: Path) -> Stated | None:
     name = words[0] if words else "unknown"
     if name in _OF_VIDEO and _OF_VIDEO[name] is None:
         return None
-    said = f"transfer {name}" + (f" ({_HIGH_RANGE[name]}, high dynamic range)" if name in _HIGH_RANGE else "")
-    return transfer_of(path, _OF_VIDEO.get(name), said)
+    return transfer_of(
+        path,
+        _OF_VIDEO.get(name),
+        f"transfer {name}" + (f" ({_HIGH_RANGE[name]}, high dynamic range)" if name in _HIGH_RANGE else ""),
+    )
 
 
 @dataclass(frozen=True)
@@ -299,14 +295,6 @@ class TransferDecision:
     transfer: str
     note: str
     doubt: str = ""
-
-
-def given_transfer(kind: str, transfer: str) -> TransferDecision | None:
-    """The transfer that needs no decision: of camera raw, or as specified; None for auto."""
-    if kind == CAMERA_RAW:
-        note = "Transfer linear: camera raw, developed without tone curve, alike for all shots."
-        return TransferDecision("linear", note)
-    return None if transfer == "auto" else TransferDecision(transfer, f"Transfer {transfer}, as given.")
 
 
 Slope = Callable[[str], checks.Curvature | None]
@@ -394,13 +382,19 @@ def transfer_of_pictures(
         PolarguideError: the files state an encoding that is not read, or several.
     """
     kind = VIDEO if video else kind_of_file(paths[0]) if paths else ARRAY
-    given = given_transfer(kind, transfer)
-    if given is not None:
-        return given
+    if kind == CAMERA_RAW:
+        note = "Transfer linear: camera raw, developed without tone curve, alike for all shots."
+        return TransferDecision("linear", note)
+    if transfer != "auto":
+        return TransferDecision(transfer, f"Transfer {transfer}, as given.")
     stated = stated_video_transfer(video) if video else stated_transfer(paths) if paths else None
     shots, angles = zip(*judged(), strict=True)
-    slope = slope_of_shots(shots, angles) if len(angles[0]) > 1 else None
-    return decide_transfer(kind, stated, eight=shots[0].pictures.dtype == np.uint8, slope=slope)
+    return decide_transfer(
+        kind,
+        stated,
+        eight=shots[0].pictures.dtype == np.uint8,
+        slope=slope_of_shots(shots, angles) if len(angles[0]) > 1 else None,
+    )
 
 
 def _doubt(slope: Slope | None, transfer: str) -> str:

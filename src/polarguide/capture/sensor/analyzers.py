@@ -2,20 +2,28 @@
 
 A pixel behind a polarizer measures ``I = a . (S0, S1, S2)`` of the linear Stokes vector; ``a`` is its analyzer vector,
 ``(1, cos 2p, sin 2p) / 2`` for an ideal polarizer at the angle p. ``polarguide calibrate`` estimates the vectors,
-``analyzer_file`` writes and reads them, and ``AnalyzerCalibration.apply`` gives the intensities that ideal polarizers
-would have measured (the superpixel calibration of Powell and Gruev, Optics Express 21(18), 2013).
+``write_analyzers`` and ``read_analyzers`` store them. ``AnalyzerCalibration.apply`` gives the intensities that ideal
+polarizers would have measured (the superpixel calibration of Powell and Gruev, Optics Express 21(18), 2013).
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
 
-from polarguide.capture.sensor.pattern import Pattern, sensor_pattern
+from polarguide.capture.sensor.pattern import SENSORS, Pattern, sensor_pattern
 from polarguide.core.errors import PolarguideError
+from polarguide.core.files import in_utf8, require_file, write_whole
+from polarguide.core.records import decode
 from polarguide.geometry.polarizer import ANGLES
 
 Array = NDArray[np.float32]
@@ -63,8 +71,7 @@ def correction_matrices(analyzers: list[Array], nominal: NDArray[Any]) -> Array:
         minor = minor + w[i] * (u[k] * v[m] - u[m] * v[k])
         left.append(minor if j % 2 == 0 else -minor)
     rest = [0.5 if int(angle) % 90 == 0 else -0.5 for angle in nominal]
-    along = dot(rest, left)
-    length = np.copysign(np.sqrt(dot(left, left)), along)
+    length = np.copysign(np.sqrt(dot(left, left)), dot(rest, left))
     left = [part / length for part in left]
     cosine = [{0: 1.0, 90: -1.0}.get(int(angle), 0.0) for angle in nominal]
     sine = [{45: 1.0, 135: -1.0}.get(int(angle), 0.0) for angle in nominal]
@@ -241,7 +248,10 @@ class AnalyzerCalibration:
         for index, (row, column) in enumerate(np.ndindex(2, 2)):
             part[:] = 0
             for other, sample in enumerate(samples):
-                part += np.multiply(_expanded(matrices[index, other], rows, columns), sample, out=product)
+                plane = matrices[index, other]
+                if plane.shape != sample.shape:  # cells share matrices
+                    plane = plane[:, columns][rows]
+                part += np.multiply(plane, sample, out=product)
             out[inside][row::2, column::2] = part
         return out
 
@@ -308,7 +318,10 @@ class AnalyzerCalibration:
         order = [places.index(angle) for angle in ANGLES]
         cells = cells[order][:, order]
         if pattern.colors is None:
-            planes = [_resized(cells, scale)]
+            planes = [_repeated(cells, 2 // scale)]
+            if scale == 4:
+                parts = [cells[..., r::2, c::2] for r, c in np.ndindex(2, 2)]
+                planes = [np.mean(parts, axis=0, dtype=np.float32)]
         else:
             corners = [(row, column) for row, column in np.ndindex(2, 2)]
             planes = []
@@ -382,19 +395,158 @@ def _region(offset: tuple[int, int], size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]} pixels{place}"
 
 
-def _expanded(plane: Array, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
-    """The plane [R, C] at every cell; itself where each cell has a matrix of its own."""
-    if plane.shape == (len(rows), len(columns)):
-        return plane
-    return np.asarray(plane[:, columns][rows])
-
-
-def _resized(cells: Array, scale: int) -> Array:
-    """Matrices of cells [4, 4, h, w] at the pixels of intensities."""
-    if scale == 4:
-        return np.mean([cells[..., r::2, c::2] for r, c in np.ndindex(2, 2)], axis=0, dtype=np.float32)
-    return _repeated(cells, 2 // scale)
-
-
 def _repeated(planes: Array, times: int) -> Array:
     return np.repeat(np.repeat(planes, times, axis=-2), times, axis=-1) if times > 1 else planes
+
+
+FORMAT = "polarguide-analyzers"
+VERSION = 1
+SUFFIX = ".safetensors"
+MOST_THROUGHPUT = 1e3
+_LONGEST_HEADER = 100_000_000  # bytes, by safetensors' format; text in their place is a larger number
+_ENTRY = "polarguide"
+_TENSOR = "vectors"
+_REMEDY = "Calibrate again (polarguide calibrate), or copy the file again."
+
+_Positive = Annotated[int, msgspec.Meta(ge=1, le=1 << 20)]
+_NotNegative = Annotated[int, msgspec.Meta(ge=0, le=1 << 20)]
+
+
+class _Metadata(msgspec.Struct, forbid_unknown_fields=True):
+    """The one entry of metadata of the file."""
+
+    format: str
+    version: int
+    sensor: str
+    lens: str
+    width: _Positive
+    height: _Positive
+    offset_x: _NotNegative
+    offset_y: _NotNegative
+    block: _Positive
+    reference: Reference
+    polarizer_extinction: float | None
+    units: str
+    sha256: str
+
+
+UNITS = "intensity per Stokes component, (S0, S1, S2); an ideal polarizer has (1, cos 2p, sin 2p) / 2"
+
+
+def is_analyzer_file(path: Path) -> bool:
+    """Whether a file looks like one of analyzers rather than like JSON; False where it cannot be read."""
+    try:
+        if not path.is_file():  # opening a pipe would wait for somebody who writes to it
+            return False
+        with path.open("rb") as file:
+            start = file.read(64)
+    except OSError:
+        return False
+    return path.suffix.lower() == SUFFIX or (
+        start[8:9] == b"{" and int.from_bytes(start[:8], "little") <= _LONGEST_HEADER
+    )
+
+
+def write_analyzers(path: Path, calibration: AnalyzerCalibration) -> str:
+    """Write the file of a calibration, which is the same bytes for the same content; returns the checksum.
+
+    Raises:
+        PolarguideError: the file cannot be written.
+    """
+    vectors = np.ascontiguousarray(calibration.vectors, np.float32)
+    metadata = _Metadata(
+        FORMAT, VERSION, calibration.sensor, calibration.lens, *calibration.size, *calibration.offset,
+        calibration.block, calibration.reference, calibration.polarizer_extinction, UNITS, "",
+    )  # fmt: skip
+    metadata.sha256 = _checksum(metadata, vectors)
+    # One entry: safetensors writes several in any order.
+    text = json.dumps(msgspec.to_builtins(metadata), ensure_ascii=False)
+    write_whole(path, save({_TENSOR: vectors}, metadata={_ENTRY: text}))
+    return metadata.sha256
+
+
+def read_analyzers(path: Path) -> AnalyzerCalibration:
+    """Read the file that ``polarguide calibrate`` wrote.
+
+    Raises:
+        PolarguideError: the file cannot be read, is cut short, damaged, or of another kind or version.
+    """
+    require_file(path, expected="a calibration of polarguide calibrate", remedy=_REMEDY)
+    try:
+        with in_utf8(path) as name, safe_open(name, framework="numpy") as file:
+            entries = file.metadata() or {}
+            vectors = file.get_tensor(_TENSOR) if list(file.keys()) == [_TENSOR] else None
+    except (SafetensorError, ValueError, OSError, RuntimeError, TypeError) as error:
+        raise _damaged(path, f"damaged or foreign data ({str(error)[:200]})") from None
+    if _ENTRY not in entries or vectors is None:
+        raise _damaged(path, "another safetensors file")
+    metadata = decode(entries[_ENTRY].encode(), _Metadata, path, remedy=_REMEDY)
+    if metadata.format != FORMAT or metadata.version != VERSION:
+        raise _damaged(path, f"{metadata.format}, version {metadata.version}")
+    if _checksum(metadata, vectors) != metadata.sha256:
+        raise PolarguideError(
+            path,
+            expected=f"content with the checksum {metadata.sha256[:16]}...",
+            found="other content: the file is damaged, or was changed",
+            remedy=_REMEDY,
+        )
+    calibration = AnalyzerCalibration(
+        metadata.sensor, metadata.lens, (metadata.offset_x, metadata.offset_y), (metadata.width, metadata.height),
+        metadata.block, vectors, metadata.reference, metadata.polarizer_extinction, metadata.sha256,
+    )  # fmt: skip
+    _require_sound(path, calibration)
+    return calibration
+
+
+def _require_sound(path: Path, calibration: AnalyzerCalibration) -> None:
+    """Refuse content that fits its checksum and still makes no sense.
+
+    Raises:
+        PolarguideError: an unknown sensor, vectors of another shape, or that no polarizer has.
+    """
+    if calibration.sensor not in SENSORS:
+        raise _damaged(path, f"one of the sensor {calibration.sensor!r}, which is unknown")
+    period = calibration.pattern.period
+    shape = (*grid_shape(calibration.offset, calibration.size, calibration.block), period, period, 3)
+    if (
+        calibration.block % period
+        or calibration.vectors.shape != shape
+        or calibration.vectors.dtype != np.float32
+    ):
+        raise _damaged(
+            path,
+            f"vectors {list(calibration.vectors.shape)} of {calibration.vectors.dtype} instead of {list(shape)}",
+        )
+    gain = calibration.vectors[..., 0]
+    if not (np.isfinite(calibration.vectors).all() and (gain > 0).all()):
+        raise _damaged(path, "vectors that are not finite, or have no throughput")
+    if gain.min() < 1 / MOST_THROUGHPUT or gain.max() > MOST_THROUGHPUT:
+        raise _damaged(
+            path, f"throughputs of {gain.min():g} to {gain.max():g}, whose mean is 1/2 in such a file"
+        )
+    if (
+        np.hypot(calibration.vectors[..., 1], calibration.vectors[..., 2]) < LEAST_DIATTENUATION * gain
+    ).any():
+        raise _damaged(path, "vectors of pixels that hardly polarize")
+    nominal = 2 * np.radians(calibration.pattern.angles)
+    angles = np.arctan2(calibration.vectors[..., 2], calibration.vectors[..., 1])
+    # Four that are alike could not be solved for light.
+    if (np.cos(angles - nominal) < np.cos(2 * FARTHEST_ANGLE)).any():
+        raise _damaged(path, "vectors of polarizers far from the sensor's angles")
+
+
+def _damaged(path: Path, found: str) -> PolarguideError:
+    return PolarguideError(
+        path,
+        expected=f"a file that polarguide calibrate wrote (version {VERSION})",
+        found=found,
+        remedy=_REMEDY,
+    )
+
+
+def _checksum(metadata: _Metadata, vectors: NDArray[Any]) -> str:
+    fields = {key: value for key, value in msgspec.to_builtins(metadata).items() if key != "sha256"}
+    digest = hashlib.sha256(json.dumps(fields, ensure_ascii=False, sort_keys=True).encode())
+    digest.update(f"{vectors.dtype.str} {vectors.shape}".encode())
+    digest.update(np.ascontiguousarray(vectors).tobytes())
+    return digest.hexdigest()

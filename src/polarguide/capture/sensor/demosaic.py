@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +25,7 @@ _SOFT = np.float32(1e-2)
 _SOFT_SQUARE = np.float32(1e-4)
 
 
-def bilinear(values: Array, known: Mask) -> Array:
+def interpolate_bilinear(values: Array, known: Mask) -> Array:
     """Bilinear interpolation of samples that are known at every second pixel, or in a checkerboard.
 
     Args:
@@ -39,15 +39,8 @@ def bilinear(values: Array, known: Mask) -> Array:
     return np.where(known, values, _filtered(np.where(known, values, np.float32(0))) / weight)
 
 
-def used_by_bilinear(bad: Mask, known: Mask) -> Mask:
-    """Where ``bilinear`` uses a bad sample."""
-    if not bad.any():
-        return np.zeros_like(bad)
-    return np.where(known, bad, _filtered((bad & known).astype(np.float32)) > 0)
-
-
 def bilinear_cells(mosaic: Array, row: int, column: int, out: Array) -> None:
-    """``bilinear`` of the samples at rows ``row``, ``row + 2``, ... and columns ``column``, ``column + 2``, ...
+    """Interpolate the samples at every second row from ``row`` and every second column from ``column``.
 
     Args:
         mosaic: [H, W], H and W even. row, column: 0 or 1. out: [H, W], takes the result.
@@ -60,7 +53,7 @@ def bilinear_cells(mosaic: Array, row: int, column: int, out: Array) -> None:
 
 def guided_color(bayer: Array, colors: NDArray[np.int64]) -> Array:
     """Bayer picture [H, W] with ``colors`` 0, 1, 2 (R, G, B) at its pixels -> [H, W, 3]."""
-    at = _Neighbors(bayer)
+    at = _neighbors(bayer)
     center = 2 * bayer
     bend_x = center - at(0, -2) - at(0, 2)
     bend_y = center - at(-2, 0) - at(2, 0)
@@ -68,22 +61,14 @@ def guided_color(bayer: Array, colors: NDArray[np.int64]) -> Array:
     weight_y = 1 / ((np.abs(at(-1, 0) - at(1, 0)) + np.abs(bend_y)) ** 2 + _SOFT_SQUARE)
     along_x = (at(0, -1) + at(0, 1)) / 2 + bend_x / 8
     along_y = (at(-1, 0) + at(1, 0)) / 2 + bend_y / 8
-    between = (along_x * weight_x + along_y * weight_y) / (weight_x + weight_y)
-    green = np.where(colors == 1, bayer, between)
-    red, blue = (green + bilinear(bayer - green, colors == color) for color in (0, 2))
+    green = np.where(colors == 1, bayer, (along_x * weight_x + along_y * weight_y) / (weight_x + weight_y))
+    red, blue = (green + interpolate_bilinear(bayer - green, colors == color) for color in (0, 2))
     return np.stack([red, green, blue], axis=-1).astype(np.float32)
-
-
-def guided_polarization(mosaic: Array, places: NDArray[np.int64]) -> Array:
-    """Monochrome polarization mosaic [H, W] with angles ``places`` in degrees -> [4, H, W] by angle."""
-    guide = _half_s0(mosaic)
-    difference = mosaic - guide
-    return np.stack([guide + bilinear(difference, places == angle) for angle in ANGLES])
 
 
 def _half_s0(mosaic: Array) -> Array:
     """S0/2 at each pixel: mean of the four 2x2 windows it belongs to, weighted against gradients toward them."""
-    at = _Neighbors(mosaic)
+    at = _neighbors(mosaic)
     total = np.zeros_like(mosaic)
     weights = np.zeros_like(mosaic)
     for down in (-1, 1):
@@ -100,17 +85,16 @@ def _half_s0(mosaic: Array) -> Array:
     return total / weights
 
 
-class _Neighbors:
-    """``at(y, x)``: the picture moved so that each pixel sees the one ``y`` below and ``x`` to the right of it."""
+def _neighbors(values: Array) -> Callable[[int, int], Array]:
+    """Return a function of (y, x) that gives each pixel the value ``y`` pixels below and ``x`` to the right of it."""
+    height, width = values.shape
+    # Reflected about the outermost pixel, so that the pattern goes on.
+    padded = cv2.copyMakeBorder(values, 2, 2, 2, 2, cv2.BORDER_REFLECT_101)
 
-    def __init__(self, values: Array) -> None:
-        self._shape = values.shape
-        # Reflected about the outermost pixel, so that the pattern goes on.
-        self._padded = cv2.copyMakeBorder(values, 2, 2, 2, 2, cv2.BORDER_REFLECT_101)
+    def at(y: int, x: int) -> Array:
+        return np.asarray(padded[2 + y : 2 + y + height, 2 + x : 2 + x + width])
 
-    def __call__(self, y: int, x: int) -> Array:
-        height, width = self._shape
-        return np.asarray(self._padded[2 + y : 2 + y + height, 2 + x : 2 + x + width])
+    return at
 
 
 def _filtered(values: Array) -> Array:
@@ -177,7 +161,8 @@ def demosaic(
         if mode == "full":
             picture = _full(cells, pattern, interpolation)
         else:
-            picture = _half_size(cells, pattern)
+            places = {int(pattern.angles[place]): place for place in cells}
+            picture = np.stack([cells[places[angle]] for angle in ANGLES])
             if registered:
                 picture = _registered(picture, _full(cells, pattern, interpolation), interpolation)
     if colored and picture.shape[-1] == 1:
@@ -212,7 +197,11 @@ def _spoiled_colors(bad: Mask, pattern: Pattern, place: tuple[int, int], interpo
     if interpolation != "bilinear":
         return _dilated(mask, GUIDED_RADIUS)
     bayer = tiled(pattern.colors[row::2, column::2], mask.shape)
-    return np.any([used_by_bilinear(mask, bayer == color) for color in range(3)], axis=0)
+    used = mask.copy()
+    for color in range(3):
+        known = bayer == color
+        used |= ~known & (_filtered((mask & known).astype(np.float32)) > 0)
+    return used
 
 
 _Cells = dict[tuple[int, int], Array]
@@ -228,17 +217,12 @@ def _cells(values: Array, pattern: Pattern, interpolation: str) -> _Cells:
             continue
         bayer = tiled(pattern.colors[row::2, column::2], sample.shape)
         if interpolation == "bilinear":
-            planes = [bilinear(sample, bayer == color) for color in range(3)]
-            colors[row, column] = np.stack(planes, axis=-1)
+            colors[row, column] = np.stack(
+                [interpolate_bilinear(sample, bayer == color) for color in range(3)], axis=-1
+            )
         else:
             colors[row, column] = guided_color(sample, bayer)
     return colors
-
-
-def _half_size(cells: _Cells, pattern: Pattern) -> Array:
-    """Half size: the samples of a cell, by angle."""
-    angles = {int(pattern.angles[place]): place for place in cells}
-    return np.stack([cells[angles[angle]] for angle in ANGLES])
 
 
 def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Array:
@@ -255,7 +239,10 @@ def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Array:
             for index, angle in enumerate(ANGLES):
                 bilinear_cells(plane, *at[angle], out=planes[index, channel])
         else:
-            planes[:, channel] = guided_polarization(plane, tiled(pattern.angles[:2, :2], plane.shape))
+            guide = _half_s0(plane)
+            places = tiled(pattern.angles[:2, :2], plane.shape)
+            for index, angle in enumerate(ANGLES):
+                planes[index, channel] = guide + interpolate_bilinear(plane - guide, places == angle)
     return np.moveaxis(planes, 1, -1)
 
 
@@ -322,7 +309,11 @@ def outliers(values: NDArray[Any], period: int) -> tuple[NDArray[np.bool_], NDAr
     places = [
         (y, x) for y in (0, period, 2 * period) for x in (0, period, 2 * period) if (y, x) != (period, period)
     ]
-    around = _sorted([padded[y : y + height, x : x + width] for y, x in places])
+    around = [padded[y : y + height, x : x + width] for y, x in places]
+    for low, high in _NETWORK:
+        a = around[low]
+        b = around[high]
+        around[low], around[high] = np.minimum(a, b), np.maximum(a, b)
     least = around[0].astype(np.float32)
     most = around[7].astype(np.float32)
     middle = (around[3].astype(np.float32) + around[4]) / 2
@@ -330,8 +321,7 @@ def outliers(values: NDArray[Any], period: int) -> tuple[NDArray[np.bool_], NDAr
     spread = most - least
     rise = values - middle
     beyond = np.abs(rise) - np.maximum(most - middle, middle - least)
-    noise = _noise(rise, middle)
-    off = np.abs(rise) > _BEYOND_NOISE * noise
+    off = np.abs(rise) > _BEYOND_NOISE * _noise(rise, middle)
     return np.asarray(off & (beyond > spread) & _alone(rise)), (np.sign(rise) * off).astype(np.int8)
 
 
@@ -341,15 +331,6 @@ _NETWORK = (
 )  # fmt: skip
 """Comparisons that sort eight values (Batcher's odd-even merge sort): on whole pictures, faster than a sort of each
 pixel."""
-
-
-def _sorted(eight: list[NDArray[Any]]) -> list[NDArray[Any]]:
-    """Eight pictures, sorted at every pixel."""
-    for low, high in _NETWORK:
-        a = eight[low]
-        b = eight[high]
-        eight[low], eight[high] = np.minimum(a, b), np.maximum(a, b)
-    return eight
 
 
 def _noise(rise: NDArray[np.float32], middle: NDArray[np.float32]) -> NDArray[np.float32]:

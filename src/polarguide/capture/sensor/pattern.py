@@ -211,6 +211,10 @@ class Levels:
     black: float
     gamma: float = 1.0
 
+    def is_full(self, container: int) -> bool:
+        """Whether the levels are those of files whose values fill ``container`` bits."""
+        return self.bits == container and self.saturation == self.white
+
     def linear(self, values: NDArray[Any], dark: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
         """(value - black) / (white - black), made linear, float32; noise below black stays negative.
 
@@ -237,6 +241,7 @@ def estimate_levels(
     saturation: int | None,
     counts: NDArray[np.int64] | None = None,
     stated: int | None = None,
+    alone: bool = False,
 ) -> Levels:
     """Estimate the full scale of a capture.
 
@@ -253,6 +258,8 @@ def estimate_levels(
         saturation: stored value at which the sensor saturates, or None for full scale.
         counts: how often each stored value occurs, from 0 on.
         stated: full scale that the files state; None where they do not.
+        alone: whether the values are those of a single shot of a series, which do not imply the full scale by piling
+            up.
 
     Raises:
         PolarguideError: a value exceeds the range, or the levels are not in order.
@@ -262,7 +269,7 @@ def estimate_levels(
     if stated is not None:
         bits = stated.bit_length()
     elif bits is None:
-        bits = clipped or (12 if container == 16 and largest < 4096 else container)
+        bits = (None if alone else clipped) or (12 if container == 16 and largest < 4096 else container)
     if largest >= 1 << bits:
         raise PolarguideError(
             "--bits",
@@ -333,7 +340,7 @@ def clipping_bits(counts: NDArray[np.int64]) -> int | None:
 
 def level_notes(
     levels: Levels,
-    counts: NDArray[np.int64],
+    counts: NDArray[np.int64] | None,
     container: int,
     bits: int | None,
     stated: int | None = None,
@@ -346,12 +353,13 @@ def level_notes(
         return notes
     if bits is None and stated is None:
         notes.append(f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale.")
-    if clipping_bits(counts) is not None and levels.saturation < FULL_16:
+    if counts is not None and clipping_bits(counts) is not None and levels.saturation < FULL_16:
+        top = int(np.flatnonzero(counts)[-1])
         share = float(counts[levels.saturation :].sum() / counts.sum())
-        notes.append(
-            f"Values pile up at {int(np.flatnonzero(counts)[-1])} ({share:.1%} of the samples): taken as saturated "
-            "(--bits and --saturation say otherwise)."
-        )
+        hint = "(--bits and --saturation say otherwise)"
+        if top < levels.white:
+            hint = f"(--bits {top.bit_length()} makes it full scale)"
+        notes.append(f"Values pile up at {top} ({share:.1%} of the samples): taken as saturated {hint}.")
     return notes
 
 
