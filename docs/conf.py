@@ -63,7 +63,6 @@ napoleon_custom_sections = [("Attributes", "params_style"), ("Raises", "params_s
 html_theme = "furo"
 html_title = f"polarguide {release}"
 html_static_path = ["_static"]
-html_extra_path = ["extra"]  # copied as it is: pages that polarguide share wrote
 html_css_files = ["polarguide.css"]
 html_copy_source = False
 html_show_sourcelink = False

@@ -7,7 +7,7 @@
     python benchmarks/front/front_pictures.py SCENE RUNS --view v016
 
 Writes ``docs/images/front.jpg`` and ``docs/images/front.webp``; with ``--control RUN``, a training without
-polarization, only the pairs that the gallery wipes, into ``docs/extra/scenes``. Pictures have the size of the scene's
+polarization, only the pairs that the gallery wipes, into ``docs/_static/scenes``. Pictures have the size of the scene's
 own, whatever the training's was.
 """
 
@@ -27,7 +27,7 @@ from polarguide.visualization.figures import Picture, contact_sheet
 from polarguide.visualization.layers import ground_truth_pictures, layer_picture
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
-PAGES = IMAGES.parent / "extra" / "scenes"
+PAGES = IMAGES.parent / "_static" / "scenes"
 RECIPES = ("3dgs", "3dgs-dr", "polarguide-stokes")
 LAYERS = {"final": "picture", "specular": "specular", "diffuse": "diffuse", "normal": "normals"}
 FRAMES_PER_SECOND = 12

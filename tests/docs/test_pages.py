@@ -90,7 +90,7 @@ def test_files_and_links_exist(path):
         if not found.exists() or (anchor and anchor not in anchors(text_of(found))):
             missing.append(target)
     served = re.findall(r'(?:href|src)="([^"#:]+)"', text)
-    assert missing + [name for name in served if not (DOCS / "extra" / name).exists()] == []
+    assert missing + [name for name in served if not (DOCS / name).exists()] == []
 
 
 def anchors(text):
