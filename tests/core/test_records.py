@@ -9,7 +9,14 @@ import pytest
 from faults import Fault
 from msgspec import Meta
 
-from polarguide.core.records import LARGEST_RECORD, check_options, decode, read_record, to_json
+from polarguide.core.records import (
+    LARGEST_RECORD,
+    check_options,
+    decode,
+    first_differing_value,
+    read_record,
+    to_json,
+)
 
 
 class Part(msgspec.Struct, forbid_unknown_fields=True):
@@ -122,3 +129,15 @@ def test_names_that_are_no_unicode_come_back(tmp_path: Path) -> None:
 def test_a_key_that_stands_twice_is_named() -> None:
     twice = b'{"a": {"b": 1, "c": 2, "b": 1}}'
     Fault("f.json", "", '"b"').raised_by(decode, twice, dict[str, Any], "f.json")
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "difference"),
+    [
+        ({"a": 1}, {"a": 2}, (".a", 1, 2)),
+        ({"a": None}, {}, (".a", None, None)),
+        ({"a": {"b": [1, 2]}}, {"a": {"b": [1, 3]}}, (".a.b.1", 2, 3)),
+    ],
+)
+def test_the_first_difference_of_records(before: object, now: object, difference: object) -> None:
+    assert first_differing_value("", before, now) == difference

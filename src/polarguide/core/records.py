@@ -257,7 +257,7 @@ def first_differing_value(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
     A field of a nested record is named by its path, such as ``recipe_data.metal_rules.begin``.
     """
     if isinstance(a, dict) and isinstance(b, dict):
-        key = next(key for key in {**a, **b} if a.get(key) != b.get(key))
+        key = next(key for key in {**a, **b} if key not in a or key not in b or a[key] != b[key])
         return first_differing_value(f"{name}.{key}", a.get(key), b.get(key))
     if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
         place = next(place for place, (x, y) in enumerate(zip(a, b, strict=True)) if x != y)
