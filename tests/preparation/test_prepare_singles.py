@@ -371,8 +371,8 @@ TABLES = {
         "file,angle,view\na.png,none,v\nb.png,none,v\n",
         Fault(expected="one photograph of v without a filter"),
     ),
-    "elsewhere": ("file,angle\n../x.png,0\na.png,0\nb.png,0\n", Fault(expected="files in")),
-    "no picture": ("file,angle\nangles.csv,0\na.png,0\nb.png,0\n", Fault(expected="pictures")),
+    "elsewhere": ("file,angle\n../x.png,0\na.png,0\nb.png,0\n", Fault(expected="a picture in")),
+    "no picture": ("file,angle\nangles.csv,0\na.png,0\nb.png,0\n", Fault(expected="a picture in")),
     "name of a view": (
         "file,angle,view\na.png,0,a/b\nb.png,0,c\n",
         Fault(expected="a view name that can be a file name"),

@@ -167,7 +167,7 @@ def test_a_training_heeds_them_and_goes_on_to_the_same_bits(
     offsets = whole.gaussians["index_offset"]
     assert float((offsets < 0).float().mean()) > 0.1
     result = whole.result(whole.scene.views[0].name)
-    assert 1.32 < float(result.index.min()) < 1.42  # five views say 1.33, and all else has 1.5
+    assert 1.32 < float(result.layers["index"].min()) < 1.42  # five views say 1.33, and all else has 1.5
     plain = polarguide.open_run(trained)  # nothing is said of the same views
     assert not bool(plain.gaussians["index_offset"].any())
     assert not torch.equal(whole.gaussians["sh_dc"], plain.gaussians["sh_dc"])

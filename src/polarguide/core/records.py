@@ -202,10 +202,23 @@ def _parts(value: Any, kind: Any) -> Iterator[tuple[str, Any, Any]]:
         yield from ((f".{key}", item, arguments[1]) for key, item in value.items())
     elif isinstance(value, dict):
         fields = getattr(msgspec.inspect.type_info(kind), "fields", ())
-        hints = get_type_hints(kind, include_extras=True) if fields else {}
+        hints = _field_types(kind) if fields else {}
         for field in fields:
             if field.encode_name in value:
                 yield f".{field.encode_name}", value[field.encode_name], hints[field.name]
+
+
+def _field_types(kind: Any) -> dict[str, Any]:
+    """Return the types of the fields of a record by name, with the parameters of a generic type filled in."""
+    origin = get_origin(kind) or kind
+    arguments = dict(zip(getattr(origin, "__parameters__", ()), get_args(kind), strict=False))
+    types = get_type_hints(origin, include_extras=True)
+    for name, hint in types.items():
+        if isinstance(hint, TypeVar):
+            types[name] = arguments.get(hint, Any)
+        elif parameters := getattr(hint, "__parameters__", ()):
+            types[name] = hint[tuple(arguments.get(parameter, Any) for parameter in parameters)]
+    return types
 
 
 def _mismatched_fields(value: Any, options: Any) -> tuple[str, str] | None:
@@ -215,7 +228,8 @@ def _mismatched_fields(value: Any, options: Any) -> tuple[str, str] | None:
         if fields and isinstance(value, dict):
             missing = [name for name, required in fields.items() if required and name not in value]
             closed = getattr(option, "forbid_unknown_fields", False)
-            unknown = [name for name in value if closed and name not in fields]
+            known = {*fields, getattr(option, "tag_field", None)}
+            unknown = [name for name in value if closed and name not in known]
             if missing:
                 return f"the field {missing[0]}", f"only {', '.join(value)}" if value else "none"
             if unknown:
@@ -227,7 +241,7 @@ def _described(value: Any, options: Any) -> str:
     """Return the expected types of a value as text, or the limits if the value has one of these types."""
     names = []
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if number and _LARGEST_INTEGER <= abs(value) < math.inf:
+    if number and isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
         return "a number of usual size"
     for option in options:
         if number and _limits(option):
