@@ -28,7 +28,7 @@ Values = dict[str, Numbers]
 
 CONFIDENCE = 0.95
 LEAST_UNITS = 3
-"""Fewest seeds, views or scenes of which an interval is given: with two, it is 13 times as wide as they are apart."""
+"""Fewest seeds, views or scenes for an interval. With two, it is 13 times as wide as their difference."""
 NORMAL_QUANTILE = float(stats.norm.ppf((1 + CONFIDENCE) / 2))
 KNOWN_SCATTER: Mapping[str, float] = {
     "psnr": 0.23,

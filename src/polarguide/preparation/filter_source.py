@@ -489,7 +489,7 @@ _LISTED = 12
 
 
 @dataclass
-class TableRow:
+class PictureRow:
     """A picture of the scene.
 
     Attributes:
@@ -521,7 +521,7 @@ def write_exposure_table(
         reporter: for messages.
     """
     pictures = [
-        TableRow(view, Path(name).name, exposure)
+        PictureRow(view, Path(name).name, exposure)
         for view, record in sorted(views.items())
         for name, exposure in zip(
             picture_names(view, [shot.angle for shot in record.exposures or ()]),
@@ -551,7 +551,7 @@ def write_exposure_table(
     write_whole(root / TABLE, text.getvalue().encode())
 
 
-def _estimate(root: Path, pictures: list[TableRow], posed: bool, reporter: Reporter) -> None:
+def _estimate(root: Path, pictures: list[PictureRow], posed: bool, reporter: Reporter) -> None:
     """Gains of all pictures, from points in common and what the files say."""
     views = list(dict.fromkeys(picture.view for picture in pictures))
     noted = [picture.record.light for picture in pictures]
@@ -590,7 +590,7 @@ def _estimate(root: Path, pictures: list[TableRow], posed: bool, reporter: Repor
     _warn([views[k] for k in estimate.contradicted], pictures, of_view, reporter)
 
 
-def _within_views(pictures: list[TableRow], files: NDArray[np.float64]) -> NDArray[np.float64]:
+def _within_views(pictures: list[PictureRow], files: NDArray[np.float64]) -> NDArray[np.float64]:
     """Logarithms of exposures relative to the mean of their view, as the files say; 0 where not all of them do."""
     relative = np.zeros(len(pictures))
     for view in {picture.view for picture in pictures}:
@@ -605,7 +605,7 @@ def _within_views(pictures: list[TableRow], files: NDArray[np.float64]) -> NDArr
 
 def _of_points(
     root: Path,
-    pictures: list[TableRow],
+    pictures: list[PictureRow],
     rows: dict[str, list[int]],
     within: NDArray[np.float64],
     reporter: Reporter,
@@ -671,7 +671,7 @@ def _say_how(
 
 
 def _warn(
-    contradicted: list[str], pictures: list[TableRow], files: NDArray[np.float64], reporter: Reporter
+    contradicted: list[str], pictures: list[PictureRow], files: NDArray[np.float64], reporter: Reporter
 ) -> None:
     """Name exposures that are out of the ordinary."""
     if contradicted:
@@ -689,7 +689,7 @@ def _warn(
             )
 
 
-def _tell(pictures: list[TableRow], reporter: Reporter) -> None:
+def _tell(pictures: list[PictureRow], reporter: Reporter) -> None:
     """Print the table: all pictures, or the most unusual ones of many; nothing where all gains are 1."""
     if all(picture.record.gain == 1 for picture in pictures):
         return
