@@ -131,7 +131,7 @@ def perform(
     device = {"CUDA_VISIBLE_DEVICES": gpus[int(worker.name) % len(gpus)]} if gpus else {}
 
     def wanted() -> bool:
-        """Whether somebody waits: not if the task was canceled, nor if the command that asked for it is gone."""
+        """Return False if the task was canceled or its command has ended."""
         state = worker.state.tasks.get(key)
         return state is not None and state.state != "cancelled"
 

@@ -48,7 +48,7 @@ WORKER_BYTES = 300_000_000
 CONNECT_SECONDS = 30.0
 """How long a scheduler that somebody else runs may take to answer."""
 SETTINGS = {
-    # Whoever loses a worker is to hear of it: run_jobs decides whether the job goes on.
+    # A lost worker is reported at once: run_jobs decides whether the job goes on.
     "distributed.scheduler.allowed-failures": 0,
     "distributed.deploy.lost-worker-timeout": "2s",
     "distributed.worker.memory.terminate": False,
@@ -103,7 +103,7 @@ def workers(
     import dask
     from distributed import Client, LocalCluster
 
-    # What matters, run_jobs says. Each of them has a level of its own.
+    # run_jobs reports what matters. Each logger has a level of its own.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with dask.config.set(SETTINGS), contextlib.ExitStack() as stack:
@@ -199,7 +199,7 @@ def _no_cluster(manager: str, found: str) -> PolarguideError:
 
 
 def _mib(memory: int) -> int:
-    """Of a job: a worker and the process that it starts."""
+    """Return the memory of a job in MiB: that of its process and of its worker."""
     return math.ceil((memory + WORKER_BYTES) / MEBIBYTE)
 
 

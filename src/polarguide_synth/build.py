@@ -289,7 +289,7 @@ class BuiltScene:
 
     @property
     def drawn(self) -> NDArray[np.bool_]:
-        """Whether the camera sees an object, by its number; number 0 is no object."""
+        """Visibility of the objects to the camera, by number; number 0 stands for no object."""
         return np.array([False, *self.spec.shown])
 
 

@@ -7,7 +7,9 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+import torch
 from faults import Fault
+from torch import Tensor
 from trainings import different
 
 import polarguide
@@ -108,4 +110,26 @@ def test_a_recipe_names_the_action_of_a_callback(tiny_scene: Scene, tmp_path: Pa
 
     Fault("training", expected="reset_opacity", found="note").raised_by(
         trained, tiny_scene, tmp_path / "other", recipe=noting, settings=short
+    )
+
+
+class Nameless(Callback[Any]):
+    """Has a state, but no name for it."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"count": torch.zeros(())}
+
+
+class Named(Nameless):
+    """Has a name, which a second one would share."""
+
+    name = "named"
+
+
+@pytest.mark.parametrize(("callbacks", "found"), [([Nameless()], "''"), ([Named(), Named()], "'named'")])
+def test_a_state_needs_a_name_of_its_own(
+    tiny_scene: Scene, tmp_path: Path, callbacks: list[Callback[Any]], found: str
+) -> None:
+    Fault("training", expected="a name of its own", found=found).raised_by(
+        trained, tiny_scene, tmp_path / "run", *callbacks
     )

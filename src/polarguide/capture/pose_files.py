@@ -41,7 +41,7 @@ _OFF_CENTER = 0.125
 
 
 def is_centered(size: Size, center: tuple[float | None, float | None]) -> bool:
-    """Whether a principal point, as far as it is known, lies near the middle of a picture."""
+    """Return True if the known coordinates of a principal point lie near the middle of the picture."""
     return all(
         place is None or abs(place - side / 2) <= _OFF_CENTER * side
         for place, side in zip(center, size, strict=True)
@@ -116,7 +116,7 @@ class _Transforms(_Lens):
     from_na: bool | None = None
 
 
-# What these say changes no camera: where a program puts the scene, what it trains on, depth, masks and points.
+# Fields that change no camera: placement of the scene, training, depth, masks and points.
 _IRRELEVANT = {
     "aabb", "aabb_scale", "render_aabb", "scale", "offset", "up", "applied_transform", "applied_scale",
     "orientation_override", "auto_scale_poses_override", "centered", "ply_file_path", "n_frames",
@@ -236,7 +236,7 @@ def _camera_of(
 
 
 def _is_fisheye(where: str, lens: Mapping[str, Any]) -> bool:
-    """Whether the lens is a fisheye of OpenCV.
+    """Return True for a fisheye lens of OpenCV, and False for a perspective one.
 
     Raises:
         PolarguideError: the lens is a panorama or another lens that is not read, or fields contradict one another.
@@ -494,8 +494,8 @@ _METASHAPE_FIELDS = {
     "calibration": {"resolution", *_METASHAPE_LENS},
     "camera": {"transform", "rolling_shutter"},
 }
-# What these say changes no camera that is read: bands, exposures, accuracies, GPS, and what the chunk's frame is to the
-# world. ``orientation`` is how Metashape displays a picture; pose and calibration are of the stored pixels.
+# Fields that change no camera: bands, exposures, accuracies, GPS, and the placement of the chunk in the world.
+# ``orientation`` is how Metashape displays a picture; pose and calibration are of the stored pixels.
 _METASHAPE_IRRELEVANT = {
     "sensor": {
         "property", "bands", "data_type", "covariance", "meta", "fixed", "fixed_params", "fixed_calibration",

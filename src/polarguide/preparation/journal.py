@@ -79,7 +79,7 @@ class ViewRecord(msgspec.Struct, kw_only=True):
 
     @property
     def turned(self) -> bool:
-        """Whether the view was turned for display."""
+        """True if the view was turned for display."""
         return self.orientation not in (UNSET, 1)
 
 

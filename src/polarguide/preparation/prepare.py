@@ -82,9 +82,9 @@ SPLIT = "split.json"
 SFM = ".sfm"
 PARTIAL = ".sparse.partial"
 FOLDERS = ("polar", "invalid", "masks", "sparse")
-"""What is written into."""
+"""Folders of a scene that a preparation writes into."""
 REMEDY = "Give another --out; nothing was written."
-# Of a picture's angle, in its name.
+# Angle in the name of a picture.
 _LABEL = r"(\d{3}(\.\d+)?|unknown|none)(-\d+)?"
 _OF_POSES = ("poses", "poses_of", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
 _EARLIER_SETTINGS = {"analyzers": None, "angles": None, "poses_of": "auto", "shots_per_view": None}
@@ -236,7 +236,7 @@ class SceneFolder:
         (self.root / JOURNAL).unlink(missing_ok=True)
 
     def has(self, view: str, warp: object) -> bool:
-        """Whether a view is written as it would be now."""
+        """Return True if the folder holds all files of a view, made with the same undistortion."""
         record = self.views.get(view)
         return (
             record is not None

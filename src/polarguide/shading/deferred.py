@@ -127,7 +127,7 @@ class DeferredShading(ShadingModel):
 
     @property
     def blurs(self) -> bool:
-        """Whether surfaces can be other than mirrors."""
+        """True if surfaces can be rough."""
         return self.rough or self.metal
 
     @property

@@ -122,7 +122,7 @@ class ShadingModel(ABC):
     """Whether shading reads the normals, so that they are always splatted."""
 
     smooth_dielectric: ClassVar[bool] = True
-    """Whether ``predicted_stokes`` is that of a smooth dielectric, for which there is a native kernel."""
+    """True if ``predicted_stokes`` is that of a smooth dielectric, for which there is a native kernel."""
 
     def __init_subclass__(cls) -> None:
         """Check that methods and kernels agree: whoever replaces a method states what its kernel is.

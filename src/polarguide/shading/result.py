@@ -164,7 +164,7 @@ class RenderResult:
 
     @property
     def is_polarized(self) -> bool:
-        """Whether Stokes vectors can be predicted: both lobes and the normal are there."""
+        """True if both lobes and the normal exist, from which Stokes vectors are predicted."""
         return {"specular", "diffuse", "normal"} <= self.layers.keys()
 
     def with_layers(self, **layers: Tensor) -> RenderResult:

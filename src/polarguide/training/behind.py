@@ -34,7 +34,7 @@ def shares_before(depth: Tensor, near: float, far: float) -> Tensor:
 
 
 def _largest_of_three(values: Tensor) -> Tensor:
-    """Of each row and its two neighbors, [H, W]; many times as fast as pooling."""
+    """Return the maximum of each row and its two neighbors, [H, W]; many times as fast as pooling."""
     largest = values.clone()
     torch.maximum(values[1:], values[:-1], out=largest[1:])
     torch.maximum(largest[:-1], values[1:], out=largest[:-1])

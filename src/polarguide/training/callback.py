@@ -18,7 +18,7 @@ class Callback(Generic[LoopKind]):
     """Does something between the steps of a training; every method of this class does nothing.
 
     Attributes:
-        name: prefix of its tensors in a checkpoint, unique among the callbacks of a loop.
+        name: prefix of its tensors in a checkpoint, an identifier; unique among the callbacks that have a state.
         action: name in ``Stage.on_enter``, ``Repeat`` and ``Rounds`` of a recipe that makes ``act`` due.
     """
 

@@ -23,7 +23,7 @@ from polarguide.shading.model import PLAIN
 from polarguide.shading.result import COLOR_CHANNELS
 from polarguide.training.actions import exchange_statistics
 from polarguide.training.behind import turned_behind
-from polarguide.training.callback import AnyCallback
+from polarguide.training.callback import AnyCallback, Callback
 from polarguide.training.context import TrainingContext
 from polarguide.training.distributed import Ranks
 from polarguide.training.feed import Feed
@@ -130,8 +130,10 @@ class TrainingLoop(Loop):
         """Begin with a schedule, or resume it from a state.
 
         Raises:
-            PolarguideError: the recipe has an action, or the state has tensors, of a callback that is not there.
+            PolarguideError: the recipe has an action, or the state has tensors, of a callback that is not there; or
+                callbacks with a state have no name of their own.
         """
+        _check_names(self.callbacks)
         self.current = context
         self.schedule = Schedule(context.recipe, context.settings.steps)
         self.feed = Feed(context)
@@ -185,9 +187,8 @@ class TrainingLoop(Loop):
         stage = self.position.stage
         shading = self.current.shading if stage.reflection else PLAIN
         view = self.view_at(state.step * self.settings.views_per_step + slot)
-        targets = self.feed.targets(
-            state.step, view, stage.weights, state.frozen
-        )  # before the picture takes memory
+        # Targets come first: the picture takes memory, too.
+        targets = self.feed.targets(state.step, view, stage.weights, state.frozen)
         camera = targets.camera
         statistic = ScreenStatistic(COLOR_CHANNELS) if stage.densify else None
         request = requested_layers(stage, self.schedule.sh_degree(state.step), statistic)
@@ -297,6 +298,19 @@ def requested_layers(stage: Stage, sh_degree: int, statistic: ScreenStatistic | 
         normal_rotation_only=fades,
         statistic=statistic,
     )
+
+
+def _check_names(callbacks: Sequence[AnyCallback]) -> None:
+    """Check that callbacks with a state have names by which a checkpoint can hold it."""
+    names = [each.name for each in callbacks if type(each).state_dict is not Callback.state_dict]
+    for name in names:
+        if not name.isidentifier() or names.count(name) > 1:
+            raise PolarguideError(
+                "training",
+                expected="a name of its own for each callback that has state_dict, made of letters, digits and _",
+                found=repr(name),
+                remedy="Set the attribute name of the callback.",
+            )
 
 
 def _check_known(what: str, names: Iterable[str], known: set[str]) -> None:

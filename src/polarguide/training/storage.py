@@ -39,7 +39,7 @@ class Packed(NamedTuple):
 
 
 Entry = dict[str, Packed]
-"""What is kept of a view, by name."""
+"""Cached tensors of a view by name."""
 
 
 def packed(values: Tensor) -> Packed:

@@ -240,7 +240,7 @@ class Painting:
 
     @property
     def waits(self) -> bool:
-        """Whether a recorded action is pending."""
+        """True if a recorded action is pending."""
         return bool(self._todo)
 
     def act(self, camera: Camera) -> None:

@@ -101,7 +101,7 @@ class Presenting:
 
     @property
     def waits(self) -> bool:
-        """Whether a click is pending."""
+        """True if a click is pending."""
         return self._clicked is not None
 
     @property

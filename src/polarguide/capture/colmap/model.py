@@ -158,9 +158,9 @@ def _decimal_comma(data: bytes) -> str:
 
 
 def _strange_color(data: bytes) -> str | None:
-    """A line of ``points3D.txt`` with a color that pycolmap would take modulo 256; None where there is none.
+    """Return a line of ``points3D.txt`` with a color that pycolmap would take modulo 256, or None.
 
-    What is no number at all, pycolmap finds itself.
+    Colors that are not numbers are left to pycolmap, which refuses them.
     """
     for number, line in enumerate(data.splitlines(), 1):
         cells = line.split(None, 7)[4:7]

@@ -59,7 +59,7 @@ from polarguide.core.errors import PolarguideWarning
 from polarguide.core.files import read_file
 from polarguide.core.records import read_record
 
-# Of the releases and of NeRSP's, PolGS's and PhyGaP's copies of them.
+# Names in the releases, and in the copies of NeRSP, PolGS and PhyGaP.
 STOKES_FOLDERS = ("images_stokes", "train_images_stokes")
 _PICTURES = ("image", "images", "train", "I-sum", "I_sum")
 _MAPS = ("input_azimuth_maps", "train_input_azimuth_maps")

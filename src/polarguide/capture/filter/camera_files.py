@@ -71,8 +71,8 @@ def read_camera_raw(
         pixels = np.asarray(raw.postprocess(**libraw_parameters(gains)))
         reached = float(_FULL)
         if raw.raw_type.name == "Stack":
-            # Of files that are no mosaics (linear DNG, such as a telephone's ProRAW) LibRaw subtracts the black levels
-            # of three channels from the samples, and that of a fourth one, which is 0, from the white level.
+            # In a file that is not a mosaic (linear DNG, such as ProRAW of a telephone), LibRaw subtracts the black
+            # levels of three channels from the samples. From the white level it subtracts that of a fourth one, 0.
             black = raw.black_level_per_channel
             reached = float((raw.white_level - max(black[:3])) / (raw.white_level - min(black)) * _FULL)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint16:

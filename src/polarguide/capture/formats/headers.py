@@ -41,7 +41,7 @@ _JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 ORIENTATION = 274
 # Marks without a length: one that nobody uses, and restarts.
 _JPEG_ALONE = (0x01, *range(0xD0, 0xD8))
-# Of a progressive JPEG file. Encoders write ten or so; each is decoded over the whole picture, be it empty or not.
+# Largest number of scans of a progressive JPEG file. Encoders write about ten, and decoding an empty one costs as much.
 _MOST_SCANS = 200
 LARGEST_PIXELS = 150_000_000
 """More pixels than any camera has: a file that claims more is refused before memory is taken for it."""
@@ -140,7 +140,7 @@ def _png_damage(data: bytes) -> str | None:
 
 
 def _jpeg_damage(data: bytes) -> str | None:
-    """Whether a JPEG file ends with its end-of-image mark, has a size, and not too many scans."""
+    """Describe the damage of a JPEG file: no end-of-image mark, too many scans, or no size; None for a sound one."""
     kinds = list(_jpeg_marks(data))
     if 0xD9 not in kinds:
         return f"a JPEG file cut short (it ends after {len(data)} bytes)"

@@ -254,7 +254,7 @@ def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
             path,
             expected="one ordinary gray or RGB picture in a TIFF file",
             found=str(error),
-            remedy="Export one gray or RGB picture. Of four angles in one file, save each as a file of its own, "
+            remedy="Export one gray or RGB picture. If the file holds four angles, save each in a file of its own, "
             f"such as {path.stem}_0.tif and {path.stem}_45.tif; or give the raw mosaic.",
         ) from None
     except Exception as error:  # the libraries raise many kinds of errors for damaged files

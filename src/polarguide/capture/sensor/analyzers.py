@@ -434,7 +434,7 @@ UNITS = "intensity per Stokes component, (S0, S1, S2); an ideal polarizer has (1
 
 
 def is_analyzer_file(path: Path) -> bool:
-    """Whether a file looks like one of analyzers rather than like JSON; False where it cannot be read."""
+    """Return True if a file looks like a file of analyzers, and False for JSON or an unreadable file."""
     try:
         if not path.is_file():  # opening a pipe would wait for somebody who writes to it
             return False

@@ -212,7 +212,7 @@ class Levels:
     gamma: float = 1.0
 
     def is_full(self, container: int) -> bool:
-        """Whether the levels are those of files whose values fill ``container`` bits."""
+        """Return True if values fill all ``container`` bits of the file and saturate at full scale."""
         return self.bits == container and self.saturation == self.white
 
     def linear(self, values: NDArray[Any], dark: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
