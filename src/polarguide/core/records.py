@@ -214,9 +214,8 @@ def _field_types(kind: Any) -> dict[str, Any]:
     arguments = dict(zip(getattr(origin, "__parameters__", ()), get_args(kind), strict=False))
     types = get_type_hints(origin, include_extras=True)
     for name, hint in types.items():
-        if isinstance(hint, TypeVar):
-            types[name] = arguments.get(hint, Any)
-        elif parameters := getattr(hint, "__parameters__", ()):
+        parameters = getattr(hint, "__parameters__", ())
+        if parameters:
             types[name] = hint[tuple(arguments.get(parameter, Any) for parameter in parameters)]
     return types
 
