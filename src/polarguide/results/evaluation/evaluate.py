@@ -23,6 +23,8 @@ from polarguide.core.system import peak_memory_mib
 from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 from polarguide.optics.color import shown
+from polarguide.gaussians.initialize import camera_reach
+from polarguide.results.evaluation.coverage import Coverage, DepthMap, rendered_depths, true_depths
 from polarguide.results.evaluation.mesh import mesh_scores
 from polarguide.results.evaluation.metrics import HAZE_DEPTH, Selection, normal_angles_deg
 from polarguide.results.evaluation.record import METRICS_FILE, code_digest, commit, write_metrics
@@ -44,6 +46,8 @@ BRIGHTEST = (0.05, 0.5)
 """Between these lies the DoLP from which its pictures are fully bright."""
 MAP = "inferno"
 NOT_COUNTED = 90
+STRIPES = 48
+"""Number of stripes across a picture that mark pixels whose content no training view shows."""
 COLUMNS = {
     "photograph": "photograph",
     "final": "picture error",
@@ -60,7 +64,8 @@ COLUMNS = {
 class ErrorSheet:
     """Pictures of the errors of some views, one row each, and below each column the key to its colors.
 
-    Heat maps are black at no error and bright at the end of their scale; what does not count is gray. Layers and
+    Heat maps are black at no error and bright at the end of their scale; what does not count is gray. Stripes mark
+    pixels of the picture error and of the Stokes error whose content no training view shows. Layers and
     picture: mean over channels of the absolute difference of shown values. Polarization: angle of the field as hue,
     degree as brightness, of the channels' mean Stokes vector; its error is the mean over channels of |S1 error| + |S2
     error|. Its scales end at about what a tenth of the pixels measure or more.
@@ -73,7 +78,7 @@ class ErrorSheet:
         self._chosen = range(0, views, max(1, math.ceil(views / MOST_VIEWS)))
         self._added = 0
         # Name, pictures, measured and predicted Stokes vectors, and where they count: scales depend on all views.
-        self._rows: list[tuple[str, dict[str, Picture], Tensor | None, Tensor | None, Tensor]] = []
+        self._rows: list[tuple[str, dict[str, Picture], Tensor | None, Tensor | None, Tensor, Tensor]] = []
 
     def add(self, view: View, target: ViewTarget, result: RenderResult, stokes: Tensor | None) -> None:
         """Add the next view, if it is one of those that are drawn; ``stokes`` [3, H, W, 3] as it is predicted."""
@@ -92,10 +97,12 @@ class ErrorSheet:
         if "normal" in result.layers and target.normal is not None and target.surface is not None:
             angles = normal_angles_deg(result.normal.nan_to_num(), target.normal)
             pictures["normal"] = _heat(angles, target.surface.mask, NORMAL_HIGH)
+        unseen = (target.valid.mask & ~target.seen.mask).cpu()
+        _hatch(pictures["final"], unseen)
         keep = target.valid if target.polarized is None else target.polarized
         predicted = None if stokes is None else stokes.cpu().nan_to_num()
         measured = view.stokes() if view.is_determined else None
-        self._rows.append((view.name, pictures, measured, predicted, keep.mask.cpu()))
+        self._rows.append((view.name, pictures, measured, predicted, keep.mask.cpu(), unseen))
 
     def write(self, path: Path) -> None:
         """Write the sheet; nothing where no view was added."""
@@ -103,7 +110,7 @@ class ErrorSheet:
             return
         ends = {**dict.fromkeys(("final", "specular", "diffuse"), PICTURE_HIGH), "normal": NORMAL_HIGH}
         headings = dict(COLUMNS)
-        if any(measured is not None and predicted is not None for _, _, measured, predicted, _ in self._rows):
+        if any(measured is not None and predicted is not None for _, _, measured, predicted, *_ in self._rows):
             brightest, ends["stokes"] = self._draw_polarization()
             headings["measured"] = f"AoLP x DoLP / {brightest:g}"
         keys = [key for key in COLUMNS if any(key in pictures for _, pictures, *_ in self._rows)]
@@ -126,17 +133,18 @@ class ErrorSheet:
 
     def _draw_polarization(self) -> tuple[float, float]:
         """Add the pictures of the polarization; the DoLP that is fully bright, and the end of the errors' scale."""
-        counted = [measured[:, keep] for _, _, measured, _, keep in self._rows if measured is not None]
+        counted = [measured[:, keep] for _, _, measured, _, keep, _ in self._rows if measured is not None]
         degrees = torch.cat([optics.dolp(optics.luminance(values)) for values in counted])
         brightest = min(max(_tenth_above(degrees), BRIGHTEST[0]), BRIGHTEST[1])
         high = _tenth_above(torch.cat([_size(values) for values in counted]))
-        for _, pictures, measured, predicted, keep in self._rows:
+        for _, pictures, measured, predicted, keep, unseen in self._rows:
             if measured is None:
                 continue
             pictures["measured"] = _polarization(measured, brightest)
             if predicted is not None:
                 pictures["predicted"] = _polarization(predicted, brightest)
                 pictures["stokes"] = _heat(_size(predicted - measured), keep, high)
+                _hatch(pictures["stokes"], unseen)
         return brightest, high
 
 
@@ -149,6 +157,15 @@ def _heat(values: Tensor, keep: Tensor, high: float) -> Picture:
     picture = figures.scalar_to_rgb(values, 0.0, high, MAP)
     picture[~keep.cpu().numpy()] = NOT_COUNTED
     return picture
+
+
+def _hatch(picture: Picture, unseen: Tensor) -> None:
+    """Draw diagonal stripes over the pixels [H, W] whose content no training view shows."""
+    height, width = unseen.shape
+    diagonal = torch.arange(height)[:, None] + torch.arange(width)
+    spacing = max(4, width // STRIPES)
+    stripes = unseen & (diagonal % spacing < spacing // 4)
+    picture[stripes.numpy()] = NOT_COUNTED
 
 
 def _size(stokes: Tensor) -> Tensor:
@@ -305,12 +322,13 @@ def evaluate(
         reporter.say(
             f"scored behind an analyzer that is fitted on the other half of the picture: {listed(fitted)}"
         )
+    coverage = _coverage(run, reporter)
     views = {}
     by_object = ErrorsByObject(facts.objects)
     sheet = ErrorSheet(len(tests))
     with reporter.track("scoring", len(tests)) as advance:
         for view in tests:
-            views[view.name] = _score(run, view, facts, by_object, sheet)
+            views[view.name] = _score(run, view, facts, coverage.seen[view.name], by_object, sheet)
             advance(len(views))
     sheet.write(run.folder / ERRORS_FILE)
     memory = _peak(held_before)  # before the mesh, which is no part of what a run needs
@@ -339,12 +357,44 @@ def evaluate(
     )
 
 
+def _coverage(run: ScoredRun, reporter: Reporter) -> Coverage:
+    """Find the pixels of the test views whose content a training view shows.
+
+    Depths of test views come from the ground truth where it has them. All others are rendered.
+    """
+    scene = run.scene
+    training = scene.train_views
+    centers = torch.stack([view.camera.center for view in training])
+    middle, radius = camera_reach(scene.points.double().numpy(), centers.numpy())
+
+    def surface(view: View) -> DepthMap:
+        result = run.model.render(view.camera, normals=False, depth=True)
+        return rendered_depths(view.camera, result.depth, result.alpha, torch.from_numpy(middle), radius)
+
+    held_out = {}
+    for view in scene.test_views:
+        truth = view.ground_truth
+        known = None if truth is None else truth.depth
+        held_out[view.name] = surface(view) if known is None else true_depths(view.camera, known)
+    coverage = Coverage(held_out)
+    with reporter.track("finding the photographed pixels", len(training)) as advance:
+        for count, view in enumerate(training, start=1):
+            coverage.add(surface(view))
+            advance(count)
+    return coverage
+
+
 def _score(
-    run: ScoredRun, view: View, facts: SceneFacts, by_object: ErrorsByObject, sheet: ErrorSheet
+    run: ScoredRun,
+    view: View,
+    facts: SceneFacts,
+    seen: Tensor,
+    by_object: ErrorsByObject,
+    sheet: ErrorSheet,
 ) -> ViewScores:
     """Score a view; its errors are added to those by object, and its pictures to the sheet."""
     # First what is known of it: copied later, it would have to wait until the rendering is done.
-    target = ViewTarget.of_view(view, facts, run.model.device)
+    target = ViewTarget.of_view(view, facts, run.model.device).with_coverage(seen)
     result = run.model.render(view.camera, depth=True, surface=True)
     stokes = run.model.stokes(result, view.camera)
     if not view.measures_radiance:

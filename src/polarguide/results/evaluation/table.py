@@ -21,6 +21,7 @@ from polarguide.results.evaluation.metrics import (
     mean_alpha,
     normal_mae_deg,
     normal_within_11,
+    seen_share,
     squared_error,
     ssim,
     stokes_error,
@@ -61,6 +62,23 @@ OURS: tuple[Metric, ...] = (
         "psnr", "PSNR", "dB", 2, "higher", measure=_compared(squared_error, "final", "photograph", "valid")
     ),
     Metric(
+        "psnr_seen",
+        "PSNR seen",
+        "dB",
+        2,
+        "higher",
+        measure=_compared(squared_error, "final", "photograph", "seen"),
+    ),
+    Metric(
+        "seen_share",
+        "seen pixels",
+        "%",
+        1,
+        None,
+        measure=_compared(seen_share, "final", "seen", "valid"),
+        factor=100.0,
+    ),
+    Metric(
         "psnr_foreground",
         "PSNR foreground",
         "dB",
@@ -78,6 +96,14 @@ OURS: tuple[Metric, ...] = (
     ),
     Metric(
         "ssim", "SSIM", "", 3, "higher", measure=_compared(ssim, "final", "photograph", "valid", "windows")
+    ),
+    Metric(
+        "ssim_seen",
+        "SSIM seen",
+        "",
+        3,
+        "higher",
+        measure=_compared(ssim, "final", "photograph", "seen", "seen_windows"),
     ),
     Metric("lpips", "LPIPS", "", 3, "lower"),
     Metric("flip", "FLIP", "", 3, "lower"),
@@ -143,6 +169,14 @@ OURS: tuple[Metric, ...] = (
         3,
         "lower",
         measure=_compared(stokes_error, "polarization", "polarization", "polarized", "photograph"),
+    ),
+    Metric(
+        "stokes_error_seen",
+        "Stokes error seen",
+        "",
+        3,
+        "lower",
+        measure=_compared(stokes_error, "polarization", "polarization", "seen_polarized", "photograph"),
     ),
     Metric(
         "depth_error_median_percent",

@@ -176,6 +176,8 @@ class ViewTarget:
         smooth: valid pixels with a true depth at least 2 pixels from any jump of it.
         mask: [H, W] float64, 1 in the foreground; None unless the pictures show nothing else.
         beyond: valid pixels more than 3 pixels outside the mask; None likewise.
+        seen: valid pixels whose content a training view shows; None if not determined. seen_windows: centers of
+            SSIM's windows among them. seen_polarized: those of them whose polarization counts.
         extent: extent of the scene, world units.
     """
 
@@ -197,6 +199,9 @@ class ViewTarget:
     smooth: Selection | None = None
     mask: Tensor | None = None
     beyond: Selection | None = None
+    seen: Selection | None = None
+    seen_windows: Selection | None = None
+    seen_polarized: Selection | None = None
     extent: float = 1.0
 
     @classmethod
@@ -275,6 +280,18 @@ class ViewTarget:
             mask=_there(alone, device),
             beyond=_chosen(None if alone is None else outside(alone) & ~view.invalid, device),
             extent=facts.extent,
+        )
+
+    def with_coverage(self, seen: Tensor) -> ViewTarget:
+        """Return the target with the pixels [H, W] bool (CPU) whose content a training view shows."""
+        device = self.photograph.device
+        counted = seen & self.valid.mask.cpu()
+        polarized = None if self.polarized is None else counted & self.polarized.mask.cpu()
+        return replace(
+            self,
+            seen=Selection.of(counted, device),
+            seen_windows=Selection.of(window_centers(counted), device),
+            seen_polarized=_chosen(polarized, device),
         )
 
 
