@@ -234,7 +234,7 @@ def read_metrics(run: Path) -> dict[str, Any]:
     path = run / METRICS_FILE
     if not path.exists():
         raise PolarguideError(
-            path, expected="the scores of a run", found="no such file", remedy="Run polarguide eval."
+            path, expected="the scores of a run", found="none", remedy="Run polarguide eval."
         )
     record = read_record(path, dict[str, Any], remedy=_REMEDY)
     validate_metrics(record, path)
