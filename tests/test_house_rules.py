@@ -64,7 +64,9 @@ def repeated_names(package):
     modules = defaultdict(list)
     for path in sorted(package.rglob("*.py")):
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            public = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and not node.name.startswith("_")
+            public = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and not node.name.startswith(
+                "_"
+            )
             if public or isinstance(node, ast.ClassDef):
                 modules[node.name].append(path.relative_to(package).as_posix())
     return {name: paths for name, paths in modules.items() if len(paths) > 1}

@@ -403,10 +403,12 @@ def _coverage(run: ScoredRun, reporter: Reporter) -> Coverage:
     scene = run.scene
     training = scene.train_views
     centers = torch.stack([view.camera.center for view in training])
-    middle, radius = camera_reach(scene.points.double().numpy(), centers.numpy())
+    middle, radius = camera_reach(
+        (scene.points if len(scene.points) else centers).double().numpy(), centers.numpy()
+    )
 
     def surface(view: View) -> DepthMap:
-        result = run.model.render(view.camera, normals=False, depth=True)
+        result = run.model.render(view.camera, normals=False, depth=True, surface=True)
         return rendered_depths(view.camera, result.depth, result.alpha, torch.from_numpy(middle), radius)
 
     held_out = {}

@@ -69,7 +69,7 @@ BUILT_IN_METRICS: tuple[Metric, ...] = (
         "dB",
         2,
         "higher",
-        measure=_compared(squared_error, "final", "photograph", "seen"),
+        measure=_comparison(squared_error, "final", "photograph", "seen"),
     ),
     Metric(
         "seen_share",
@@ -77,7 +77,7 @@ BUILT_IN_METRICS: tuple[Metric, ...] = (
         "%",
         1,
         None,
-        measure=_compared(seen_share, "final", "seen", "valid"),
+        measure=_comparison(seen_share, "final", "seen", "valid"),
         factor=100.0,
     ),
     Metric(
@@ -105,7 +105,7 @@ BUILT_IN_METRICS: tuple[Metric, ...] = (
         "",
         3,
         "higher",
-        measure=_compared(ssim, "final", "photograph", "seen", "seen_windows"),
+        measure=_comparison(ssim, "final", "photograph", "seen", "seen_windows"),
     ),
     Metric("lpips", "LPIPS", "", 3, "lower"),
     Metric("flip", "FLIP", "", 3, "lower"),
@@ -178,7 +178,7 @@ BUILT_IN_METRICS: tuple[Metric, ...] = (
         "",
         3,
         "lower",
-        measure=_compared(stokes_error, "polarization", "polarization", "seen_polarized", "photograph"),
+        measure=_comparison(stokes_error, "polarization", "polarization", "seen_polarized", "photograph"),
     ),
     Metric(
         "depth_error_median_percent",
