@@ -323,7 +323,7 @@ PICTURES: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
     ),
     "another size than its camera": (
         lambda capture: capture.write_view("v003", ideal_intensities(0, height=8, width=12)),
-        Fault("camera of view v003", "the size of the pictures, 12x8", "12x10", "no crop"),
+        Fault("camera of view v003", "the size of the pictures, 12x8", "12x10", "crop"),
     ),
     "a view of another depth": (
         lambda capture: capture.write_view("v003", capture.linear["v003"], bits=8),
