@@ -12,7 +12,7 @@ from polarguide.capture.exposures import TABLE
 from polarguide.capture.filter import shots as filter_shots
 from polarguide.capture.filter.consecutive import VIDEO_SUFFIXES
 from polarguide.capture.layout import (
-    Layout,
+    CaptureFiles,
     angle_folders,
     angle_of_folder,
     describe_contents,
@@ -217,7 +217,7 @@ def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
     return videos + _filter_sets(shots)
 
 
-def _views(layout: Layout) -> list[ExposureSet]:
+def _views(layout: CaptureFiles) -> list[ExposureSet]:
     """The views of a scene; a fault for each whose pictures do not determine Stokes vectors.
 
     Raises:
