@@ -171,7 +171,7 @@ class View:
 
     def __repr__(self) -> str:
         size = f"{self.camera.width}x{self.camera.height}"
-        angles = ", ".join(e.words for e in self.exposures)
+        angles = ", ".join(e.label for e in self.exposures)
         beside = {"mask": self.mask, "materials": self.materials, "ground truth": self.truth}
         more = ", ".join(name for name, there in beside.items() if there is not None) or "no mask"
         return (
@@ -181,7 +181,7 @@ class View:
         )
 
     def _repr_html_(self) -> str:
-        facts = {"pictures": ", ".join(exposure.words for exposure in self.exposures), "state": repr(self)}
+        facts = {"pictures": ", ".join(exposure.label for exposure in self.exposures), "state": repr(self)}
         return figure(self.photograph().cpu().numpy(), self.name) + table(self.name, facts)
 
     @property
@@ -282,7 +282,7 @@ class View:
 
     def undetermined(self, what: str) -> PolarguideError:
         """The error that the pictures do not determine ``what``."""
-        angles = ", ".join(exposure.words for exposure in self.exposures)
+        angles = ", ".join(exposure.label for exposure in self.exposures)
         return PolarguideError(
             f"view {self.name}",
             expected=f"pictures that determine {what}: at three or more angles that differ enough",

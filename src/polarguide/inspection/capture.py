@@ -255,7 +255,7 @@ def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
     saturated, invalid, black = (float(mask.float().mean()) for mask in lost)
     nothing = ViewMeasurements(view.name, bright, saturated, invalid, black)
     if view.exposures != FOUR:
-        return replace(nothing, exposures=", ".join(exposure.words for exposure in view.exposures))
+        return replace(nothing, exposures=", ".join(exposure.label for exposure in view.exposures))
     if share < 0.001:
         return nothing
     stokes = optics.stokes(gray)

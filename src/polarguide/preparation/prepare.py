@@ -74,7 +74,7 @@ from polarguide.preparation.open_source import (
     settle_pose_frames,
 )
 from polarguide.preparation.settings import PrepareSettings, known_intrinsics
-from polarguide.preparation.source import Source, developed
+from polarguide.preparation.source import Source, develop_view
 
 JOURNAL = "prepare.json"
 SCENE = "scene.json"
@@ -377,7 +377,7 @@ class Workshop:
             for count, view in enumerate(views, 1):
                 path = images / f"{view}.png"
                 if view not in known or not path.exists():
-                    done = developed(self._pictures, view, measured)
+                    done = develop_view(self._pictures, view, measured)
                     if done.mask is not None:
                         write_png(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
                     write_png(path, tone_mapped(done.intensities, self._settings.sfm_pictures))
@@ -616,7 +616,7 @@ def _write_view(
     folder: SceneFolder, pictures: Source, view: str, poses: Poses | None
 ) -> tuple[list[str], tuple[str, ...]]:
     """Write the pictures of a view; returns what makes it useless, and the notes about it."""
-    done = developed(pictures, view, folder.measured)
+    done = develop_view(pictures, view, folder.measured)
     intensities = done.intensities
     invalid = done.invalid
     mask = done.mask
