@@ -25,7 +25,8 @@ from polarguide.core.text import canonical
 
 Factor = Annotated[float, Meta(gt=0, le=1e12)]
 """Positive factor."""
-_Four = tuple[Factor, Factor, Factor, Factor]
+"""Positive factor."""
+FourFactors = tuple[Factor, Factor, Factor, Factor]
 _Code = Annotated[int, Meta(ge=0, le=FULL_CODE)]
 _Multiple = tuple[_Code, Annotated[int, Meta(ge=1, le=FULL_CODE)]]
 StoredRounding = Annotated[tuple[_Multiple, ...], Meta(min_length=1)]
@@ -59,6 +60,13 @@ class ExposureRecord(msgspec.Struct):
     points: int | UnsetType = UNSET
 
 
+class WarpRecord(msgspec.Struct):
+    """Removal of the distortion of a camera: COLMAP's camera model and its parameters."""
+
+    model: str
+    parameters: list[float]
+
+
 class ViewRecord(msgspec.Struct, kw_only=True):
     """Record of a developed view. Fields that its kind of source does not measure are unset."""
 
@@ -75,7 +83,7 @@ class ViewRecord(msgspec.Struct, kw_only=True):
     negative_share: float | UnsetType = UNSET
     invalid_share: float | UnsetType = UNSET
     geometry: Geometry
-    warp: Any = None
+    warp: WarpRecord | None = None
     files: dict[str, int] = {}
 
     @property
