@@ -114,9 +114,14 @@ class Capture:
         return all(view.exposures == FOUR for view in self.views)
 
     @property
+    def cameras(self) -> list[tuple[InspectedView, Camera]]:
+        """The views with a pose, and their cameras."""
+        return [(view, view.camera) for view in self.views if view.camera is not None]
+
+    @property
     def posed(self) -> tuple[InspectedView, ...]:
         """The views with a pose."""
-        return tuple(view for view in self.views if view.camera is not None)
+        return tuple(view for view, _ in self.cameras)
 
 
 def read_capture(
