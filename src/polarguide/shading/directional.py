@@ -8,8 +8,8 @@ blended normal and ``r`` the roughness, a pixel has
     final = albedo + specular
 
 in linear radiance. The grid is a learned cubemap of 16 channels with L box-filtered levels, f the blended feature at
-unit length, and h x f an outer product of 64 values. The MLP has two hidden layers with ReLU. The albedo does not depend
-on the view.
+unit length, and h x f an outer product of 64 values. The MLP has two hidden layers with ReLU. The albedo is independent
+of the view.
 
 Surroundings do not reflect. A Gaussian that started farther away than the cameras (``surface`` 0) splats its harmonics
 instead of the albedo. Specular light of a pixel is multiplied by the share of its alpha from Gaussians with a surface.
