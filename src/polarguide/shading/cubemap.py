@@ -1,7 +1,6 @@
 """Cubemaps of learned light: seamless bilinear look-up, differentiable in texels and directions.
 
-Faces have OpenGL's order and orientation. On each face s increases along columns and t along rows, from -1
-to 1:
+Faces have OpenGL's order and orientation. On each face s increases along columns and t along rows, from -1 to 1:
 
 ==== ===== ===== =====
 face major s     t
