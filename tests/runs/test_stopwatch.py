@@ -13,7 +13,7 @@ from polarguide.runs import stopwatch
 from polarguide.runs.callbacks import Look
 from polarguide.runs.folder import RunLog
 from polarguide.runs.stopwatch import in_words
-from polarguide.runs.train import train
+from polarguide.runs.train import train_gaussians
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.settings import TrainSettings
 
@@ -70,7 +70,7 @@ def test_pauses_of_a_training_do_not_count(
         yield look
 
     reporter = Seconds()
-    train(tiny_scene, tmp_path / "run", settings=TrainSettings(20), reporter=reporter, watch=watch)
+    train_gaussians(tiny_scene, tmp_path / "run", settings=TrainSettings(20), reporter=reporter, watch=watch)
     assert reporter.seconds == {0: 0.0, 10: 20.0, 20: 40.0}
     assert [line for line in reporter.said if line.startswith("took 40 s")]
     assert RunLog(tmp_path / "run").elapsed()[0] == 40.0

@@ -55,8 +55,9 @@ def test_several_views_a_step_stay_there_too(tiny_scene: Scene) -> None:
         trainer = make_trainer(tiny_scene, RECIPES["polarguide"], STEPS, backend=BACKEND, views_per_step=2)
         report = trainer.step()
     assert report.measured.device == THERE
-    assert trainer.state.statistics.gradient.shape == (2, len(trainer.state.gaussians))
-    assert trainer.state.statistics.gradient.device == THERE
+    gradient = trainer.state.tensors()["statistics.gradient"]
+    assert gradient.shape == (2, len(trainer.state.gaussians))
+    assert gradient.device == THERE
 
 
 def test_a_training_stays_there_and_goes_on_from_its_checkpoint(

@@ -14,7 +14,6 @@ from polarguide.geometry.vectors import unit
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.model import Parameters, ShadingModel
-from polarguide.training.distributed import Ranks
 from polarguide.training.recipe import Propagation
 from polarguide.training.state import TrainingState
 
@@ -129,9 +128,3 @@ def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: 
         views += (pixels >= LEAST_PIXELS).float()
         most = torch.maximum(most, pixels)
     return PixelCounts(views, most)
-
-
-def exchange_statistics(state: TrainingState, ranks: Ranks) -> None:
-    """Let every rank know what all have seen since the last densification. Every rank calls it."""
-    for sums in (state.statistics.gradient, state.statistics.seen):
-        ranks.exchange_slots(sums if sums.ndim == 2 else sums[None])

@@ -79,6 +79,16 @@ class Ranks:
     def all_reduce(self, tensors: Sequence[Tensor]) -> None:
         """Replace each tensor by its sum over the ranks, in their order."""
 
+    def average(self, gradients: Sequence[Tensor], views: int) -> None:
+        """Replace sums over the views of this rank by the mean over all ``views`` of a step."""
+        if views == 1 and self.world == 1:
+            return
+        if not self.slots(views):
+            torch._foreach_zero_(gradients)
+        self.all_reduce(gradients)
+        if views > 1:
+            torch._foreach_div_(gradients, float(views))
+
     def exchange_slots(self, sums: Tensor) -> None:
         """Fill in the rows of [S, ...] that other ranks own."""
 

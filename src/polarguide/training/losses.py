@@ -276,6 +276,11 @@ class StepLoss(NamedTuple):
     photometric: Tensor
     error: Tensor
 
+    def measured(self) -> Tensor:
+        """Return ``StepReport.measured``."""
+        psnr = -10 * torch.log10(self.error.clamp(min=1e-10))
+        return torch.stack((self.photometric.detach(), psnr, self.total.detach()))
+
 
 def refuse_diverged(total: Tensor) -> None:
     """Raise PolarguideError unless all of ``total`` is finite.

@@ -13,6 +13,7 @@ from polarguide.capture import View
 from polarguide.capture.exposures import analyzers, radiance_places
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import srgb_encode
+from polarguide.raster import ScreenStatistic
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
 
@@ -170,6 +171,7 @@ class Step:
         shading: shading of the stage, for the run's refractive index.
         log_scales: [N, 3] of the Gaussians. extent: extent of the scene.
         ssim_weight: lambda of the image terms.
+        statistic: gradient of the projected means after the backward pass; None without density control.
     """
 
     result: RenderResult
@@ -178,3 +180,4 @@ class Step:
     log_scales: Tensor
     extent: float
     ssim_weight: float = 0.2
+    statistic: ScreenStatistic | None = None

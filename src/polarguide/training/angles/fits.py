@@ -69,7 +69,7 @@ class AngleFits(Callback[TrainingLoop]):
             loop.offset = self.polarizers.searched
             loop.total = self._context.settings.steps + self.polarizers.search
         if self._searches or not self.begins_again:
-            loop.set_exposures(self.polarizers.beliefs)
+            loop.feed.set_exposures(self.polarizers.beliefs)
 
     def before_step(self, loop: TrainingLoop, position: Position) -> None:
         """Fit angles if that is due."""
@@ -107,7 +107,7 @@ class AngleFits(Callback[TrainingLoop]):
         earlier = [] if state.angles is None else [*state.angles]
         state.angles = torch.stack([*earlier, table.cpu()])
         changed = self.polarizers.take(state.angles)
-        loop.set_exposures({name: self.polarizers.beliefs[name] for name in changed})
+        loop.feed.set_exposures({name: self.polarizers.beliefs[name] for name in changed})
 
 
 def gaussian_training(
