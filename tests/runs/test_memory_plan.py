@@ -123,7 +123,7 @@ def test_other_exposures_leave_the_pictures_in_their_files(
     for hold in (True, False):
         plan = MemoryPlan(hold, None, 4 << 30)
         monkeypatch.setattr(training, "_planned", lambda *_, plan=plan: plan)
-        run = training.train(
+        run = training.train_gaussians(
             demo_scene, tmp_path / f"run {hold}", settings=settings, reading=SceneOptions(downscale=8)
         )
         held = [isinstance(view.pictures, Tensor) for view in run.scene.train_views]

@@ -54,8 +54,8 @@ def test_several_views_a_step_stay_there_too(tiny_scene: Scene) -> None:
     with OtherDevice():
         trainer = make_trainer(tiny_scene, RECIPES["polarguide"], STEPS, backend=BACKEND, views_per_step=2)
         report = trainer.step()
+        gradient = trainer.state.tensors()["statistics.gradient"]
     assert report.measured.device == THERE
-    gradient = trainer.state.tensors()["statistics.gradient"]
     assert gradient.shape == (2, len(trainer.state.gaussians))
     assert gradient.device == THERE
 

@@ -79,7 +79,7 @@ class Ranks:
     def all_reduce(self, tensors: Sequence[Tensor]) -> None:
         """Replace each tensor by its sum over the ranks, in their order."""
 
-    def average(self, gradients: Sequence[Tensor], views: int) -> None:
+    def average(self, gradients: list[Tensor], views: int) -> None:
         """Replace sums over the views of this rank by the mean over all ``views`` of a step."""
         if views == 1 and self.world == 1:
             return
