@@ -1,4 +1,4 @@
-"""Constants of the detection of metals and flat surfaces, and of the fit of polarizer angles: data of the recipe."""
+"""Constants of the detection of metals and flat surfaces, and of the fit of polarizer angles, as data of a recipe."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class MetalRules:
-    """The five constants of the energy whose minimum says what is metal (``training.metals.cut``).
+    """Constants of the energy whose minimum decides on metals (``training.metals.cut``).
 
     Attributes:
-        prior: nats per view by which a metal has to be likelier than a dielectric.
-        trust: nats that a single Gaussian's evidence counts at most: of 20 one may be wrong, whatever its evidence.
-        likeness: nats that it costs if one of two neighbors that look alike is a metal and the other is none.
-        tint: standard deviation of the logarithm of a surface's tint in the light that it mirrors, of which the mean
-            light of the scene is known: a metal is hardly more deeply colored than gold.
-        surface: nats that a metal surface that hangs together has to be worth.
+        prior: log likelihood ratio per view, in nats, by which a metal must be likelier than a dielectric.
+        trust: upper bound of the evidence of a single Gaussian, in nats: one of 20 may be wrong at any evidence.
+        likeness: cost, in nats, of two similar neighbors of which one is a metal and the other a dielectric.
+        tint: standard deviation of the logarithm of a surface's tint relative to the mean light of the scene. Metals
+            are hardly more deeply colored than gold.
+        surface: least gain of a connected metal surface, in nats.
     """
 
     prior: float = 0.45
@@ -27,22 +27,22 @@ class MetalRules:
 
 @dataclass(frozen=True)
 class MetalViews:
-    """Which measurements count in the search for metals, and how the first metals fix the light.
+    """Constants of the measurements for the search for metals, and of the light gain from the first metals.
 
     Attributes:
-        most_views: views that are looked at, evenly spread.
+        most_views: largest number of examined views, evenly spread.
         least_share: a view counts if a Gaussian has at least this share of its largest blending weight in it.
-        least_normal: length of a blended normal above which a pixel counts: shorter ones mix surfaces.
-        cosines: of the zenith angle, between which a view counts: head-on nothing is polarized, and at grazing angles
-            normals and reflectances are uncertain.
-        dark: radiance (full scale is 1) that is added to the one that errors are relative to.
-        reach: metals are looked for within this share of the cameras' distance from the middle of the points: what is
-            farther away is behind the subject in views from the other side.
-        contradicted: share of a view's labels from which on a warning says that other views contradict them.
-        gain_views: views from which the gain of the light is taken when the first metals are found.
-        gain_share: share of metal above which a pixel counts for it.
-        gain_pixels: least share of the pixels that have to count.
-        most_gain: the largest gain.
+        least_normal: length of a blended normal above which a pixel counts; shorter ones mix surfaces.
+        cosines: cosines of the zenith angle between which a view counts. Light is unpolarized at normal incidence, and
+            normals and reflectances are uncertain at grazing angles.
+        dark: radiance (full scale is 1) that is added to the reference of relative errors.
+        reach: share of the cameras' distance from the middle of the points within which metals are searched. Gaussians
+            farther away are behind the subject in views from the other side.
+        contradicted: share of the labels of a view above which contradictions by other views lead to a warning.
+        gain_views: number of views for the gain of the light.
+        gain_share: metal share above which a pixel counts for the gain.
+        gain_pixels: least share of counted pixels.
+        most_gain: largest gain.
     """
 
     most_views: int = 32
@@ -63,33 +63,33 @@ class AngleRules:
     """Constants of the search for unknown polarizer angles, and of the check of known ones.
 
     Attributes:
-        search_steps: steps of the schedule on which unknown angles are sought before the training. Longer is not
-            better: flat surfaces that mirror, such as water, bend to explain their reflections without polarization.
-        search_size: pixels of the longer side of the pictures that are used for it, at most.
+        search_steps: steps of the schedule of a search before the training. More steps are not better: mirroring flat
+            surfaces, such as water, bend to explain their reflections without polarization.
+        search_size: largest number of pixels of the longer side of its pictures.
         first, every, last: shares of these steps at which angles are fitted; their mean counts. Earlier fits would
-            confirm the initial guess, and later ones the errors that the model has absorbed meanwhile.
-        again: shares at which they are fitted in a second search, which begins with the angles of the first: most are
-            right, and predict better for the others. A third search found nothing more on two scenes.
+            confirm the initial guess, and later ones the errors that the model has absorbed by then.
+        again: shares of the fits of a second search, which begins with the angles of the first. Most of these are right
+            and improve the prediction for the others. A third search found no more on two scenes.
         checks: shares of all steps at which known angles are compared with the pictures. Early, the model predicts
-            little; late, colors and surfaces have bent to the given angles. Half size, 1,500 steps: of six wrong angles
-            of 63 (45 or 90 degrees off), one, three and five contradict, five in all, and no right one.
-        least_spread: degrees of spread under which a fit counts no more for having less.
-        weak: modulation under which an angle is not relied on. Wrong predictions take some of it away: a picture
-            through a filter seldom has all of it, and half is usual when angles are first fitted.
-        vague: degrees of spread from which on a picture does not tell its angle.
-        lost: degrees of spread from which on a fitted angle is not even the best guess. With up to 30 degrees of error
-            such a guess is nearer than a photograph without a filter; spreads of 20 to 60 degrees had errors under 20,
-            mostly.
-        disagree: degrees of scatter of a picture's fits from which on they do not agree.
-        contradicts: degrees between given and fitted angle from which on they contradict each other, if that is also
-            three times the spread and three standard deviations of the deviations of all pictures. Rings are read to a
-            few degrees.
-        locked: standard deviation of the logarithms of fitted gains up to which exposures count as equal: the first fit
-            has 0.03 to 0.07 for equal ones, and automatic exposure of 0.3 stops each way 0.13.
-        fewest: pictures from which on a spread of gains is determined.
-        poor: ``Judgment.unexplained`` from which on a picture may well be at another angle. On four test scenes, two
-            seeds, every picture that was over 45 degrees off exceeded it, and at most five others of 63 did; it was set
-            by one of these seeds.
+            little; late, colors and surfaces have adapted to wrong angles. At half size and 1,500 steps, six of 63
+            angles were wrong by 45 or 90 degrees: one, three and five of them contradict, five in all, and no right
+            one.
+        least_spread: spread in degrees below which a fit gains no more weight.
+        weak: modulation below which an angle is unreliable. Wrong predictions reduce the modulation: pictures through a
+            filter seldom have all of it, and half is usual at the first fits.
+        vague: spread in degrees above which a picture does not determine its angle.
+        lost: spread in degrees above which an angle is no best guess. Guesses with up to 30 degrees of error are better
+            than a photograph without a filter; spreads of 20 to 60 degrees mostly had errors under 20.
+        disagree: scatter in degrees above which the fits of a picture disagree.
+        contradicts: degrees between specified and fitted angle above which they contradict each other, if that also
+            exceeds three times the spread and three standard deviations of the deviations of all pictures. Angles are
+            read from rings to a few degrees.
+        locked: standard deviation of the logarithms of fitted gains up to which exposures count as equal: 0.03 to 0.07
+            for equal exposures at the first fit, and 0.13 for automatic exposure within 0.3 stops.
+        fewest: number of pictures that determine a spread of gains.
+        poor: ``Judgment.unexplained`` above which a picture may be at another angle. On four test scenes and two seeds,
+            every picture with an error over 45 degrees exceeded it, and at most five others of 63. It was chosen with
+            one of these seeds.
     """
 
     search_steps: int = 900
@@ -115,17 +115,19 @@ class FlatRules:
     """Constants of the search for flat surfaces.
 
     Attributes:
-        tries: pairs of pixels that propose a normal. samples: pixels that judge them, about.
-        close: sine of the angle between a pixel's plane of incidence and the normal, up to which they agree.
-        apart: sine of the angle between the directions of two pixels under which they propose nothing.
-        least: share of a view that a flat surface covers at least: one normal explains up to a sixth of a curved one by
-            chance.
-        faint: DoLP from which on a pixel counts.
-        slack: factor on Fresnel's DoLP, and what is added to it, beyond which a pixel contradicts.
-        grazing: cosine between normal and ray under which a surface is not seen.
-        window, most: side in pixels of the square around a pixel, and the share of it that has to agree.
-        alike: degrees within which flat surfaces of different views are one.
-        fewest, share: views, and share of the views, that have to show it.
+        tries: number of pixel pairs that propose a normal.
+        samples: approximate number of pixels that judge them.
+        close: sine of the angle between the plane of incidence of a pixel and the normal up to which they agree.
+        apart: sine of the angle between the directions of two pixels below which they propose no normal.
+        least: least share of a view that a flat surface covers. One normal explains up to a sixth of a curved surface
+            by chance.
+        faint: DoLP above which a pixel counts.
+        slack: factor on Fresnel's DoLP, and addition to it, beyond which a pixel contradicts.
+        grazing: cosine between normal and ray below which a surface is not visible.
+        window: side in pixels of the square around a pixel for ``most``.
+        most: least share of that square that agrees.
+        alike: degrees up to which flat surfaces of different views are the same.
+        fewest, share: least number and least share of the views that show the surface.
     """
 
     tries: int = 400
