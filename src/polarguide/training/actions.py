@@ -24,9 +24,9 @@ def _logit(value: float) -> float:
 
 @torch.no_grad()
 def reset_opacity(state: TrainingState, shading: ShadingModel, most: float) -> None:
-    """Lower opacities to ``most``, so that what is not needed stays transparent (Kerbl et al. 2023).
+    """Lower opacities to at most ``most``, so that unneeded Gaussians stay transparent (Kerbl et al. 2023).
 
-    Parameters of the shading model rise to their minimum after a reset, where they have one.
+    Parameters of the shading model rise to their minimum after a reset, if they have one.
     """
     gaussians = state.gaussians
     gaussians.overwrite("opacity_logits", gaussians["opacity_logits"].clamp(max=_logit(most)))
@@ -45,17 +45,17 @@ def propagate_normals(
 ) -> None:
     """Let Gaussians with a right normal take over their neighborhood (Ye et al. 2024, Sec. 3.3).
 
-    Opacities rise, matte Gaussians get noise on their color (which hides what they explain by color alone), and
-    glossy ones grow along their surface.
+    Opacities rise. Matte Gaussians get noise on their color, which hides the light that they explain by color alone.
+    Glossy Gaussians grow along their surface.
     """
     gaussians = state.gaussians
     strength = shading.strength(gaussians)
     gaussians.overwrite("opacity_logits", gaussians["opacity_logits"].clamp(min=_logit(settings.opacity)))
-    # Drawn on the CPU, so that every device gets the same noise.
+    # Drawn on the CPU: the noise is the same on every device.
     noise = (torch.rand(gaussians["sh_dc"].shape, generator=generator) * 2 - 1) * settings.color_noise
     noise = noise.to(gaussians["sh_dc"].device)
     matte = (strength <= settings.matte)[:, None]
-    # The release adds the noise to the SH coefficient itself; so do we.
+    # As in the release, the noise is added to the SH coefficient itself.
     gaussians.overwrite("sh_dc", gaussians["sh_dc"] + torch.where(matte, noise, torch.zeros_like(noise)))
     scales = gaussians["log_scales"]
     longer = torch.ones_like(scales).scatter(1, scales.argmin(dim=1, keepdim=True), 0.0)
@@ -64,24 +64,26 @@ def propagate_normals(
     state.opacity_frozen_until = state.step + min(settings.rest, steps // settings.rest_part)
 
 
-# A Gaussian at most this much behind the rendered surface, relative to its depth, is seen.
 DEPTH_SLACK = 0.02
-# Pixels that a Gaussian has to fill, counted by its blending weights, to add to a picture.
+"""Largest distance of a visible Gaussian behind the rendered surface, relative to its depth."""
 LEAST_PIXELS = 0.05
+"""Least sum of the blending weights of a Gaussian that contributes to a picture."""
 DEPTH_ALONE = RenderRequest(sh_degree=0, normals=False, depth=True)
 
 
 @torch.no_grad()
 def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: Rasterize) -> Tensor:
-    """Sum of the unit directions to the cameras that see each Gaussian.
+    """Return the sum of the unit directions to the cameras that see each Gaussian.
 
-    A camera sees it where its center lies in the picture and not behind the rendered depth.
+    A camera sees a Gaussian if its center is inside the picture and not behind the rendered depth.
 
     Args:
-        gaussians: the Gaussians. views: with the cameras. rasterize: rasterizer of the backend.
+        gaussians: the Gaussians.
+        views: views with the cameras.
+        rasterize: rasterizer of the backend.
 
     Returns:
-        [N, 3]; zero where no camera sees it.
+        [N, 3]; zero for Gaussians that no camera sees.
     """
     means = gaussians["means"]
     total = torch.zeros_like(means)
@@ -99,9 +101,8 @@ class PixelCounts(NamedTuple):
     """Pixels of each Gaussian in training pictures.
 
     Attributes:
-        views: [N] float32, to how many pictures it adds something: its blending weights there add up to
-            ``LEAST_PIXELS``.
-        most: [N] pixels that it fills in the picture to which it adds most, counted by its blending weights.
+        views: [N] float32, number of pictures in which the sum of its blending weights is at least ``LEAST_PIXELS``.
+        most: [N] largest sum of its blending weights in a picture, in pixels.
     """
 
     views: Tensor
@@ -109,10 +110,12 @@ class PixelCounts(NamedTuple):
 
 
 def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: Rasterize) -> PixelCounts:
-    """Pixels of each Gaussian in pictures from some cameras.
+    """Count the pixels of each Gaussian in pictures.
 
     Args:
-        gaussians: the Gaussians. cameras: cameras of the pictures. rasterize: rasterizer of the backend.
+        gaussians: the Gaussians.
+        cameras: cameras of the pictures.
+        rasterize: rasterizer of the backend.
     """
     splatted = splats(gaussians)
     views = torch.zeros(len(splatted.means), device=splatted.means.device)
@@ -122,9 +125,8 @@ def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: 
         with torch.enable_grad():
             features = torch.ones_like(splatted.features).requires_grad_()
             fixed = type(splatted)(*(tensor.detach() for tensor in splatted))
-            rasterize(fixed._replace(features=features), camera).features.sum().backward()
-        assert features.grad is not None
-        pixels = features.grad[:, 0]
+            total = rasterize(fixed._replace(features=features), camera).features.sum()
+            pixels = torch.autograd.grad(total, features)[0][:, 0]
         views += (pixels >= LEAST_PIXELS).float()
         most = torch.maximum(most, pixels)
     return PixelCounts(views, most)

@@ -177,7 +177,7 @@ def resolve_field(
     Raises:
         PolarguideError: a setting that means nothing for a field.
     """
-    recorded: dict[str, Any] = {} if resumed is None else resumed.specified()
+    recorded: dict[str, Any] = {} if resumed is None else vars(resumed)
     values: dict[str, Any] = {
         **vars(settings),
         "steps": recipe.steps,
