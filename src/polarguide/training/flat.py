@@ -1,12 +1,12 @@
-"""Flat surfaces that mirror: where one normal explains the polarization of a large part of a view.
+"""Flat mirroring surfaces: large parts of a view whose polarization one normal explains.
 
-Light that a dielectric or a metal mirrors is polarized across the plane of incidence, so a pixel's AoLP gives a
-direction that its normal is perpendicular to, whatever is mirrored and however deep that seems to lie. On a plane all
-pixels have one normal, and the directions of many of them leave one line for it, whose side faces the camera: neither
-of the ambiguities of pi and pi/2 is left. Still water, which shows the depth of what it mirrors, has no other anchor.
+Light that a dielectric or a metal mirrors is polarized across the plane of incidence. The AoLP of a pixel therefore
+gives a direction perpendicular to its normal, for any mirrored light at any apparent depth. All pixels of a plane have
+one normal, and the directions of many pixels determine it up to its sign, which follows from the camera. Neither the
+ambiguity of pi nor that of pi/2 remains. Still water, which shows the depth of the mirrored scene, has no other cue.
 
 The planes of incidence of a sphere also meet in one line, the ray through its center. There Fresnel's equations allow
-next to no polarization, so that what is measured contradicts it.
+almost no polarization, so that the measurement contradicts this normal.
 """
 
 from __future__ import annotations
@@ -36,15 +36,16 @@ class Flat:
     where: Tensor
 
     def to(self, device: torch.device) -> Flat:
-        """The same on a device."""
+        """Return the surface on a device."""
         return Flat(self.normal.to(device), self.where.to(device))
 
 
 @torch.no_grad()
 def flat_surface(view: View, refractive_index: float, rules: FlatRules) -> Flat | None:
-    """The flat surface that explains most of a view whose pictures determine the Stokes vector; None: there is none.
+    """Find the flat surface that explains most of a view; None: no surface explains enough.
 
-    Random pairs of pixels propose normals, the one that most pixels agree with is refined on them by least squares.
+    The pictures of the view have to determine the Stokes vector. Random pairs of pixels propose normals. The proposal
+    with the most agreeing pixels is refined on these by least squares.
     """
     luminance = optics.luminance(view.stokes())
     rays = view.camera.rays()
@@ -87,7 +88,15 @@ def flat_surface(view: View, refractive_index: float, rules: FlatRules) -> Flat 
 
 
 def _agrees(off: Tensor, cosine: Tensor, dolp: Tensor, refractive_index: float, rules: FlatRules) -> Tensor:
-    """Whether pixels agree with normals: ``off`` the cosine to their directions, ``cosine`` that to their rays."""
+    """Return a mask of pixels that agree with normals.
+
+    Args:
+        off: cosine between the normal and the direction of the pixel.
+        cosine: cosine between the normal and the reversed ray.
+        dolp: DoLP of the pixel.
+        refractive_index: refractive index of the surface.
+        rules: tolerances.
+    """
     allowed = (
         optics.specular_dolp(cosine.clamp(0, 1).acos(), refractive_index) * rules.slack[0] + rules.slack[1]
     )
@@ -95,7 +104,7 @@ def _agrees(off: Tensor, cosine: Tensor, dolp: Tensor, refractive_index: float, 
 
 
 def flat_surfaces(views: Iterable[View], refractive_index: float, rules: FlatRules) -> dict[str, Flat]:
-    """Flat surfaces by the name of the view, where enough views have one that is turned alike; each has their mean.
+    """Find flat surfaces with similar normals in enough views; return them by view, with the mean normal.
 
     Views that do not determine the Stokes vector are left out.
     """

@@ -1,6 +1,6 @@
-"""Terms of the loss that compare normals, layers and depth pixel by pixel: a native pass, with its gradient.
+"""Native pass over the terms that compare normals, layers and depth per pixel, with its gradient.
 
-Float32 on the CPU. The functions in ``polarguide.training.losses`` are the reference implementation.
+It takes float32 on the CPU. The functions in ``polarguide.training.losses`` are the reference implementation.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from polarguide.geometry.camera import Camera
 from polarguide.shading.result import RenderResult
 
 S1_AND_S2 = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-"""The analyzers of S1 and S2 themselves."""
+"""Analyzers of S1 and S2 themselves."""
 
 
 class PolarizationTerm(NamedTuple):
@@ -28,9 +28,10 @@ class PolarizationTerm(NamedTuple):
     Attributes:
         measured: [K, H, W, 3] on the scale of Stokes vectors.
         analyzers: K vectors a: ``S1_AND_S2``, or (1, cos 2t, sin 2t) / 2 of a polarizer at angle t.
-        weight: [H, W].
-        factor: on the sum. refractive_index: of the surfaces, more than 1. indices: [H, W] that of each pixel, in its
-            place; None: the same everywhere.
+        weight: [H, W] weights of the pixels.
+        factor: factor on the sum.
+        refractive_index: refractive index of the surfaces, more than 1.
+        indices: [H, W] refractive indices of the pixels; None: the same everywhere.
     """
 
     measured: Tensor
@@ -46,8 +47,9 @@ class Directions(NamedTuple):
 
     Attributes:
         directions: [H, W, 3] unit, world axes.
-        weight: [H, W].
-        factor: on the sum. plane: whether d is the normal of a plane that n should lie in.
+        weight: [H, W] weights of the pixels.
+        factor: factor on the sum.
+        plane: d is the normal of a plane that contains n.
     """
 
     directions: Tensor
@@ -57,10 +59,11 @@ class Directions(NamedTuple):
 
 
 class Consistency(NamedTuple):
-    """``factor * sum(weight * (alpha - n . n_depth))`` over all pixels but the border's; n as blended.
+    """``factor * sum(weight * (alpha - n . n_depth))`` over all pixels except the border, with the blended normal n.
 
     Attributes:
-        weight: [H, W]; None: 1. factor: on the sum.
+        weight: [H, W] weights of the pixels; None: 1.
+        factor: factor on the sum.
     """
 
     weight: Tensor | None
@@ -71,7 +74,9 @@ class Terms(NamedTuple):
     """The terms of a step; at least one.
 
     Attributes:
-        polarization: needs both layers. directions: any number. consistency: needs the depth.
+        polarization: term that needs both layers.
+        directions: any number of terms.
+        consistency: term that needs the depth.
     """
 
     polarization: PolarizationTerm | None
@@ -81,34 +86,29 @@ class Terms(NamedTuple):
 
 class _PixelTerms(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, camera: Camera, terms: Terms, alpha: Tensor, *inputs: Tensor | None) -> Tensor:
-        tensors = [None if t is None else t.detach().contiguous() for t in inputs]
-        gradients = [None if t is None else torch.zeros_like(t) for t in tensors]
-        # Pixels in a row; the depth stays a picture.
-        (
-            (normal, specular, diffuse, metal, depth),
-            (to_normal, to_specular, to_diffuse, to_metal, to_depth),
-        ) = ([t if t is None or t.ndim == 2 else t.view(-1, 3) for t in of] for of in (tensors, gradients))
-        assert normal is not None
-        assert to_normal is not None
+    def forward(
+        ctx: Any, camera: Camera, terms: Terms, alpha: Tensor, metal: Tensor | None, *inputs: Tensor
+    ) -> Tensor:
+        tensors = [t.detach().contiguous() for t in inputs]
+        gradients = [torch.zeros_like(t) for t in tensors]
+        to_metal = None if metal is None else torch.zeros_like(metal)
+        # The native code takes rows of pixels, and the depth as a map.
+        *colors, depth = tensors
+        *to_colors, to_depth = gradients
+        normal, specular, diffuse = (t.view(-1, 3) for t in colors)
+        to_normal, to_specular, to_diffuse = (t.view(-1, 3) for t in to_colors)
         frame = camera.rays().view(-1, 3), camera.pose(torch.float32, alpha.device).rotation
         total = 0.0
         if (p := terms.polarization) is not None:
-            assert specular is not None
-            assert diffuse is not None
-            assert to_specular is not None
-            assert to_diffuse is not None
-            measured = p.measured.flatten(1, 2)
-            weight = p.weight.reshape(-1)
             total += _native.polarization(
                 normal,
                 *frame,
                 specular,
                 diffuse,
-                metal,
-                measured,
+                None if metal is None else metal.detach().contiguous(),
+                p.measured.flatten(1, 2),
                 torch.tensor(p.analyzers),
-                weight,
+                p.weight.reshape(-1),
                 p.factor,
                 p.refractive_index,
                 None if p.indices is None else p.indices.reshape(-1).contiguous(),
@@ -119,15 +119,12 @@ class _PixelTerms(torch.autograd.Function):
             )
         for d in terms.directions:
             directions = d.directions.reshape(-1, 3)
-            weight = d.weight.reshape(-1)
-            total += _native.direction(normal, directions, weight, d.factor, d.plane, to_normal)
+            total += _native.direction(normal, directions, d.weight.reshape(-1), d.factor, d.plane, to_normal)
         if (c := terms.consistency) is not None:
-            assert depth is not None
-            assert to_depth is not None
             depths = depth, alpha.detach().contiguous()
-            counts = None if c.weight is None else c.weight.reshape(-1)
-            total += _native.consistency(normal, *frame, *depths, counts, c.factor, to_normal, to_depth)
-        ctx.save_for_backward(*gradients)
+            weight = None if c.weight is None else c.weight.reshape(-1)
+            total += _native.consistency(normal, *frame, *depths, weight, c.factor, to_normal, to_depth)
+        ctx.save_for_backward(to_metal, *gradients)
         return alpha.new_tensor(total)
 
     @staticmethod
@@ -137,39 +134,43 @@ class _PixelTerms(torch.autograd.Function):
 
 
 def scaled(gradient: Tensor, factor: Tensor) -> Tensor:
-    """A gradient times the scalar that comes from above, which is mostly 1."""
+    """Multiply a gradient by the incoming scalar, which is mostly 1."""
     return gradient if factor.device.type == "cpu" and float(factor) == 1 else gradient * factor
 
 
 def pixel_terms(result: RenderResult, camera: Camera, terms: Terms) -> Tensor:
-    """The sum of terms as a scalar, differentiable in the normal, both layers and the depth (not in alpha).
+    """Return the sum of terms as a scalar, differentiable in the normal, both layers and the depth, not in alpha.
 
-    Values and gradients are finite for normals of any length, zero too; the bits do not depend on the number of
+    Values and gradients are finite for normals of any length, including zero. The bits do not depend on the number of
     threads.
 
     Args:
-        result: with what the terms need; float32 on the CPU, like all that they hold.
+        result: rendered layers of the terms; float32 on the CPU.
+        camera: camera of the view.
+        terms: the terms, float32 on the CPU.
 
     Raises:
-        ValueError: if a shape does not fit, or a picture with a consistency term is smaller than 3 x 3.
+        ValueError: a shape differs, or a picture with a consistency term is smaller than 3 x 3.
     """
     polarized = terms.polarization is not None
-    deep = terms.consistency is not None
+    unused = result.alpha.new_empty(0, 3)
     total: Tensor = _PixelTerms.apply(
         camera,
         terms,
         result.alpha,
-        result.normal,
-        result.layers["specular"] if polarized else None,
-        result.layers["diffuse"] if polarized else None,
         _field(result) if polarized else None,
-        result.depth if deep else None,
+        result.normal,
+        result.layers["specular"] if polarized else unused,
+        result.layers["diffuse"] if polarized else unused,
+        unused if terms.consistency is None else result.depth,
     )
     return total
 
 
 def _field(result: RenderResult) -> Tensor | None:
-    """Metals' part of the specular layer and of its polarization over ``sin^2(zenith)``, [P, 6]; None: no metal."""
+    """Return the metals' part of the specular layer and of its polarization over ``sin^2(zenith)``, [P, 6]; None: no
+    metal.
+    """
     if (metal := result.metal) is None:
         return None
     both = torch.cat((metal.specular, metal.slope * metal.specular), dim=1)

@@ -12,27 +12,27 @@ from polarguide import optics
 from polarguide.optics import Mount
 
 ROUNDS = 6
-"""Reweightings on the way from least squares to least absolute differences."""
+"""Number of least-squares fits in the approximation of least absolute differences."""
 SOFT = 0.001
-"""Difference of intensities under which one counts no more for being smaller."""
+"""Intensity difference below which the weight of a pixel stays constant."""
 FLOOR = 0.02
-"""S0 under which a pixel counts no more for being darker."""
+"""S0 below which the weight of a pixel stays constant."""
 BLOCK = 16
-"""Side of the squares of pixels whose errors may depend on each other."""
+"""Side of the squares of pixels whose errors may be correlated."""
 
 
 @dataclass(frozen=True)
 class FittedAngle:
-    """The polarizer angle that fits a picture.
+    """Polarizer angle fitted to a picture.
 
     Attributes:
         angle: degrees in [0, 180), as ``Exposure.angle``.
         gain: brightness over the predicted one.
-        modulation: the polarization that shows in the picture over the predicted one: 1 behind a polarizer, 0 without
-            one, above 1 where too little was predicted.
+        modulation: polarization of the picture over the predicted one: 1 behind a polarizer, 0 without a polarizer,
+            above 1 if the prediction is too small.
         spread: standard deviation of the angle, degrees; at most 90.
         doubt: standard deviation of the modulation, at most 1.
-        misfit: what remains of the picture's light, relative to it: the mean of the differences over the picture's.
+        misfit: mean residual over the mean light of the picture.
         misfit_across: the same with the polarizer turned by 90 degrees.
     """
 
@@ -50,17 +50,20 @@ def fit_angle(
 ) -> FittedAngle | None:
     """Fit ``I = (g S0 + x S1 + y S2) / 2`` with g the gain and (x, y) = g (cos 2t, sin 2t) of the angle t.
 
-    Least absolute differences, by least squares with new weights in each of a few rounds, so that what the prediction
-    has not explained yet does not pull at the angle, over the square of S0: what a prediction lacks grows with the
-    light, and what is dark is polarized most. Of a filter before the lens, whose analyzer depends on the pixel,
-    (x, y) turns that of the last round.
+    Iteratively reweighted least squares minimize the absolute differences over the square of S0. Unexplained light thus
+    has little influence on the angle: errors of a prediction grow with the light, and dark surfaces are polarized most.
+    A filter in front of the lens has an analyzer that depends on the pixel; there, (x, y) rotates the analyzer of the
+    previous round.
 
     Args:
-        intensity: [H, W, 3] linear. stokes: [3, H, W, 3] as predicted. weight: [H, W], 0 where nothing was measured.
-        rays: [H, W, 3] unit, camera axes. mount: where the polarizer was.
+        intensity: [H, W, 3] linear.
+        stokes: [3, H, W, 3] predicted Stokes vectors.
+        weight: [H, W], 0 for pixels without a measurement.
+        rays: [H, W, 3] unit, camera axes.
+        mount: place of the polarizer.
 
     Returns:
-        None where there is no polarization to tell an angle by.
+        None without polarization that determines an angle.
     """
     flat = (weight / (stokes[0].mean(dim=-1).clamp(min=0) + FLOOR) ** 2)[..., None].expand_as(intensity)
     plain = flat.reshape(-1).double()
@@ -110,8 +113,10 @@ def fit_angle(
 
 
 def _covariance(columns: Tensor, weights: Tensor, residuals: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Covariance [3, 3] of a solution by least absolute differences: the usual sandwich, with the density of the
-    residuals at zero from those under their median, and errors that may depend on each other within ``BLOCK``.
+    """Return the covariance [3, 3] of a solution by least absolute differences.
+
+    This is the sandwich estimator. The density of the residuals at zero follows from those below their median. Errors
+    may be correlated within blocks of side ``BLOCK``.
     """
     width = residuals[weights > 0].abs().median().clamp(min=1e-9)
     slope = (columns * (weights * (residuals.abs() <= width) / width)) @ columns.T

@@ -31,25 +31,28 @@ REMEDY = (
 UNFITTED = (0.0, 1.0, 0.0, 90.0, 1.0, 0.0, 0.0)
 """Values of ``FittedAngle`` for a picture without polarization to fit an angle to."""
 Predict = Callable[[View], Tensor]
-"""Stokes vectors [3, H, W, 3] that the present state predicts for a view."""
+"""Function that predicts the Stokes vectors [3, H, W, 3] of a view from the current state."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Judgment(FittedAngle):
-    """The training's judgment of a picture's angle.
+    """Judgment of a training on the polarizer angle of a picture.
 
-    ``angle`` is the mean of the fits that tell one, or else of those that guess one. The other values of
+    ``angle`` is the mean of the fits that determine one, or else of those that are a best guess. The other values of
     ``FittedAngle`` are those of the last of these fits.
 
     Attributes:
-        view, number: the view, and the place of the picture among its exposures.
-        specified: what the capture says. believed: what the training goes by.
-        scatter: scatter of the angles about their mean, degrees; 90 where less than half of the fits have one.
-        usual: median of what the telling pictures of the same fit are ``off``: how well the model predicts any.
-        unexplained: misfit of the last of all fits over the median of all pictures, times that over the misfit across:
-            large where the picture is explained worse than others are, and hardly better than by a turned polarizer.
-        overruled: whether the other pictures of its view contradict a wrong angle; see ``Polarizers._overruled``.
-        rules: by which it is judged.
+        view: name of the view.
+        number: index of the picture among the exposures of the view.
+        specified: exposure of the capture.
+        believed: exposure that the training assumes.
+        scatter: scatter of the angles about their mean, degrees; 90 if less than half of the fits determine one.
+        usual: median deviation of the pictures with a determined angle in the same fit, which measures the prediction.
+        unexplained: misfit of the last fit over the median of all pictures, times the misfit over that across. It is
+            large for a picture with a worse explanation than others, and hardly a better one than by a turned
+            polarizer.
+        overruled: the other pictures of the view contradict a wrong angle; see ``Polarizers._overruled``.
+        rules: constants of the judgment.
     """
 
     view: str
@@ -99,8 +102,10 @@ class Judgment(FittedAngle):
 
     @property
     def limit(self) -> float:
-        """Degrees that a picture has to be ``off`` to contradict its specified angle: more than others are,
-        since where all are off, the model is wrong. From 90 on, nothing contradicts.
+        """Degrees of deviation beyond which a picture contradicts its specified angle.
+
+        It grows with the deviations of the other pictures, since large deviations of all pictures mean a wrong model.
+        From 90 on, no picture contradicts.
         """
         return tolerance(self.rules.contradicts, self.spread, self.usual)
 
@@ -110,7 +115,7 @@ class Judgment(FittedAngle):
         return not (self.unfiltered or self.overruled) and abs(self.off) > self.limit
 
     def resembles(self, other: Judgment) -> bool:
-        """Whether it looks as if taken at the specified angle of another picture, as well as it tells."""
+        """Return True if the fitted angle equals the specified angle of another picture, within its spread."""
         apart = angle_difference(self.angle, other.specified.angle or 0.0)
         return abs(apart) <= tolerance(self.rules.contradicts, self.spread)
 
@@ -122,19 +127,23 @@ class Judgment(FittedAngle):
 
 
 class Polarizers:
-    """The pictures behind polarizers that are to be fitted, and what has been found.
+    """Pictures behind polarizers to fit, and their fits.
 
-    Pictures of a polarization camera are not; nor is anything where the recipe has no use for it. Angles are sought in
-    the second half of a schedule. Where the training begins again with what was found, they are sought twice, the
-    second time by what the first has found.
+    Pictures of a polarization camera are left out, and all pictures if the recipe does not use them. Angles are fitted
+    in the second half of a schedule. If the training begins again with them, they are fitted in two searches; the
+    second begins with the angles of the first.
 
     Args:
-        scene: the capture. recipe: the method. steps: of the training. search: of the schedule by which unknown
-            angles are sought where the training begins again after it; 0: it does not.
-        table: what was found before, [F, P, 8] float64: what each ``fit`` gave; None: nothing.
+        scene: the capture.
+        recipe: the method.
+        steps: steps of the training.
+        table: earlier fits, [F, P, 8] float64, results of ``fit``; None: no fit.
+        search: steps of the schedule of a search for unknown angles; 0: the training does not begin again.
 
     Attributes:
-        beliefs: the exposures that a training goes by, by the name of the view; of views that were fitted.
+        table: all fits.
+        beliefs: assumed exposures of fitted views by the name of the view.
+        ignored: the recipe ignores the filters of some pictures.
 
     Raises:
         ValueError: the table has another number of rows.
@@ -168,7 +177,7 @@ class Polarizers:
         self.beliefs = self._beliefs()
 
     def due(self, step: int) -> bool:
-        """Return true if angles are fitted before a step."""
+        """Return True if angles are fitted before a step."""
         return not self.settled and step in self._rounds[self.ended]
 
     @property
@@ -184,7 +193,7 @@ class Polarizers:
 
     @property
     def search(self) -> int:
-        """Steps until unknown angles are found; 0 without unknown angles."""
+        """Number of steps until unknown angles are found; 0 without unknown angles."""
         return sum(times[-1] for times in self._rounds) if self._unknown else 0
 
     @property
@@ -193,19 +202,22 @@ class Polarizers:
         return sum(times[-1] for times in self._rounds[: self.ended]) if self._unknown else 0
 
     def believed(self, view: View) -> View:
-        """A view with what is believed of its exposures."""
+        """Return a view with its assumed exposures."""
         exposures = self.beliefs.get(view.name)
         return view if exposures is None or exposures == view.exposures else view.with_exposures(exposures)
 
     def resolved(self, scene: Scene) -> Scene:
-        """A scene with what is believed of its exposures."""
+        """Return a scene with its assumed exposures."""
         return replace(scene, views=tuple(self.believed(view) for view in scene.views))
 
     def fit(self, predict: Predict) -> Tensor:
         """Fit all angles.
 
+        Args:
+            predict: predicts the Stokes vectors of a view.
+
         Returns:
-            [P, 8] float64: of each picture the values of ``FittedAngle``, and 1 where there was anything to go by.
+            [P, 8] float64: the values of ``FittedAngle`` of each picture, and 1 for a successful fit.
         """
         rows = []
         for view in self._views:
@@ -221,14 +233,14 @@ class Polarizers:
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, ANGLE_COLUMNS)
 
     def take(self, table: Tensor) -> set[str]:
-        """Go by a table of all fits [F, P, 8] from now on; the names of the views of which it changes the beliefs."""
+        """Use a table of all fits [F, P, 8]; return the names of the views with changed exposures."""
         self.table = table
         before = self.beliefs
         self.beliefs = self._beliefs()
         return {name for name, exposures in self.beliefs.items() if before.get(name) != exposures}
 
     def judgments(self) -> list[Judgment]:
-        """Specified and assumed angles of each picture; empty before the first fit."""
+        """Return the judgment of each picture; empty before the first fit."""
         if self.table is None:
             return []
         common = self._common_gain(self.table[-1])
@@ -256,10 +268,10 @@ class Polarizers:
         return [replace(judgment, overruled=self._overruled(judgment, judgments)) for judgment in judgments]
 
     def _overruled(self, judgment: Judgment, judgments: Sequence[Judgment]) -> bool:
-        """Whether a picture contradicts its angle, and the three or more others of its view do not.
+        """Return True if a picture contradicts its angle, and the other pictures of its view, at least three, do not.
 
         Four pictures determine more than a Stokes vector: a single wrong angle breaks their pair sums, which
-        ``prepare`` and ``inspect`` check. Only two exchanged pictures keep the sums, and each looks like the other.
+        ``prepare`` and ``inspect`` check. Only two exchanged pictures keep the sums, and each resembles the other.
         """
         if not judgment.contradicts:
             return False
@@ -273,7 +285,7 @@ class Polarizers:
         )
 
     def _judged(self, fit: Tensor) -> list[Judgment]:
-        """The judgment of each picture by one fit [P, 8]."""
+        """Return the judgment of each picture by one fit [P, 8]."""
         rows = [
             Judgment(
                 *row[:-1],
@@ -290,7 +302,7 @@ class Polarizers:
         return [replace(row, usual=usual) for row in rows]
 
     def _common_gain(self, fit: Tensor) -> float | None:
-        """The gain that others are relative to; None where gains differ as little as those of locked exposures."""
+        """Return the median gain as a reference; None if gains differ as little as those of locked exposures."""
         rows = [row for (view, k), row in zip(self._places, fit, strict=True) if not view.exposures[k].known]
         gains = [float(row[1]) for row in rows if row[-1]]
         if len(gains) < self._rules.fewest:
@@ -308,12 +320,12 @@ class Polarizers:
 
 
 def predicts_filters(recipe: Recipe) -> bool:
-    """Whether a recipe learns from what is behind a filter: it renders S0, S1 and S2."""
+    """Return True if a recipe learns from pictures behind filters: it renders S0, S1 and S2."""
     return recipe.shading.reflects and any(stage.weights.stokes > 0 for stage in recipe.stages)
 
 
 def search_steps(recipe: Recipe, settings: ResolvedSettings) -> int:
-    """Steps of the schedule by which unknown angles are sought before a training begins; 0: it does not begin again."""
+    """Return the steps of the schedule of a search for unknown angles; 0: the training does not begin again."""
     return min(recipe.angle_rules.search_steps, settings.steps) if settings.begin_again else 0
 
 
@@ -326,7 +338,7 @@ def _unexplained(fit: Tensor) -> list[float]:
 
 
 def _belief(judgment: Judgment, common: float | None) -> Exposure:
-    """The exposure assumed for a picture without a specified angle: a photograph where no angle was fitted."""
+    """Return the exposure assumed for a picture without a specified angle: a photograph if no angle was fitted."""
     specified = judgment.specified
     if judgment.unfiltered:
         return replace(specified, filtered=False)
