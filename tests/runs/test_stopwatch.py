@@ -9,10 +9,9 @@ import pytest
 
 from polarguide.capture import Scene
 from polarguide.core.progress import Advance, Reporter
-from polarguide.runs import stopwatch
-from polarguide.runs.callbacks import Look
+from polarguide.runs import callbacks
+from polarguide.runs.callbacks import Look, in_words
 from polarguide.runs.folder import RunLog
-from polarguide.runs.stopwatch import in_words
 from polarguide.runs.train import train_gaussians
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.settings import TrainSettings
@@ -51,7 +50,7 @@ def test_pauses_of_a_training_do_not_count(
     """Each step takes two seconds, and others look for a thousand seconds after each."""
     now = 0.0
     clock = SimpleNamespace(perf_counter=lambda: now, process_time=lambda: now)
-    monkeypatch.setattr(stopwatch, "time", clock)
+    monkeypatch.setattr(callbacks, "time", clock)
 
     @contextlib.contextmanager
     def watch(trainer: TrainingLoop) -> Iterator[Look]:

@@ -11,7 +11,7 @@ from polarguide.capture import Scene
 from polarguide.raster import Backend, rasterize_reference
 from polarguide.recipes import RECIPES
 from polarguide.shading.gbuffer import RenderRequest, render, splats
-from polarguide.training.actions import LEAST_PIXELS, touched_pixels
+from polarguide.training.callbacks import LEAST_PIXELS, touched_pixels
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.losses import Weights, coverage_loss
 from polarguide.training.recipe import Recipe

@@ -26,11 +26,21 @@ from polarguide.runs.model import GaussianModel
 from polarguide.runs.reports import METALS_PICTURE, report_metals
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.loop import TrainingLoop
-from polarguide.training.metals.cut import INFINITE, Graph, decide, minimum_cut, surfaces, unary
 from polarguide.training.metals.evidence import GOLD, LEVELS, MetalEvidence, _tint_cost, errors, evidence
 from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights, shares
-from polarguide.training.metals.search import SOFT_PRIORS, MetalSearch, looks, warn_of_unused_materials
-from polarguide.training.rules import MetalRules, MetalViews
+from polarguide.training.metals.search import (
+    INFINITE,
+    SOFT_PRIORS,
+    Graph,
+    MetalSearch,
+    decide,
+    looks,
+    minimum_cut,
+    surfaces,
+    unary,
+    warn_of_unused_materials,
+)
+from polarguide.training.recipe import MetalRules, MetalViews
 from polarguide.training.settings import TrainSettings
 
 RULES, LIMITS = MetalRules(), MetalViews()

@@ -24,7 +24,7 @@ STEPS, HALF = 20, 9
 
 @pytest.fixture(autouse=True)
 def plain_adam(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("polarguide.gaussians.adam.adam", unfused_adam)
+    monkeypatch.setattr("polarguide.gaussians.gaussians.adam", unfused_adam)
 
 
 def checkpoint(folder: Path, trainer: TrainingLoop) -> dict[str, Tensor]:
