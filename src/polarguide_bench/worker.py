@@ -34,7 +34,7 @@ from polarguide.results.evaluation.record import code_digest
 from polarguide.results.export import formats, web_page
 from polarguide.runs.folder import CONFIGURATION, writing_to
 from polarguide.runs.opened import OpenedRun
-from polarguide.runs.train import train
+from polarguide.runs.train import train_gaussians
 from polarguide.training.recipe import Recipe
 from polarguide.visualization import figures
 from polarguide.visualization.layers import layer_picture
@@ -230,7 +230,7 @@ def _do(task: Task) -> None:
 def _train_run(task: Training) -> None:
     """Train a run, or go on with the one in its folder."""
     recipe = recipe_named(task.recipe)
-    trains: Any = train if isinstance(recipe, Recipe) else train_field
+    trains: Any = train_gaussians if isinstance(recipe, Recipe) else train_field
     with StopSignals() as should_stop:
         trains(
             task.scene,

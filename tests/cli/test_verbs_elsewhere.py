@@ -94,7 +94,7 @@ def test_pictures_by_other_light_and_along_a_path(elsewhere: Path, tmp_path: Pat
 def test_the_inspection_trains_there_and_compares_here(
     demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("polarguide.gaussians.adam.adam", unfused_adam)
+    monkeypatch.setattr("polarguide.gaussians.gaussians.adam", unfused_adam)
     scene = load_scene(demo_scene, downscale=8)
 
     def stop(report: object) -> None:

@@ -15,7 +15,7 @@ from polarguide.capture import Scene
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import DeviceName, PathLike, SceneOptions, SessionOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.core.system import MemoryBound, return_freed_memory
+from polarguide.core.system import return_freed_memory
 from polarguide.geometry.camera import Camera
 from polarguide.raster import choose_backend, use_threads
 from polarguide.results.rendering.mesh import RESOLUTION, Surface
@@ -28,7 +28,6 @@ from polarguide.runs.train import (
     check_step,
     check_trainable,
     ignored_filters,
-    resources_used,
     unsuitable_folder,
     view_store,
 )
@@ -136,9 +135,7 @@ def train_field(
                 reporter.say(f"{out} has no checkpoint: the training begins at step 0")
         loop = FieldLoop(loaded, recipe, resolved, backend.device, state, store)
         configuration.save(out)
-        bound = MemoryBound(plan.peak)
-        seconds = run_to_the_end(loop, out, session, reporter, should_stop, None, bound)
-    reporter.say(resources_used(seconds, plan.peak))
+        run_to_the_end(loop, out, session, reporter, should_stop, None, plan.peak)
     return FieldRun(out, configuration, recipe, FieldModel(loop.state, recipe, backend.device))
 
 
@@ -180,7 +177,7 @@ def resolve_field(
     Raises:
         PolarguideError: a setting that means nothing for a field.
     """
-    recorded: dict[str, Any] = {} if resumed is None else resumed.specified()
+    recorded: dict[str, Any] = {} if resumed is None else vars(resumed)
     values: dict[str, Any] = {
         **vars(settings),
         "steps": recipe.steps,

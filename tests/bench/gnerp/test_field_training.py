@@ -212,7 +212,7 @@ def test_a_run_without_a_checkpoint_begins_anew_and_says_so(demo_scene: Path, tm
 
 def test_a_run_with_other_steps_is_not_resumed(demo_scene: Path, tmp_path: Path) -> None:
     field_trained(demo_scene, tmp_path / "run", 2)
-    Fault("steps", "2, as this training was begun", "3").raised_by(
+    Fault("steps", "2, the number", "3").raised_by(
         field_trained, demo_scene, tmp_path / "run", 3, resume=True
     )
 

@@ -31,7 +31,7 @@ from polarguide.results.export.placement import (
 from polarguide.results.rendering.mesh import ColoredMesh
 from polarguide.shading.gbuffer import diffuse_colors
 from polarguide.shading.model import Parameters, ShadingModel
-from polarguide.training.actions import outward_directions
+from polarguide.training.callbacks import outward_directions
 
 
 def write_mesh(
