@@ -40,17 +40,17 @@ from polarguide_bench.plan import (
     scene_entries,
 )
 from polarguide_bench.recipes import ABLATIONS, AnyRecipe, ablations_of, recipe_named
-from polarguide_bench.record import (
+from polarguide_bench.report import exposure_svg, read_study, study_svg, write_report
+from polarguide_bench.results import (
     FORMAT,
     REMEDY,
     PartScores,
     RecipeRecord,
     Record,
+    Results,
     RunRecord,
     SceneRecord,
 )
-from polarguide_bench.report import exposure_svg, read_study, study_svg, write_report
-from polarguide_bench.results import Results
 from polarguide_bench.tables import write_tables
 
 LOCK = ".lock"

@@ -35,8 +35,7 @@ from polarguide.runs.memory_plan import pixels_of, plan_memory
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import STEPS, TrainSettings
-from polarguide_bench.gnerp.memory import plan_field_memory
-from polarguide_bench.gnerp.runs import FieldRun, open_field
+from polarguide_bench.gnerp.runs import FieldRun, open_field, plan_field_memory
 from polarguide_bench.options import ClusterOptions, CompareOptions
 from polarguide_bench.recipes import AnyRecipe, ablations_of, recipe_named
 

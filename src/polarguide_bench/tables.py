@@ -25,10 +25,10 @@ from polarguide.results.evaluation.table import (
     Metric,
 )
 from polarguide.visualization.pages import templates
-from polarguide_bench.record import RunRecord
 from polarguide_bench.results import (
     Cell,
     Results,
+    RunRecord,
     ScoreRow,
     Values,
     controlled,

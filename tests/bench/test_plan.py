@@ -23,7 +23,7 @@ from polarguide_bench.compare import ablated, collect, compare
 from polarguide_bench.options import CompareOptions
 from polarguide_bench.plan import Comparison, PlannedRun, SceneEntry, plan_runs, run_key, scene_entries
 from polarguide_bench.recipes import ABLATIONS
-from polarguide_bench.record import read_results
+from polarguide_bench.results import read_results
 
 SETTINGS = TrainSettings(40, 0)
 ENTRY = SceneEntry(Path("cup"), "cup", "digest", 9, ("v0",))

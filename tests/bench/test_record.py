@@ -10,8 +10,7 @@ from faults import Fault
 
 from polarguide.core.records import decode
 from polarguide_bench.join import join_records, join_tables
-from polarguide_bench.record import Record, read_results
-from polarguide_bench.results import Results
+from polarguide_bench.results import Record, Results, read_results
 from polarguide_bench.tables import scores_section, write_tables
 
 STORED = Path(__file__).parents[2] / "benchmarks" / "results"

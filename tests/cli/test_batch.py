@@ -85,8 +85,9 @@ def test_a_watched_folder_is_taken_once_nothing_in_it_changes(
 
     def instead(captures: list[Capture], out: Path, *_: Any, **__: Any) -> list[CaptureRow]:
         asked.append([capture.name for capture in captures])
+        record: Any = None
         return [
-            CaptureRow(name, "", out, "failed" if name == "b" else "done", "broken", None)
+            CaptureRow(name, "", out, "failed" if name == "b" else "done", "broken", record)
             for name in asked[-1]
         ]
 

@@ -22,7 +22,7 @@ from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.options import CompareOptions
 from polarguide_bench.plan import Comparison, plan_runs, scene_entries
-from polarguide_bench.record import read_results
+from polarguide_bench.results import read_results
 from polarguide_shots.ring_scale import ring_scale
 from polarguide_synth.schema import SceneSpec
 from polarguide_synth.settings import Variant, choose_variant

@@ -22,7 +22,7 @@ from polarguide.core.options import EXPORT_PACKAGES, SceneOptions, check_finite
 from polarguide.core.text import canonical
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 from polarguide.training.settings import TrainSettings
-from polarguide_bench.collection import NO_FILES, source_stamp
+from polarguide_bench.children import NO_FILES, source_stamp
 from polarguide_bench.options import BatchOptions
 
 if TYPE_CHECKING:
