@@ -401,7 +401,8 @@ def _scene_views(
 ) -> Iterator[tuple[EmbeddedView | None, str | None]]:
     """Yield the result of ``embed`` for views of a scene. The limit is in bytes for each view."""
     scene = read_scene(entry.path, comparison.options)
-    opened = [open_compared(run.folder, comparison.options.own_device) for run in runs]
+    device = comparison.options.device if comparison.options.local else "auto"
+    opened = [open_compared(run.folder, device) for run in runs]
     scores = [(run.metrics() or {})["views"] for run in runs]
     for name in names:
         view = scene.view(name)
