@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +14,14 @@ import pandas as pd
 from polarguide.capture.layout import find_layout, refuse_scene
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import check_out, make_folder, require_inside, write_text
-from polarguide.core.options import ComputeOptions, PathLike, SceneOptions
+from polarguide.core.options import ComputeOptions, PathLike
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.inspection.report import FILE as INSPECTION_PAGE
-from polarguide.preparation.settings import PrepareSettings
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.record import read_metrics
 from polarguide.results.evaluation.table import COLUMNS
 from polarguide.runs.folder import CHECKPOINT, RunConfiguration
-from polarguide.training.settings import TrainSettings
 from polarguide.visualization.pages import page
 from polarguide_bench.children import (
     FORMAT,
@@ -32,6 +30,7 @@ from polarguide_bench.children import (
     RUN,
     SHARE,
     STEPS,
+    Capture,
     CaptureRecord,
     Processing,
     Request,
@@ -139,27 +138,6 @@ CAPTURES = "captures"
 """Folder of the captures' folders."""
 WORK_BYTES = 2_000_000_000
 """Memory request of a job of SLURM or PBS. The size of a capture is unknown before its preparation."""
-
-
-@dataclass(frozen=True)
-class Capture:
-    """A capture of a collection, and the options for it.
-
-    Attributes:
-        name: name of its folder in the results.
-        path: folder of its files, or a scene.
-        prepare: settings of the preparation, unused for a scene.
-        recipe: recipe of the training.
-        settings: settings of the training.
-        reading: options for reading the scene.
-    """
-
-    name: str
-    path: Path
-    prepare: PrepareSettings = field(default_factory=PrepareSettings)
-    recipe: str = "polarguide-stokes"
-    settings: TrainSettings = TrainSettings()
-    reading: SceneOptions = SceneOptions()
 
 
 def run_batch(

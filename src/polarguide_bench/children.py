@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -47,6 +48,27 @@ STEPS: tuple[Step, ...] = ("prepare", "inspect", "train", "eval", "share", "expo
 """Steps of a capture in their order."""
 NO_FILES = (0, 0, 0)
 """Stamp of an empty or missing folder."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture of a collection, and the options for it.
+
+    Attributes:
+        name: name of its folder in the results.
+        path: folder of its files, or a scene.
+        prepare: settings of the preparation, unused for a scene.
+        recipe: recipe of the training.
+        settings: settings of the training.
+        reading: options for reading the scene.
+    """
+
+    name: str
+    path: Path
+    prepare: PrepareSettings = field(default_factory=PrepareSettings)
+    recipe: str = "polarguide-stokes"
+    settings: TrainSettings = TrainSettings()
+    reading: SceneOptions = SceneOptions()
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -20,8 +20,8 @@ from polarguide.core.records import decode
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.training.settings import TrainSettings
 from polarguide_bench import job_queue
-from polarguide_bench.batch import Capture, CaptureRow, _task, run_batch
-from polarguide_bench.children import FORMAT, STEPS, CaptureRecord, Message, prepare_settings
+from polarguide_bench.batch import CaptureRow, _task, run_batch
+from polarguide_bench.children import FORMAT, STEPS, Capture, CaptureRecord, Message, prepare_settings
 from polarguide_bench.compare import locked
 from polarguide_bench.options import BatchOptions
 

@@ -183,7 +183,7 @@ def test_interrupted_failed_and_finished(
     (second / "run.json").write_text("{}")
     assert run(command) == 2
     said = capsys.readouterr()
-    assert "expected 2 finished runs, found that 1 failed (demo, 3dgs, seed 0: " in said.err
+    assert "1 failed runs (demo, 3dgs, seed 0: " in said.err
     assert f"{second}/run.json: expected " in said.err
     assert len(said.err.splitlines()) == 1
     assert "done  demo, 3dgs-dr, seed 0" in said.out
