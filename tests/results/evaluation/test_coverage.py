@@ -5,7 +5,12 @@ import torch
 from torch import Tensor
 
 from polarguide.geometry.camera import Camera, look_at
-from polarguide.results.evaluation.coverage import Coverage, DepthMap, rendered_depths, true_depths
+from polarguide.results.evaluation.coverage import (
+    Coverage,
+    DepthMap,
+    depth_map_of_rendering,
+    depth_map_of_truth,
+)
 
 SIZE = 48
 WALL = 4.0
@@ -88,7 +93,7 @@ def test_background_is_seen_in_its_direction():
 def test_true_depths_of_zero_are_background():
     depth = torch.zeros(SIZE, SIZE)
     depth[0] = 3
-    assert true_depths(MIDDLE, depth).depth.isfinite().sum() == SIZE
+    assert depth_map_of_truth(MIDDLE, depth).depth.isfinite().sum() == SIZE
 
 
 def test_rendered_depths_are_background_beyond_the_cameras_or_without_alpha():
@@ -97,6 +102,6 @@ def test_rendered_depths_are_background_beyond_the_cameras_or_without_alpha():
     alpha = torch.ones(SIZE, SIZE)
     alpha[1] = 0.4
     middle = torch.tensor([0.0, 0.0, WALL], dtype=torch.float64)
-    surface = rendered_depths(MIDDLE, depth, alpha, middle, radius=4.0).depth.isfinite()
+    surface = depth_map_of_rendering(MIDDLE, depth, alpha, middle, radius=4.0).depth.isfinite()
     assert not surface[:2].any()
     assert surface[2:].all()

@@ -39,13 +39,15 @@ class DepthMap(NamedTuple):
         return torch.where(surface[..., None], self.camera.center, 0.0) + rays * distance[..., None]
 
 
-def true_depths(camera: Camera, depth: Tensor) -> DepthMap:
+def depth_map_of_truth(camera: Camera, depth: Tensor) -> DepthMap:
     """Return the depth map of a ground truth [H, W], in which 0 marks background."""
     values = depth.double()
     return DepthMap(camera, torch.where(values > 0, values, torch.inf))
 
 
-def rendered_depths(camera: Camera, depth: Tensor, alpha: Tensor, middle: Tensor, radius: float) -> DepthMap:
+def depth_map_of_rendering(
+    camera: Camera, depth: Tensor, alpha: Tensor, middle: Tensor, radius: float
+) -> DepthMap:
     """Return the depth map of a rendering.
 
     Args:

@@ -24,7 +24,12 @@ from polarguide.gaussians.initialize import camera_reach
 from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 from polarguide.optics.color import shown
-from polarguide.results.evaluation.coverage import Coverage, DepthMap, rendered_depths, true_depths
+from polarguide.results.evaluation.coverage import (
+    Coverage,
+    DepthMap,
+    depth_map_of_rendering,
+    depth_map_of_truth,
+)
 from polarguide.results.evaluation.mesh import mesh_scores
 from polarguide.results.evaluation.metrics import HAZE_DEPTH, Selection, normal_angles_deg
 from polarguide.results.evaluation.record import METRICS_FILE, code_digest, commit, write_metrics
@@ -128,7 +133,7 @@ class ErrorSheet:
         if "normal" in result.layers and target.normal is not None and target.surface is not None:
             angles = normal_angles_deg(result.normal.nan_to_num(), target.normal)
             pictures["normal"] = _heat(angles, target.surface.mask, NORMAL_HIGH)
-        unseen = (target.valid.mask & ~target.seen.mask).cpu()
+        unseen = target.unseen.cpu()
         _hatch(pictures["final"], unseen)
         keep = target.valid if target.polarized is None else target.polarized
         predicted = None if stokes is None else stokes.cpu().nan_to_num()
@@ -409,13 +414,15 @@ def _coverage(run: ScoredRun, reporter: Reporter) -> Coverage:
 
     def surface(view: View) -> DepthMap:
         result = run.model.render(view.camera, normals=False, depth=True, surface=True)
-        return rendered_depths(view.camera, result.depth, result.alpha, torch.from_numpy(middle), radius)
+        return depth_map_of_rendering(
+            view.camera, result.depth, result.alpha, torch.from_numpy(middle), radius
+        )
 
     held_out = {}
     for view in scene.test_views:
         truth = view.ground_truth
         known = None if truth is None else truth.depth
-        held_out[view.name] = surface(view) if known is None else true_depths(view.camera, known)
+        held_out[view.name] = surface(view) if known is None else depth_map_of_truth(view.camera, known)
     coverage = Coverage(held_out)
     with reporter.track("finding the photographed pixels", len(training)) as advance:
         for count, view in enumerate(training, start=1):

@@ -288,6 +288,11 @@ class ViewTarget:
             extent=facts.extent,
         )
 
+    @property
+    def unseen(self) -> Tensor:
+        """Valid pixels [H, W] bool whose content no training view shows; none if not determined."""
+        return self.valid.mask & ~(self.valid if self.seen is None else self.seen).mask
+
     def with_coverage(self, seen: Tensor) -> ViewTarget:
         """Return the target with the pixels [H, W] bool (CPU) whose content a training view shows."""
         device = self.photograph.device
@@ -297,7 +302,7 @@ class ViewTarget:
             self,
             seen=Selection.of(counted, device),
             seen_windows=Selection.of(window_centers(counted), device),
-            seen_polarized=_chosen(polarized, device),
+            seen_polarized=_selection(polarized, device),
         )
 
 
