@@ -130,7 +130,8 @@ def test_what_fails_for_one_browser_lets_that_one_go_with_a_line(
         browser.send(msgspec.msgpack.encode(CAMERA))
         with pytest.raises(ConnectionClosed):
             drain(browser)
-    assert served.warned == ["the viewer let a browser go: ValueError: a fault of ours"]
+    (warning,) = served.warned
+    assert "ValueError: a fault of ours" in warning
     served.warned.clear()
     assert served.is_well()
 

@@ -2,8 +2,7 @@
 
 Web pages of other sites that are open in the same browser must not connect to the viewer. viser has no hook for this.
 Therefore ``websockets``' function ``serve`` is wrapped while viser starts to listen. The version of viser is pinned,
-and
-the viewer does not start if viser did not call the wrapper.
+and the viewer does not start if viser did not call the wrapper.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ class Gate:
             pages.
 
     Raises:
-        PolarguideError: a name is neither a host name nor an address.
+        PolarguideError: a name is not a host name or an address.
     """
 
     def __init__(self, listening: str, hosts: Iterable[str] = (), origins: Iterable[str] = ()) -> None:
@@ -50,8 +49,7 @@ class Gate:
         """Return the reason and the remedy for refusing a request, or None for a valid request.
 
         An unknown name may belong to a stranger and point to this machine (DNS rebinding). The origin is the page
-        that sends
-        the request; programs other than browsers send none.
+        that sends the request; programs other than browsers send none.
 
         Args:
             headers: ``websockets.Headers`` of the request.

@@ -92,7 +92,7 @@ def choice(options: Sequence[str]) -> Accepts:
 def flag(value: Any) -> bool:
     """Accept true or false."""
     if not isinstance(value, bool):
-        raise Refused("neither on nor off")
+        raise Refused("a value other than on or off")
     return value
 
 

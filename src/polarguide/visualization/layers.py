@@ -45,7 +45,7 @@ def layer_picture(
         result, camera: the rendering.
         name: name of the layer.
         depths: range of the colors of depth.
-        exposed: whether radiance is darkened so that at most 1 % of the pixels clip.
+        exposed: darken radiance so that at most 1 % of the pixels clip.
         color: color matrix of the presentation, [3, 3], for layers of radiance.
     """
     if name in POLARIZED:
@@ -140,11 +140,13 @@ def true_name(name: str) -> str:
 def reference_pictures(
     view: View, color: Tensor | None = None, depths: Depths | None = None
 ) -> dict[str, Picture]:
-    """Reference pictures of a view's layers, 8-bit: the ``photograph``, the ground truth of others as ``NAME, true``,
-    and the polarization that its pictures measure as ``NAME, measured``.
+    """Return reference pictures of a view's layers, 8-bit.
+
+    They are the ``photograph``, the ground truth of other layers as ``NAME, true``, and the measured
+    polarization as ``NAME, measured``.
 
     Args:
-        color, depths: as for ``layer_picture``.
+        color, depths: see ``layer_picture``.
     """
     pictures = {
         true_name(name): picture for name, picture in ground_truth_pictures(view, color, depths).items()
@@ -158,8 +160,9 @@ def reference_pictures(
 def ground_truth_pictures(
     view: View, color: Tensor | None = None, depths: Depths | None = None
 ) -> dict[str, Picture]:
-    """Return the photograph as ``final`` and the ground truth of other layers as 8-bit pictures, depth only with
-    ``depths``.
+    """Return the photograph as ``final`` and the ground truth of other layers as 8-bit pictures.
+
+    Depth needs ``depths``.
     """
     pictures = {"final": figures.radiance_to_rgb(colored(view.photograph(), color))}
     ground_truth = view.ground_truth

@@ -191,7 +191,7 @@ def test_layer_buttons_and_keys(fresh: Opened) -> None:
 def test_a_layer_is_explained_and_the_hint_goes_when_it_was_followed(fresh: Opened) -> None:
     fresh.page.click("button[data-layer=roughness]")
     said = [fresh.page.inner_text(f"#{part}") for part in ("sentence", "low", "high")]
-    assert said == ["roughness: how blurred mirror images are", "mirror", "matte"]
+    assert said == ["roughness: the blur of mirror images", "mirror", "matte"]
     fresh.page.click("#compare")
     assert [fresh.page.inner_text(f"#{side}") for side in ("left", "right")] == ["without gloss", "roughness"]
     fresh.page.click("#reset")

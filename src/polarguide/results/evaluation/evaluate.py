@@ -304,8 +304,7 @@ def evaluate(
 
     Returns:
         The record in ``metrics.json``: means over the views, ``views`` by name, ``objects``, ``materials``
-        and
-        ``provenance``.
+        and ``provenance``.
 
     Raises:
         PolarguideError: the scene cannot be read or has no test views.

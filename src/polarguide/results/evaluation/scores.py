@@ -146,8 +146,7 @@ ViewScores = dict[str, float | str | None]
 ``lpips_reason``, ``flip_reason`` and ``stokes_error_reason`` explain a missing ``lpips``, ``flip`` and
 ``stokes_error``.
 ``nonfinite_pixels`` counts pixels with NaN or infinity in a rendered layer, if any. They are scored as black,
-and their
-normals as 90 degrees off.
+and their normals as 90 degrees off.
 """
 
 

@@ -123,7 +123,7 @@ def _partial_truth_warnings(views: Sequence[View]) -> list[str]:
 
 
 def _object_warnings(scene: Scene, views: Sequence[View]) -> list[str]:
-    """Return warnings about object numbers without an entry in the table of objects, and about unspecified materials."""
+    """Return warnings about object numbers without a table entry, and about unspecified materials."""
     if not scene.objects:
         return [
             f"The ground truth has object numbers (objid), but {scene.root / 'scene.json'} has no table of objects "
@@ -141,7 +141,8 @@ def _object_warnings(scene: Scene, views: Sequence[View]) -> list[str]:
     if unlisted:
         sentences.append(
             f"{scene.root / 'scene.json'} (objects) does not list "
-            f"{listed([str(number) for number in sorted(unlisted)])}, although gt/{unlisted[min(unlisted)]}.npz contains it (objid): in no error by object or material."
+            f"{listed([str(number) for number in sorted(unlisted)])}, although gt/{unlisted[min(unlisted)]}.npz "
+            "contains it (objid): in no error by object or material."
         )
     unclear = [item.name for item in scene.objects if item.foreground and item.material.kind is None]
     if unclear:

@@ -85,11 +85,11 @@ def export(
 
     Args:
         run: the run. The formats ply, spz and sog read only poses and masks of its scene.
-        format: one of these formats. Splats (ply, spz, sog, splat-glb, splat-usdz) have reflections baked
-            into harmonics. The mesh (GLB and PLY) is fused from rendered depth and has diffuse colors and
-            learned normals. glb, obj and usdz are a textured model. stl is its closed surface. points are
-            opaque Gaussians with normals. environment is the learned light as a panorama (EXR, HDR and PNG).
-            cameras are a COLMAP model and transforms.json.
+        format: one of these formats. Splats (ply, spz, sog, splat-glb, splat-usdz) have reflections baked into
+            harmonics. The mesh (GLB and PLY) is fused from rendered depth and has diffuse colors and learned normals.
+            The textured model is glb, obj or usdz, and its closed surface stl. The points are opaque Gaussians with
+            normals. The environment is the learned light as a panorama (EXR, HDR and PNG). The cameras are a COLMAP
+            model and transforms.json.
         out: folder to write; default: ``export`` in the run's folder.
         resolution: number of voxels of the mesh along its longest side, 16 to 1024.
         spz_version: version of the SPZ file, 3 or 4. Readers support one of them.
@@ -143,7 +143,6 @@ class _Exporter:
     reporter: Reporter
 
     def plys(self) -> list[Path]:
-        """Write the PLY of the 3DGS release, and one with all fields if requested."""
         paths = [self._ply(self.folder / "splats.ply")]
         if self.fields == "all":
             paths.append(self._ply(self.folder / "polarguide.ply", own_fields=True))
@@ -189,7 +188,6 @@ class _Exporter:
         return self._from_ply("splats.spz", partial(write_spz, version=self.spz_version), placement)
 
     def sog(self) -> list[Path]:
-        """Write SOG."""
         credit = self.presented.presentation.credit
         asset = {
             **({"copyright": credit} if credit else {}),
@@ -214,7 +212,6 @@ class _Exporter:
         return self._from_ply("splats.usdz", partial(write_splat_usdz, about=about), placement)
 
     def mesh(self) -> list[Path]:
-        """Write the fused mesh as GLB and PLY."""
         presented = self.presented
         mesh = scene_mesh(self.run.cameras, presented.surface_view(self.run), resolution=self.resolution)
         mesh = mesh.within(presented.subject.holds(torch.from_numpy(mesh.surface.vertices)).numpy())
@@ -228,7 +225,6 @@ class _Exporter:
         return paths
 
     def model(self, kind: str) -> list[Path]:
-        """Write the textured model as ``glb``, ``obj`` or ``usdz``."""
         return self._textured(self._charted(kind), self.options, kind)
 
     def _charted(self, kind: str) -> Charted:
@@ -308,7 +304,6 @@ class _Exporter:
         return [self.folder / name for name in [RECORD, *names]]
 
     def points(self) -> list[Path]:
-        """Write opaque Gaussians as points with normals."""
         path = self.folder / "points.ply"
         model = self.run.model
         presented = self.presented
@@ -322,7 +317,6 @@ class _Exporter:
         return [path]
 
     def environment(self) -> list[Path]:
-        """Write the learned light as a panorama."""
         run = self.run
         presentation = self.presented.presentation
         cubemap = needs_radiance(run.model.shading, what="format")
@@ -336,7 +330,6 @@ class _Exporter:
         return paths
 
     def cameras(self) -> list[Path]:
-        """Write cameras and photographs."""
         return export_cameras(self.run, self.presented, self.folder, self.reporter)
 
 

@@ -1,4 +1,4 @@
-"""A trained scene as one HTML file: the Gaussians, their learned light, and a program that shades them per pixel."""
+"""Export of a scene as one HTML file: Gaussians, learned light, and a program that shades each pixel."""
 
 from __future__ import annotations
 
@@ -31,11 +31,14 @@ from polarguide.visualization.figures import color_gradient
 from polarguide.visualization.pages import page, page_part
 
 PACKAGE = "polarguide.results.export"
+"""Package with the folder of the page's sources."""
 
 TEXEL = 16
+"""Number of bytes of a texel."""
 LOWEST_LOGARITHM = -80.0
-"""That of no footprint: its square is 0 in float32."""
+"""Logarithm of an unknown footprint. The square of the footprint is 0 in float32."""
 HARMONICS = ("harmonics", "own_harmonics")
+"""Values that are stored as signed bytes with a scale."""
 SLOTS = {
     "mean": (0, "3<f4"),
     "opacity": (12, "<u2"),
@@ -54,26 +57,23 @@ SLOTS = {
     "own_harmonics": (112, "45i1"),
     "metal": (160, "3<f2"),
 }
-"""First byte and NumPy type of what a record can hold; a shading model gives ``share`` and what has a color.
+"""First byte and NumPy type of each value of a record.
 
-A record is a few texels of 16 bytes, what a texture of the graphics card can hold. All numbers are little-endian;
-``f16`` is a half float, ``u16`` an unsigned and ``i16`` a signed 16-bit fraction (of 65535 and 32767).
+A record consists of texels of 16 bytes, the size of a texel on the graphics card. A shading model selects its
+values, and the record ends after the last of them. All numbers are little-endian. ``f16`` is a half float.
+``u16`` and ``i16`` are unsigned and signed 16-bit fractions (of 65535 and 32767).
 
-===== ==================================================================================================
-texel content
-===== ==================================================================================================
-0     mean 3 x float32; opacity u16; ``share`` u16 (strength, or the roughness of Ref-GS)
-1     rotation (w, x, y, z) 4 x i16; logarithms of the scales 3 x f16; scale of ``harmonics`` f16
-2     ``color`` of degree 0 (or albedo) 3 x f16; normal axis 3 x i16; ``side`` u16; ``blur`` u16
-3-5   ``harmonics`` of degrees 1 to 3, 45 signed bytes in steps of their scale; or ``features`` 4 x i16 in texel 3
-6-9   light of its own: ``own_color`` of degree 0 3 x f16, scale f16; then ``own_harmonics`` as above
-10    ``metal``: reflectance 3 x f16; 0 of what is not a metal
-===== ==================================================================================================
+- Texel 0: mean 3 x float32; opacity u16; ``share`` u16 (strength, or the roughness of Ref-GS).
+- Texel 1: rotation (w, x, y, z) 4 x i16; logarithms of the scales 3 x f16; scale of ``harmonics`` f16.
+- Texel 2: ``color`` of degree 0 (or albedo) 3 x f16; normal axis 3 x i16; ``side`` u16; ``blur`` u16.
+- Texels 3 to 5: ``harmonics`` of degrees 1 to 3, 45 signed bytes in steps of their scale. Alternatively, texel 3
+  contains ``features`` 4 x i16.
+- Texels 6 to 9: local light: ``own_color`` of degree 0 3 x f16, scale f16; then ``own_harmonics`` like ``harmonics``.
+- Texel 10: ``metal``: reflectance 3 x f16; 0 for dielectrics.
 
-``side`` is the logarithm of the footprint (``raster.magnification``) as a half float, whose last bit is 1 where the
-normal axis points outward, and 0 where the camera alone decides. The harmonics' scale is each Gaussian's own: the
-largest of its 45 values is 127 steps. A shading model says which of these values its records have; they are as long as
-the last of them needs.
+``side`` is the logarithm of the footprint (``raster.magnification``) as a half float. Its last bit is 1 if
+the normal axis points outward, and 0 if only the camera decides. Each Gaussian has its own scale of
+harmonics: the largest of the 45 values is 127 steps.
 """
 
 
@@ -81,15 +81,16 @@ the last of them needs.
 def records(
     gaussians: Parameters, values: Mapping[str, Tensor], footprints: Tensor | None = None
 ) -> NDArray[Any]:
-    """Quantized Gaussians for the page, without those that are too faint to be drawn.
+    """Quantize the Gaussians for the page, without those that are too faint for rendering.
 
     Args:
         gaussians: parameters of the Gaussians.
         values: parameters of the shading model, [N, ...], by the names of ``SLOTS``.
-        footprints: [N] size of a training pixel at each Gaussian, see ``raster.magnification``; None: not known.
+        footprints: [N] size of a training pixel at each Gaussian, see ``raster.magnification``; None if
+            unknown.
 
     Returns:
-        [K] structured records, each padded to whole texels, along a space-filling curve, so that neighbors are alike.
+        [K] structured records, each padded to whole texels, in Morton order, so that neighbors are similar.
     """
     opacity = torch.sigmoid(gaussians["opacity_logits"])
     indices = (opacity >= MINIMUM_ALPHA).nonzero()[:, 0]
@@ -117,7 +118,7 @@ def records(
 
 
 def record_type(names: Sequence[str]) -> np.dtype[Any]:
-    """The type of a record with some of ``SLOTS``, as many texels long as these need."""
+    """Return the type of a record with some of ``SLOTS``, padded to whole texels."""
     offsets, formats = zip(*(SLOTS[name] for name in names), strict=True)
     end = max(at + np.dtype(form).itemsize for at, form in zip(offsets, formats, strict=True))
     size = -(-end // TEXEL) * TEXEL
@@ -125,19 +126,19 @@ def record_type(names: Sequence[str]) -> np.dtype[Any]:
 
 
 def _quantized(values: Tensor, kind: np.dtype[Any]) -> NDArray[Any]:
-    """Values in [0, 1] or [-1, 1] as whole numbers up to the type's largest; floats as they are, within its range."""
+    """Convert values in [0, 1] or [-1, 1] to integers up to the type's maximum; clamp floats to the type's range."""
     if kind.kind == "f":
         return values.clamp(-6e4, 6e4).numpy() if kind.itemsize == 2 else values.numpy()
     return np.rint(values.numpy().astype(np.float64) * np.iinfo(kind).max)
 
 
 def planes(data: NDArray[Any]) -> bytes:
-    """Records byte by byte, first all first bytes: neighbors are alike, so that they compress well."""
+    """Transpose records to byte planes. Neighboring records are similar, so that the planes compress well."""
     return np.ascontiguousarray(data.view(np.uint8).reshape(len(data), data.itemsize).T).tobytes()
 
 
 def harmonics_steps(rest: Tensor) -> tuple[NDArray[np.int8], NDArray[np.float16]]:
-    """Harmonics [N, 15, 3] as signed bytes [N, 45] (coefficient by coefficient, RGB), and their steps [N]."""
+    """Quantize harmonics [N, 15, 3] to signed bytes [N, 45] (coefficient by coefficient, RGB) with steps [N]."""
     flat = rest.flatten(1).numpy()
     step = (np.abs(flat).max(axis=1, initial=0.0) / 127).astype("<f2")
     step = np.maximum(step, np.float16(6e-8))
@@ -146,7 +147,7 @@ def harmonics_steps(rest: Tensor) -> tuple[NDArray[np.int8], NDArray[np.float16]
 
 
 def _axes(gaussians: Parameters, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Normal axes [K, 3], and 1 [K] where they are turned outward, 0 where the camera alone decides."""
+    """Return normal axes [K, 3], and 1 [K] for an outward axis or 0 if only the camera decides."""
     means = gaussians["means"][mask]
     origin = torch.zeros(3)
     axes = shortest_axis_normals(means, gaussians["quaternions"][mask], gaussians["log_scales"][mask], origin)
@@ -158,7 +159,7 @@ def _axes(gaussians: Parameters, mask: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sides(side: Tensor, footprints: Tensor | None) -> NDArray[np.uint16]:
-    """Footprints [K] and sides [K] as records hold them; none is the footprint 0, of which the logarithm is low."""
+    """Encode footprints [K] and sides [K]. An unknown footprint is 0."""
     lowest = torch.full_like(side, LOWEST_LOGARITHM)
     logarithms = lowest if footprints is None else footprints.log().clamp(min=LOWEST_LOGARITHM)
     bits = logarithms.numpy().astype("<f2").view("<u2")
@@ -166,7 +167,7 @@ def _sides(side: Tensor, footprints: Tensor | None) -> NDArray[np.uint16]:
 
 
 def curve_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Order [N] of points [N, 3] along a Z curve (Morton 1966) with 1,024 cells each way."""
+    """Return the order [N] of points [N, 3] along a Z curve (Morton 1966) with 1,024 cells per axis."""
     if not len(means):
         return np.zeros(0, dtype=np.int64)
     low = np.quantile(means, 0.01, axis=0)
@@ -176,7 +177,7 @@ def curve_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 def curve_places(cells: Tensor) -> Tensor:
-    """Places [N] of cells [N, 3], int64 below 1,024, along a Z curve."""
+    """Return the positions [N] of cells [N, 3], int64 below 1,024, along a Z curve."""
     code = torch.zeros(len(cells), dtype=torch.int64)
     for bit in range(10):
         for axis in range(3):
@@ -194,7 +195,9 @@ SCRIPTS = (
     "unpack.js",
     "main.js",
 )
+"""Parts of the page's script, in order."""
 NOTHING = Presentation()
+"""Empty presentation."""
 SHADERS = {
     "records": "records.glsl",
     "derive": "derive.frag",
@@ -204,12 +207,13 @@ SHADERS = {
     "light": "light.glsl",
     "shade": "shade.frag",
 }
+"""Files of the shaders by name."""
 LAYERS = ("final", "diffuse", "specular", "base", "strength", "normal", "metalness", "roughness")
-"""Layers that the page can show, in its order."""
+"""Layers of the page in the order of its buttons."""
 
 
-class Words(NamedTuple):
-    """Texts of a layer on the page: the name on its button, a sentence, and the meaning of both ends of its colors."""
+class LayerTexts(NamedTuple):
+    """Texts of a layer on the page: label of its button, description, and meaning of both ends of its colors."""
 
     label: str
     sentence: str
@@ -218,21 +222,22 @@ class Words(NamedTuple):
 
 
 WORDS = {
-    "final": Words("picture", "what a camera sees"),
-    "diffuse": Words("without gloss", "the color and shading of the things, without reflections"),
-    "specular": Words("gloss alone", "what surfaces reflect, and nothing else"),
-    "base": Words("below the gloss", "the color of the layer under the reflections"),
-    "strength": Words("reflectivity", "how much of its mirror image a surface shows", "nothing", "all"),
-    "normal": Words("shape", "where surfaces face: red to the right, green up, blue toward you"),
-    "metalness": Words("metal", "what is metal", "no", "yes"),
-    "roughness": Words("roughness", "how blurred mirror images are", "mirror", "matte"),
+    "final": LayerTexts("picture", "the picture of a camera"),
+    "diffuse": LayerTexts("without gloss", "the color and shading of surfaces, without reflections"),
+    "specular": LayerTexts("gloss alone", "only the reflections of surfaces"),
+    "base": LayerTexts("below the gloss", "the color of the layer under the reflections"),
+    "strength": LayerTexts("reflectivity", "the visible share of a surface's mirror image", "nothing", "all"),
+    "normal": LayerTexts("shape", "the orientation of surfaces: red to the right, green up, blue toward you"),
+    "metalness": LayerTexts("metal", "the share of metal", "no", "yes"),
+    "roughness": LayerTexts("roughness", "the blur of mirror images", "mirror", "matte"),
 }
-"""By the names of the layers, for somebody who knows none of them."""
+"""Texts by the name of the layer, for readers without prior knowledge."""
 _SHOWN_WITH = {"metalness": {"metal"}, "roughness": {"blur"}}
 BAKED = (
     "This page has no shaders for the reflections of this model. Each Gaussian shows its color toward the eye, with "
     "reflections baked into spherical harmonics of degree 3, which keep broad highlights and no mirror images."
 )
+"""Note on a page without shaders for its model."""
 
 
 def share_page(
@@ -250,20 +255,21 @@ def share_page(
     footprints: Tensor | None = None,
     gloss: float = 1.0,
 ) -> str:
-    """The page.
+    """Return the page.
 
     Args:
         gaussians: the Gaussians.
-        light: parameters of the learned light by name. shading: shading of the recipe, for the run's refractive index.
-        cameras: poses to choose from by name, at least one. first: name of the one to begin with.
-        title, caption: any text; it is escaped.
-        metrics: labels and values, any text. notes: paragraphs before them, any text.
+        light: parameters of the learned light by name. shading: shading model with the run's refractive
+            index.
+        cameras: poses by name, at least one. first: name of the initial pose.
+        title, caption: any text; the page escapes it.
+        metrics: labels and values, any text. notes: paragraphs before the metrics, any text.
         presentation: color, up axis, scale and credit.
-        footprints: [N] of the training, see ``raster.magnification``; None: not known.
-        gloss: how many times brighter than it is the specular layer is shown where it is shown alone.
+        footprints: [N] footprints of the training, see ``raster.magnification``; None if unknown.
+        gloss: factor on the brightness of the separate specular layer.
 
     Returns:
-        HTML that asks for nothing from outside; its own policy forbids it to.
+        Self-contained HTML. Its content policy forbids external requests.
     """
     shaded = page_shading(shading, gaussians, light)
     layers: Sequence[str] = shading.layers
@@ -275,7 +281,7 @@ def share_page(
         name for name in LAYERS if name in layers and shaded.values.keys() >= _SHOWN_WITH.get(name, set())
     ]
     if shaded.constants.get("blend") == "fresnel":
-        shown.remove("base")  # it is the diffuse layer
+        shown.remove("base")  # It equals the diffuse layer.
     scene: dict[str, Any] = {
         "kind": shaded.kind,
         "texels": quantized.itemsize // TEXEL,
@@ -323,7 +329,7 @@ def share_page(
 
 
 def baked_page(gaussians: Parameters, light: Light, shading: ShadingModel) -> PageShading:
-    """The page of a model for which there are no shaders: linear harmonics of its Gaussians' own colors, and a note."""
+    """Return the page of a model without shaders: linear harmonics of the Gaussians' own colors, and a note."""
     dc, rest = baked_harmonics(gaussians, light, shading, present=lambda colors: colors, linear=True)
     return PageShading("plain", {"color": dc[:, 0], "harmonics": rest}, notes=[BAKED])
 
@@ -349,7 +355,7 @@ def _packed(raw: bytes) -> str:
 
 @torch.no_grad()
 def light_numbers(levels: Sequence[Tensor]) -> NDArray[np.float16]:
-    """Cubemaps [6, R, R, C] with their rings, one after the other, channels filled up to a multiple of four."""
+    """Concatenate cubemaps [6, R, R, C] with their rings, with channels padded to a multiple of four."""
     numbers = []
     for texture in levels:
         texels = ringed_texels(texture.detach().clamp(-6e4, 6e4))
@@ -359,12 +365,12 @@ def light_numbers(levels: Sequence[Tensor]) -> NDArray[np.float16]:
 
 @torch.no_grad()
 def network_numbers(matrices: Sequence[Tensor]) -> NDArray[np.float32]:
-    """Matrices [rows, columns] one after the other, columns filled up to a multiple of four."""
+    """Concatenate matrices [rows, columns], with columns padded to a multiple of four."""
     padded = [pad(matrix.detach(), (0, -matrix.shape[1] % 4)).flatten() for matrix in matrices]
     return torch.cat(padded).numpy().astype("<f4")
 
 
 def viridis() -> NDArray[np.uint8]:
-    """The color map of scalar layers, [256, 3] RGB."""
+    """Return the color map of scalar layers, [256, 3] RGB."""
     colors = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[None], cv2.COLORMAP_VIRIDIS)
     return np.ascontiguousarray(colors[0, :, ::-1], dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""A run as one web page: what it says besides the scene, and where it begins."""
+"""Export of a run as one web page: its texts, scores and initial view."""
 
 from __future__ import annotations
 
@@ -29,27 +29,28 @@ def share(
     caption: str = "",
     reporter: Reporter = SILENT,
 ) -> Path:
-    """Write a run as one web page that renders it with its reflections, and needs nothing beside itself.
+    """Write a run as one self-contained web page that renders it with its reflections.
 
-    The photographs' poses are its views; it begins at the one that the run shows best.
+    The views of the page are the poses of the photographs. The page starts at the best view of the run.
 
     Args:
         run: the run; its scene is read.
-        path: file to write, ending in .html; ``share.html`` in the run's folder by default.
-        title: heading of the page; that of the presentation, or the scene's name, by default.
-        caption: text below it; the recipe and its steps by default. The word about polarization follows.
-        reporter: receives a line about what is cut.
+        path: file to write, ending in .html; default: ``share.html`` in the run's folder.
+        title: heading of the page; default: the title of the presentation or the scene's name.
+        caption: text below the heading; default: the recipe and its steps. The kind of polarization is
+            appended.
+        reporter: receives a line about removed Gaussians.
 
     Returns:
-        The file's path.
+        The path of the file.
 
     Raises:
-        PolarguideError: a name that ends in something else, or scores that cannot be read.
+        PolarguideError: the name has another suffix, or the scores cannot be read.
     """
     path = run.folder / "share.html" if path is None else Path(path)
     if path.suffix.lower() not in (".html", ".htm"):
         raise PolarguideError(
-            "out", expected="a name that ends in .html", found=str(path), remedy="Choose such a name."
+            "out", expected="a file name with the suffix .html", found=str(path), remedy="Change the suffix."
         )
     model = run.model
     views = run.scene.test_views + run.scene.train_views
@@ -82,7 +83,7 @@ def share(
 
 
 def _best_view(views: Sequence[View], record: Mapping[str, Any] | None, health: Health | None) -> View:
-    """The view with the highest PSNR that scores, or without them the training's own look, know of; else the first."""
+    """Return the view with the highest PSNR in the scores or the training's health check, else the first view."""
     psnr: dict[str, float | None] = {}
     if record is not None:
         psnr = {name: scores["psnr"] for name, scores in record["views"].items()}
@@ -92,11 +93,11 @@ def _best_view(views: Sequence[View], record: Mapping[str, Any] | None, health: 
 
 
 MOST_GLOSS = 16.0
-"""More would show the noise of dark surfaces."""
+"""Maximum brightening of the specular layer. More would show the noise of dark surfaces."""
 
 
 def _gloss(result: RenderResult) -> float:
-    """Times, in whole stops, that the specular layer can be brighter before 1 % of what it shows clips."""
+    """Return the factor, a power of two, that brightens the specular layer so that at most 1 % of it clips."""
     if "specular" not in result.layers:
         return 1.0
     brightest = result.layers["specular"].amax(dim=-1)[result.alpha > 0.5].flatten()

@@ -1,6 +1,7 @@
-"""A textured mesh as Wavefront OBJ, for programs that do not read glTF: geometry, material and textures as files.
+"""Export of a textured mesh as Wavefront OBJ: geometry, material and textures as files.
 
-Roughness and metalness are in the fields ``map_Pr`` and ``map_Pm`` of Clara.io's extension, which Blender reads.
+Roughness and metalness are in the fields ``map_Pr`` and ``map_Pm`` of Clara.io's extension, which Blender
+reads.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from polarguide.core.files import atomic_folder
 from polarguide.results.export.model.gltf import Pixels, Textured, encoded
 
 NAME = "model"
+"""Stem of the files."""
 _GRAY = 3
 
 
@@ -21,7 +23,8 @@ def write_obj(folder: Path, model: Textured, lines: Sequence[str], *, jpeg: bool
     """Write ``model.obj``, ``model.mtl`` and the textures ``model-color``, ``model-roughness`` and ``model-metalness``.
 
     Args:
-        folder: to write into. model: the mesh. lines: comments. jpeg: whether the color is JPEG; else PNG.
+        folder: folder to write. model: the mesh. lines: comments. jpeg: encode the color as JPEG instead of
+            PNG.
 
     Raises:
         PolarguideError: a file cannot be written.
@@ -45,11 +48,11 @@ def _material(names: dict[str, str], model: Textured) -> str:
     lines = ["newmtl surface", "Kd 1 1 1", f"map_Kd {names['color']}"]
     if lit:
         lines += [f"Ni {model.index:g}", f"map_Pr {names['roughness']}", f"map_Pm {names['metalness']}"]
-    return "\n".join([*lines, f"illum {2 if lit else 0}"]) + "\n"  # 0: the color alone, without light
+    return "\n".join([*lines, f"illum {2 if lit else 0}"]) + "\n"  # 0 means constant color.
 
 
 def _geometry(model: Textured) -> str:
-    uv = np.stack([model.uv[:, 0], 1 - model.uv[:, 1]], axis=1)  # v counts from the last row
+    uv = np.stack([model.uv[:, 0], 1 - model.uv[:, 1]], axis=1)  # In OBJ v starts at the last row.
     numbers = model.faces + 1
     lines = [f"mtllib {NAME}.mtl", "usemtl surface"]
     for word, values in (("v", model.vertices), ("vt", uv), ("vn", model.normals)):

@@ -1,4 +1,4 @@
-"""The texels of an unwrapped mesh: which place on the surface each one shows, and textures filled to their ends."""
+"""Texels of an unwrapped mesh: their positions on the surface, and filled textures."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from scipy.ndimage import distance_transform_edt
 from polarguide.core.errors import PolarguideError
 from polarguide.results.export.model.unwrap import Unwrapped
 
-_CANDIDATES = 1 << 21
-"""Pairs of triangle and texel that are looked at together: about 200 MB."""
+_CANDIDATES = 1 << 21  # pairs of triangle and texel per batch, about 200 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +21,7 @@ class Texels:
 
     Attributes:
         size: texels along the texture's side. index: [M] row times ``size`` plus column.
-        face: [M] the triangle. weights: [M, 3] of its corners, they sum to 1; single precision.
+        face: [M] triangle of each texel. weights: [M, 3] barycentric coordinates, single precision.
     """
 
     size: int
@@ -31,14 +30,14 @@ class Texels:
     weights: NDArray[np.float32]
 
     def interpolated(self, faces: NDArray[np.int64], values: NDArray[Any]) -> NDArray[np.float32]:
-        """Values [V, C] at the vertices of faces, at the texels: [M, C]."""
+        """Interpolate values [V, C] at the vertices of faces to the texels, [M, C]."""
         out = np.zeros((len(self.index), values.shape[1]), np.float32)
         for corner in range(3):
             out += self.weights[:, corner, None] * values[faces[self.face, corner]].astype(np.float32)
         return out
 
     def texture(self, values: NDArray[Any]) -> NDArray[np.float32]:
-        """A whole texture [size, size, C] of values [M, C]: beside the charts that of the nearest texel."""
+        """Return a texture [size, size, C] of values [M, C]. Texels outside the charts have the nearest value."""
         picture = np.zeros((self.size * self.size, values.shape[1]), np.float32)
         empty = np.ones(self.size * self.size, bool)
         picture[self.index] = values
@@ -55,7 +54,7 @@ def rasterized_texels(mesh: Unwrapped, size: int) -> Texels:
     Raises:
         PolarguideError: no texel lies on a triangle.
     """
-    corners = mesh.uv[mesh.faces] * size - 0.5  # the center of texel k is at k
+    corners = mesh.uv[mesh.faces] * size - 0.5  # Integers are centers of texels.
     low = np.clip(np.ceil(corners.min(axis=1)), 0, size).astype(np.int64)
     high = np.clip(np.floor(corners.max(axis=1)), -1, size - 1).astype(np.int64)
     extent = np.maximum(high - low + 1, 0)
@@ -69,10 +68,10 @@ def rasterized_texels(mesh: Unwrapped, size: int) -> Texels:
         parts.append(_inside(corners, low, extent, counts, np.arange(begin, end)))
         begin = end
     column, row, face, weights = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    index, first = np.unique(row * size + column, return_index=True)  # on a common edge: one of the two
+    index, first = np.unique(row * size + column, return_index=True)  # A texel on a common edge has one face.
     if not len(index):
         raise PolarguideError(
-            "texture", expected="texels on the triangles", found="none", remedy="Give a larger --texture."
+            "texture", expected="texels on the triangles", found="none", remedy="Choose a larger --texture."
         )
     return Texels(size, index, face[first], weights[first])
 
@@ -84,7 +83,7 @@ def _inside(
     counts: NDArray[np.int64],
     faces: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
-    """Columns, rows, faces and corner weights of the texels whose centers lie in some of the triangles."""
+    """Return columns, rows, faces and barycentric coordinates of the texels inside some of the triangles."""
     face = np.repeat(faces, counts[faces])
     number = np.arange(len(face)) - np.repeat(np.cumsum(counts[faces]) - counts[faces], counts[faces])
     column = low[face, 0] + number % np.maximum(extent[face, 0], 1)
@@ -96,7 +95,7 @@ def _inside(
         second = _cross(place - a, c - a) / area
         third = _cross(b - a, place - a) / area
     weights = np.stack([1 - second - third, second, third], axis=1)
-    inside = (weights >= -1e-9).all(axis=1)  # NaN, of triangles without area, is not
+    inside = (weights >= -1e-9).all(axis=1)  # Triangles without area have NaN.
     return column[inside], row[inside], face[inside], weights[inside].astype(np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Texture coordinates by xatlas, in a process of its own: it can neither report nor stop, and that can be ended."""
+"""Texture coordinates by xatlas in a separate process, because a running xatlas cannot be interrupted."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.progress import Reporter
 
 PADDING = 256
-"""Charts stay one texel apart in the mip map of this size, so 8 texels apart at 2,048."""
+"""Size of the mip map in which charts are one texel apart, which gives 8 texels at 2,048."""
 SLACK = 1.25
-"""How much more padding xatlas is asked for: its atlas can be larger than asked, and is scaled down then."""
+"""Factor on the requested padding, because xatlas scales an oversized atlas down."""
 SLOW = 300_000
-"""Triangles above which xatlas takes long: its time grows faster than their number."""
+"""Number of triangles above which xatlas is slow. Its time grows faster than linearly."""
 _ENTRY = "from polarguide.results.export.model.unwrap import run_xatlas; run_xatlas()"
 
 
 @dataclass(frozen=True, eq=False)
 class Unwrapped:
-    """A mesh whose vertices are split along the borders of charts.
+    """Mesh whose vertices are split along the borders of charts.
 
     Attributes:
-        source: [W] which vertex of the mesh each one was. faces: [F, 3] of these.
-        uv: [W, 2] in [0, 1]; v counts from the first row of the texture. charts: how many there are.
+        source: [W] original vertex of each vertex. faces: [F, 3] of the new vertices.
+        uv: [W, 2] in [0, 1], with v from the first row of the texture. charts: number of charts.
     """
 
     source: NDArray[np.int64]
@@ -46,34 +46,28 @@ def unwrap(
 
     Args:
         vertices: [V, 3]. faces: [F, 3]. texture: texels along its side.
-        folder: for the files that the two processes exchange. reporter: receives progress, and a warning of many
-            triangles.
+        folder: folder for exchanged files. reporter: receives progress, and a warning about many triangles.
 
     Raises:
-        PolarguideError: xatlas fails, as where memory ends.
+        PolarguideError: xatlas fails, for example because of insufficient memory.
     """
     if len(faces) > SLOW:
         reporter.warn(
-            f"xatlas may take an hour and more for {len(faces):,} triangles; --triangles {SLOW} or fewer is faster."
+            f"xatlas may take more than an hour for {len(faces):,} triangles; reduce them to --triangles {SLOW}."
         )
     task = folder / "mesh.npz"
     answer = folder / "atlas.npz"
     np.savez(task, vertices=vertices.astype(np.float32), faces=faces.astype(np.uint32), texture=texture)
     with reporter.track(f"unwrapping {len(faces):,} triangles (xatlas)"):
         command = [sys.executable, "-c", _ENTRY, str(task), str(answer)]
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
-            try:
-                _, errors = process.communicate()
-            except BaseException:
-                process.kill()
-                raise
+        process = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     if process.returncode or not answer.is_file():
-        lines = errors.decode(errors="replace").strip().splitlines()
+        lines = process.stderr.decode(errors="replace").strip().splitlines()
         raise PolarguideError(
             "xatlas",
             expected="texture coordinates",
             found=(lines or [f"exit status {process.returncode}"])[-1][:200],
-            remedy="Give fewer --triangles.",
+            remedy="Reduce --triangles.",
         )
     with np.load(answer) as atlas:
         return Unwrapped(
@@ -85,7 +79,7 @@ def unwrap(
 
 
 def run_xatlas() -> None:
-    """The process: reads the mesh from the first file that the command line names, writes the atlas to the second."""
+    """Unwrap the mesh in the first file of the command line and write the atlas to the second file."""
     xatlas = optional_import("xatlas", "a textured model")
     task, answer = sys.argv[1:3]
     with np.load(task) as mesh:
