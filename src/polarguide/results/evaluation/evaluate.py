@@ -29,10 +29,10 @@ from polarguide.results.evaluation.record import METRICS_FILE, code_digest, comm
 from polarguide.results.evaluation.scores import ErrorsByObject, ViewScores, score_view
 from polarguide.results.evaluation.target import SceneFacts, ViewTarget
 from polarguide.results.rendering.mesh import RESOLUTION, Surface, fused_surface
+from polarguide.runs.callbacks import Stopwatch
 from polarguide.runs.folder import RunConfiguration, RunLog
-from polarguide.runs.stopwatch import Stopwatch
 from polarguide.shading.result import RenderResult
-from polarguide.training.angles.fit import fit_angle
+from polarguide.training.angles.polarizers import fit_angle
 from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture, contact_sheet
 

@@ -18,10 +18,11 @@ from polarguide.gaussians.gaussians import Parameters
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.optics import reflectances_from_cosine
 from polarguide.shading.cubemap import box_mips
-from polarguide.shading.deferred import LOCAL_NOTE, REFLECTANCE, DeferredShading
+from polarguide.shading.deferred import LOCAL_NOTE, DeferredShading
 from polarguide.shading.directional import DirectionalShading, albedo_of
 from polarguide.shading.model import Light, PlainShading, ShadingModel
 from polarguide.shading.roughness import ggx_alpha, gltf_roughness
+from polarguide.shading.surface import surface_channels
 
 INDEX_NOTE = (
     "This page has one refractive index. Surfaces with another index have the same reflectance at 45 degrees."
@@ -66,12 +67,12 @@ def ply_fields(shading: ShadingModel, gaussians: Parameters) -> dict[str, Tensor
 def _(shading: DeferredShading, gaussians: Parameters) -> dict[str, Tensor]:
     """Return the blur as glTF's ``roughness``, and the ``refractive_index`` if it varies."""
     fields = ply_fields.dispatch(ShadingModel)(shading, gaussians)
+    own = surface_channels(shading.surface, gaussians)
     fields.pop("index", None)
     if fields.pop("blur", None) is not None:
-        blur = shading.blur(gaussians)
-        shown = torch.zeros_like(fields["strength"]) if blur is None else blur
-        fields["roughness"] = gltf_roughness(shown, shading.environment_resolution)
-    if shading.has_indices(gaussians):
+        blur = own["blur"][:, 0] if "blur" in own else torch.zeros_like(fields["strength"])
+        fields["roughness"] = gltf_roughness(blur, shading.environment_resolution)
+    if "index" in own:
         fields["refractive_index"] = shading.refractive_index + gaussians["index_offset"]
     return fields
 
@@ -108,33 +109,31 @@ def _(shading: PlainShading, gaussians: Parameters, light: Light) -> PageShading
 @page_shading.register
 def _(shading: DeferredShading, gaussians: Parameters, light: Light) -> PageShading | None:
     """Return harmonics, strength and texels, and the reflectance and blur of metals."""
-    has_metal = shading.has_metal(gaussians)
-    if not shading.local and (shading.rough or has_metal):
+    own = surface_channels(shading.surface, gaussians)
+    if not shading.local and (shading.rough or "metalness" in own):
         return None  # No recipe has such surfaces.
-    strength = shading.strength(gaussians)
+    strength = own["strength"][:, 0]
     notes = [LOCAL_NOTE] if shading.local else []
     index = shading.refractive_index
-    if shading.has_indices(gaussians):
-        own = index + gaussians["index_offset"].detach()
-        index = float(own.max())  # Strengths decrease and stay below 1.
-        strength = strength * _at_45_degrees(own) / _at_45_degrees(index)
+    if "index" in own:
+        indices = index + own["index"][:, 0]
+        index = float(indices.max())  # Strengths decrease and stay below 1.
+        strength = strength * _at_45_degrees(indices) / _at_45_degrees(index)
         notes.append(INDEX_NOTE)
     values = {**_harmonics(gaussians), "share": strength}
     constants: dict[str, Any] = {"blend": shading.blend, "index": index}
     if shading.local:
         values |= {"own_color": gaussians["local_dc"], "own_harmonics": gaussians["local_rest"]}
-    blur = shading.blur(gaussians)
-    if blur is not None:
-        values["blur"] = blur
+    if "blur" in own:
+        values["blur"] = own["blur"][:, 0]
         constants["mirror"] = float(ggx_alpha(torch.zeros(()), shading.environment_resolution))
-    if has_metal:
-        metalness = gaussians["metalness"].detach()[:, None]
-        values["metal"] = metalness * REFLECTANCE.values(gaussians)
+    if "metalness" in own:
+        values["metal"] = own["reflectance"]
         constants["metal"] = True
     return PageShading(
         kind="local" if shading.local else "reflection",
         values=values,
-        light=shading.light_levels(light["texels"], rough=blur is not None),
+        light=shading.light_levels(light["texels"], rough="blur" in own),
         constants=constants,
         notes=notes,
     )

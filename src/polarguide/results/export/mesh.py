@@ -30,8 +30,9 @@ from polarguide.results.export.placement import (
     with_comments,
 )
 from polarguide.results.rendering.mesh import ColoredMesh
+from polarguide.shading.gbuffer import diffuse_colors
 from polarguide.shading.model import Parameters, ShadingModel
-from polarguide.training.actions import outward_directions
+from polarguide.training.callbacks import outward_directions
 
 
 def write_mesh(
@@ -137,7 +138,7 @@ def surface_points(
     )
     normals = torch.where((normals * side).sum(dim=1, keepdim=True) < 0, -normals, normals)
     selected = {name: gaussians[name][indices] for name in (*CORE_SHAPES, *shading.parameters)}
-    return means, normals, shading.diffuse_colors(selected, -normals.contiguous())
+    return means, normals, diffuse_colors(selected, shading, -normals.contiguous())
 
 
 def write_points(
