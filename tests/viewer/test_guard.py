@@ -19,8 +19,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from polarguide.core.errors import PolarguideError
 from polarguide.viewer import Viewer, guard
-from polarguide.viewer.guard import Gate
-from polarguide.viewer.messages import LARGEST, Refused, checked_message, choice, flag, number, pair
+from polarguide.viewer.guard import LARGEST, Gate, Refused, checked_message, choice, flag, number, pair
 from polarguide.viewer.server import _listening
 
 # The viewer ignores it itself, but each test brings back the filters of before.

@@ -303,7 +303,7 @@ def demo(
 
 def _first_picture(out: Path) -> Path:
     """Write a held-out view with its layers, larger than its photograph, and return the path."""
-    layers = importlib.import_module("polarguide.visualization.layers")
+    layers = importlib.import_module("polarguide.visualization.figures")
     figures = importlib.import_module("polarguide.visualization.figures")
     run = polarguide.open_run(out)
     camera = run.scene.view(FIRST_VIEW).camera

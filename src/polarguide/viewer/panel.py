@@ -11,7 +11,7 @@ import msgspec
 
 from polarguide.capture.presentation import STOPS, Crop, Presentation, Vector
 from polarguide.core.errors import PolarguideError
-from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
+from polarguide.viewer.guard import Accepts, choice, flag, number, pair, push
 from polarguide.viewer.scenery import MEASURED, UNCHANGED, Appearance
 
 FREE_VIEW = "(free)"

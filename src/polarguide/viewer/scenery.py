@@ -23,9 +23,9 @@ from polarguide.shading.result import POLARIZED, RenderResult, polarized_layers
 from polarguide.training.loop import TrainingLoop
 from polarguide.viewer.cameras import drawn_camera, letterboxed
 from polarguide.visualization import figures
-from polarguide.visualization.figures import Picture
-from polarguide.visualization.layers import (
+from polarguide.visualization.figures import (
     RADIANCE,
+    Picture,
     depth_range,
     layer_picture,
     layer_scale,

@@ -40,8 +40,7 @@ from polarguide.runs.train import Ends, Look
 from polarguide.shading.model import ShadingModel
 from polarguide.training.loop import TrainingLoop
 from polarguide.viewer.cameras import Photograph, photographs
-from polarguide.viewer.guard import Gate, guarded
-from polarguide.viewer.messages import Accepts, checked_message
+from polarguide.viewer.guard import Accepts, Gate, checked_message, guarded
 from polarguide.viewer.painting import Materials, Paintable, kinds_of
 from polarguide.viewer.panel import KINDS, PanelOptions
 from polarguide.viewer.scenery import UNCHANGED, Scenery, run_scenery, training_scenery

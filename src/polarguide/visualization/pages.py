@@ -90,7 +90,6 @@ LAYERS: dict[str, str] = {
 }
 """Layers of the report in order: key and label."""
 LOSSLESS = ("normal",)
-"""Layers whose pictures are PNG."""
 JPEG_QUALITY = 90
 
 

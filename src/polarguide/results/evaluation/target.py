@@ -102,7 +102,6 @@ def _numbers(view: View) -> Tensor | None:
 
 
 def _on_black(views: Sequence[View], masks: dict[str, Tensor]) -> bool:
-    """Return True if the photographs are black outside the masks."""
     black = total = 0
     for view in views:
         beyond = outside(masks[view.name]) & ~view.invalid
@@ -112,7 +111,6 @@ def _on_black(views: Sequence[View], masks: dict[str, Tensor]) -> bool:
 
 
 def _partial_truth_warnings(views: Sequence[View]) -> list[str]:
-    """Return a warning if only some test views have a kind of ground truth."""
     counts = {key: sum(getattr(view.ground_truth, key, None) is not None for view in views) for key in KNOWN}
     partly = [f"{KNOWN[key]} of {count}" for key, count in counts.items() if 0 < count < len(views)]
     text = (

@@ -200,7 +200,6 @@ def rewrite_splats(path: Path, ply: Path, placement: Placement, mask: Tensor, li
 
 
 IMAGES = "images"
-"""Folder of the exported images."""
 SUFFIX = ".png"
 """Suffix of the exported images."""
 # nerfstudio uses OpenGL axes: the camera looks along -z, and y is up.

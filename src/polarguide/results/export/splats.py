@@ -1,10 +1,14 @@
-"""Export of splats in two compressed formats, from the PLY of a run: Niantic's SPZ and PlayCanvas' SOG.
+"""Export of splats from the PLY of a run: Niantic's SPZ, PlayCanvas' SOG, and glTF.
 
 SOG is a ZIP file of pictures. Its specification, version 2, is at
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog
 
 We write SOG ourselves, because GaussForge 0.6 writes 65,000 Gaussians in eight seconds but did not finish
 88,623 in six minutes.
+
+glTF uses the extension ``KHR_gaussian_splatting`` (kernel ``ellipse``). It stores linear scales, opacities in [0, 1], quaternions (x, y, z, w) and the harmonics of 3DGS.
+Its ``colorSpace`` states the encoding of colors, but readers ignore it. So there is one file for each kind of
+reader.
 """
 
 from __future__ import annotations
@@ -14,7 +18,7 @@ import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -25,7 +29,8 @@ from torch import Tensor
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import atomic, write_whole
 from polarguide.gaussians.ply import read_ply, write_ply
-from polarguide.results.export.share import curve_places
+from polarguide.results.export.glb import Binary
+from polarguide.results.export.web_page import curve_places
 
 # Signs of the harmonics of degree 1 to 3, in the order of a PLY, after a half turn about x.
 _HALF_TURN_HARMONICS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
@@ -72,7 +77,6 @@ def _half_turned(ply: Path) -> Path:
 
 
 CODES = 256
-"""Number of values of a code."""
 PALETTE_ROW = 64
 """Number of palette entries per row of a picture."""
 LARGEST_PALETTE = 8192
@@ -80,7 +84,6 @@ LARGEST_PALETTE = 8192
 ROUNDS = 8
 """Number of iterations of Lloyd's algorithm."""
 SEED = 0
-"""Seed of the initial palette."""
 Pixels = NDArray[np.uint8]
 
 
@@ -233,3 +236,45 @@ def _morton_order(means: Tensor) -> Tensor:
     # Ranks instead of positions: distant Gaussians would compress all others into one cell.
     ranks = means.argsort(dim=0).argsort(dim=0)
     return curve_places((ranks * 1024) // max(1, len(means))).argsort(stable=True)
+
+
+EXTENSION = "KHR_gaussian_splatting"
+Encoding = Literal["srgb", "linear"]
+COLOR_SPACES: dict[Encoding, str] = {"srgb": "srgb_rec709_display", "linear": "lin_rec709_display"}
+"""Value of ``colorSpace`` by encoding.
+
+Babylon and PlayCanvas blend encoded colors; three.js blends linear colors.
+"""
+
+
+def write_splat_glb(path: Path, ply: Path, asset: dict[str, Any], encoding: Encoding) -> None:
+    """Convert a PLY of Gaussians (+y up) without our own fields.
+
+    Args:
+        path: the file to write. ply: file from ``write_run_ply``. asset: glTF asset record.
+        encoding: encoding of the colors in the PLY.
+
+    Raises:
+        PolarguideError: the file cannot be written.
+    """
+    gaussians = read_ply(ply)
+    fields = {
+        "ROTATION": torch.nn.functional.normalize(gaussians["quaternions"], dim=1)[:, [1, 2, 3, 0]],
+        "SCALE": gaussians["log_scales"].exp(),
+        "OPACITY": torch.sigmoid(gaussians["opacity_logits"]),
+    }
+    harmonics = torch.cat((gaussians["sh_dc"], gaussians["sh_rest"]), dim=1)
+    for degree in range(4):
+        for k in range(2 * degree + 1):
+            fields[f"SH_DEGREE_{degree}_COEF_{k}"] = harmonics[:, degree * degree + k]
+    binary = Binary()
+    attributes = {"POSITION": binary.array(gaussians["means"].numpy(), bounds=True)}
+    attributes |= {f"{EXTENSION}:{name}": binary.array(values.numpy()) for name, values in fields.items()}
+    about = {
+        "kernel": "ellipse",
+        "colorSpace": COLOR_SPACES[encoding],
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    primitive = {"mode": 0, "attributes": attributes, "extensions": {EXTENSION: about}}
+    binary.write(path, asset, primitive, {"extensionsUsed": [EXTENSION]})

@@ -17,9 +17,7 @@ from polarguide.gaussians.ply import read_ply
 from polarguide.results.export.model.gltf import Textured, encoded
 
 ROOT = "/model"
-"""Path of the root prim."""
 WHAT = "a USDZ package"
-"""Name of the feature in messages about missing packages."""
 
 
 def write_usdz(path: Path, model: Textured, about: dict[str, Any], *, jpeg: bool) -> None:
@@ -56,7 +54,6 @@ def write_usdz(path: Path, model: Textured, about: dict[str, Any], *, jpeg: bool
 
 
 def _bind(stage: Any, mesh: Any, model: Textured, folder: Path, *, jpeg: bool) -> None:
-    """Create the material of a mesh, with its textures as files in the folder."""
     shade = _module("UsdShade")
     types = _module("Sdf").ValueTypeNames
     material = shade.Material.Define(stage, f"{ROOT}/material")

@@ -29,7 +29,6 @@ LAB: Floats = np.array([
     (50.63, 51.28, -14.12), (49.57, -29.71, -28.32), (95.19, -1.03, 2.93), (81.29, -0.57, 0.44),
     (66.89, -0.75, -0.06), (50.76, -0.13, 0.14), (35.63, -0.46, -0.48), (20.64, 0.07, -0.46),
 ])  # fmt: skip
-"""CIELAB of the patches under D50."""
 _ORDERS = [[(begin + step * k) % 4 for k in range(4)] for begin in range(4) for step in (1, -1)]
 """The eight ways to go around four corners."""
 COLUMNS = 6

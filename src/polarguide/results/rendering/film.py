@@ -23,8 +23,7 @@ from polarguide.results.rendering.subject import part_shown, subject_of
 from polarguide.runs.opened import OpenedRun, checked_layers
 from polarguide.shading.result import POLARIZED
 from polarguide.visualization import figures
-from polarguide.visualization.figures import Picture
-from polarguide.visualization.layers import layer_picture
+from polarguide.visualization.figures import Picture, layer_picture
 
 
 def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: float) -> int:

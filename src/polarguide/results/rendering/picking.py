@@ -94,7 +94,6 @@ def photograph_color(view: View, x: float, y: float) -> Tensor:
 
 
 def _patch(picture: Tensor, row: int, column: int) -> Tensor:
-    """Return the pixels [h, w, ...] around a pixel."""
     top = max(0, row - PATCH)
     left = max(0, column - PATCH)
     return picture[top : row + PATCH + 1, left : column + PATCH + 1]

@@ -24,10 +24,10 @@ from polarguide.runs.model import Within
 from polarguide.runs.opened import OpenedRun, checked_layers
 from polarguide.shading.result import POLARIZED, RenderResult
 from polarguide.visualization import figures
-from polarguide.visualization.figures import contact_sheet
-from polarguide.visualization.layers import (
+from polarguide.visualization.figures import (
     Depths,
     Picture,
+    contact_sheet,
     depth_range,
     layer_picture,
     layer_scale,

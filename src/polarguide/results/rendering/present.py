@@ -43,7 +43,6 @@ from polarguide.runs.folder import CONFIGURATION
 from polarguide.runs.opened import OpenedRun
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-"""Directions of named axes."""
 
 
 def present(

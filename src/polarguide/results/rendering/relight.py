@@ -30,7 +30,6 @@ from polarguide.shading.cubemap import cubemap_lookup, texel_directions
 from polarguide.shading.model import RadianceCubemap, ShadingModel, mirrored
 
 LARGEST = 8192 * 4096
-"""Maximum number of pixels of a panorama."""
 RELIT_RESOLUTION = 128
 """Texels along the sides of a cubemap made from a panorama or by rotation."""
 

@@ -18,9 +18,8 @@ from polarguide.core.system import free_memory
 from polarguide.results.export.model.bake import Baked, ColorSource, bake
 from polarguide.results.export.model.gltf import Textured, color_pixels, linear_pixels
 from polarguide.results.export.model.irradiance import WHAT, Surroundings, arriving_light, delit, irradiance
-from polarguide.results.export.model.subject import SurfaceView, subject_surface
-from polarguide.results.export.model.texels import Texels, rasterized_texels
-from polarguide.results.export.model.unwrap import Unwrapped, unwrap
+from polarguide.results.export.model.topology import SurfaceView, subject_surface
+from polarguide.results.export.model.unwrap import Texels, Unwrapped, rasterized_texels, unwrap
 from polarguide.results.export.placement import Placement
 from polarguide.results.rendering.mesh import ColoredMesh, Surface, fused_surface, painted
 from polarguide.results.rendering.relight import mirrored_light, needs_radiance
@@ -35,7 +34,6 @@ SOURCES: dict[BaseColor, ColorSource] = {
     "photographs": "photograph",
     "picture": "final",
 }
-"""Layer that each kind of base color averages."""
 BASE_COLORS: dict[BaseColor, str] = {
     "delit": "highlights removed, shading divided by the learned light, up to one brightness factor",
     "diffuse": "highlights removed, shading baked in",
@@ -213,7 +211,6 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _drawn(mesh: Unwrapped) -> NDArray[np.int64]:
-    """Return the faces with three different vertices."""
     a, b, c = mesh.faces.T
     return mesh.faces[(a != b) & (b != c) & (c != a)]
 

@@ -40,9 +40,7 @@ FLOOR = 0.05
 """Lower bound of irradiance relative to its mean over the mesh. Division by less would amplify noise."""
 
 WHAT = "--base-color delit"
-"""Option that needs embreex."""
 Radiance = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Function that returns radiance [N, 3] for unit directions [N, 3]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,16 +1,34 @@
-"""Cleaning and simplification of a triangle mesh to a manifold with counted boundary edges."""
+"""Clean mesh of a run's subject: a simplified manifold with counted boundary edges."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.core.errors import optional_import
-from polarguide.results.rendering.mesh import NoSurfaceError, Surface, face_pieces, largest_pieces
+from polarguide.core.files import write_whole
+from polarguide.core.options import ModelOptions
+from polarguide.core.progress import Reporter
+from polarguide.geometry.camera import Camera
+from polarguide.results.rendering.mesh import (
+    Box,
+    ColoredMesh,
+    DepthSamples,
+    NoSurfaceError,
+    Surface,
+    face_pieces,
+    fused_surface,
+    largest_pieces,
+)
+from polarguide.results.rendering.subject import Inside
+from polarguide.runs.opened import OpenedRun
+from polarguide.shading.result import RenderResult
 
 ISLAND = 0.01
 """Share of the largest piece's faces below which a piece is removed."""
@@ -188,3 +206,50 @@ def vertex_normals(vertices: Places, faces: Faces) -> Places:
     )
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.where(length > 0, total / np.maximum(length, 1e-300), [[0.0, 0.0, 1.0]])
+
+
+SurfaceView = Callable[[Camera], RenderResult]
+"""Function that renders the surface of a view."""
+
+
+def subject_surface(
+    run: OpenedRun,
+    surface_view: SurfaceView,
+    inside: Inside | None,
+    options: ModelOptions,
+    resolution: int,
+    reporter: Reporter,
+) -> tuple[Surface, list[tuple[Camera, DepthSamples]], Box]:
+    """Return the simplified surface of the subject, the depth samples of each camera, and the grid of the fusion.
+
+    The reporter receives the counts of the surface.
+
+    Raises:
+        PolarguideError: there is no surface.
+    """
+    surface, views, box = fused_surface(run.cameras, surface_view, resolution=resolution)
+    if inside is not None:
+        surface = ColoredMesh(surface, surface.vertices).within(inside(surface.vertices)).surface
+    surface = simplified(surface, options.triangles, closed=options.close_bottom)
+    counts = topology(surface.faces)
+    reporter.say(
+        f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, {counts.pieces} pieces; "
+        f"{counts.boundary_edges:,} boundary edges, {counts.non_manifold_edges} non-manifold edges"
+    )
+    return surface, views, box
+
+
+def write_stl(path: Path, vertices: Places, faces: NDArray[np.int64], comment: str) -> None:
+    """Write a binary STL file.
+
+    Args:
+        path: the file. vertices: [V, 3] in the axes of the file. faces: [F, 3].
+        comment: text for the header, of which 80 characters are kept. It must not begin with "solid".
+
+    Raises:
+        PolarguideError: the file cannot be written.
+    """
+    trimesh = optional_import("trimesh", "--format stl")
+    mesh = trimesh.Trimesh(vertices, faces, process=False, validate=False)
+    header = comment.encode("ascii", "replace")[:80].ljust(80)
+    write_whole(path, header + mesh.export(file_type="stl")[80:])
