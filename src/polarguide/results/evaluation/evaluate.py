@@ -44,7 +44,6 @@ from polarguide.visualization import figures
 from polarguide.visualization.figures import Picture, contact_sheet
 
 ERRORS_FILE = "errors.png"
-"""File name of the error sheet in a run folder."""
 MOST_VIEWS = 8
 """Maximum number of views in the error sheet."""
 PICTURE_HIGH = 0.25
@@ -54,7 +53,6 @@ NORMAL_HIGH = 45.0
 BRIGHTEST = (0.05, 0.5)
 """Bounds of the DoLP that a picture of polarization shows at full brightness."""
 MAP = "inferno"
-"""Color map of the heat maps."""
 NOT_COUNTED = 90
 """Gray level of pixels outside the mask of a score."""
 STRIPES = 48
@@ -268,9 +266,7 @@ MINIMUM_SECONDS = 1.5
 MOST_SECONDS = 40.0
 """Expected duration in seconds above which views are timed once and not all of them."""
 NO_PEAK = "the process used more memory before scoring"
-"""Reason for a missing peak memory."""
 OTHER_WORK = "other work ran on the machine at the same time"
-"""Reason for a missing time."""
 
 
 class ScoredModel(Protocol):
@@ -341,8 +337,7 @@ def evaluate(
 
     Returns:
         The record in ``metrics.json``: means over the views, ``views`` by name, ``objects``, ``materials``
-        and
-        ``provenance``.
+        and ``provenance``.
 
     Raises:
         PolarguideError: the scene cannot be read or has no test views.
@@ -439,7 +434,6 @@ def _score(
     by_object: ErrorsByObject,
     sheet: ErrorSheet,
 ) -> ViewScores:
-    """Score a view and add its errors to the sums by object and to the sheet."""
     # The target comes first: a later copy to the device would wait for the rendering.
     target = ViewTarget.of_view(view, facts, run.model.device).with_coverage(seen)
     result = run.model.render(view.camera, depth=True, surface=True)
@@ -464,7 +458,6 @@ def _peak_memory(before: float | None) -> dict[str, Any]:
 
 
 def _fuse_depths(run: ScoredRun) -> Surface:
-    """Fuse the depth maps of all views into a surface."""
     surface, _, _ = fused_surface(
         run.cameras, lambda camera: run.model.render(camera, depth=True, surface=True), resolution=RESOLUTION
     )

@@ -31,7 +31,6 @@ from polarguide.results.evaluation.target import ViewTarget
 HIGHEST_PSNR = 100.0
 """Upper bound of a recorded PSNR. JSON has no infinity for equal pictures."""
 MESH_LABEL = "mesh F-score 1 %"
-"""Label of the F-score of a mesh."""
 
 
 def _comparison(compare: Callable[..., Tensor], layer: str, *known: str) -> Measure:

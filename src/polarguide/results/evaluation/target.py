@@ -102,7 +102,6 @@ def _numbers(view: View) -> Tensor | None:
 
 
 def _on_black(views: Sequence[View], masks: dict[str, Tensor]) -> bool:
-    """Return True if the photographs are black outside the masks."""
     black = total = 0
     for view in views:
         beyond = outside(masks[view.name]) & ~view.invalid
@@ -112,7 +111,6 @@ def _on_black(views: Sequence[View], masks: dict[str, Tensor]) -> bool:
 
 
 def _partial_truth_warnings(views: Sequence[View]) -> list[str]:
-    """Return a warning if only some test views have a kind of ground truth."""
     counts = {key: sum(getattr(view.ground_truth, key, None) is not None for view in views) for key in KNOWN}
     partly = [f"{KNOWN[key]} of {count}" for key, count in counts.items() if 0 < count < len(views)]
     text = (
@@ -123,7 +121,7 @@ def _partial_truth_warnings(views: Sequence[View]) -> list[str]:
 
 
 def _object_warnings(scene: Scene, views: Sequence[View]) -> list[str]:
-    """Return warnings about object numbers without an entry in the table of objects, and about unspecified materials."""
+    """Return warnings about object numbers without a table entry, and about unspecified materials."""
     if not scene.objects:
         return [
             f"The ground truth has object numbers (objid), but {scene.root / 'scene.json'} has no table of objects "
@@ -141,7 +139,8 @@ def _object_warnings(scene: Scene, views: Sequence[View]) -> list[str]:
     if unlisted:
         sentences.append(
             f"{scene.root / 'scene.json'} (objects) does not list "
-            f"{listed([str(number) for number in sorted(unlisted)])}, although gt/{unlisted[min(unlisted)]}.npz contains it (objid): in no error by object or material."
+            f"{listed([str(number) for number in sorted(unlisted)])}, although gt/{unlisted[min(unlisted)]}.npz "
+            "contains it (objid): in no error by object or material."
         )
     unclear = [item.name for item in scene.objects if item.foreground and item.material.kind is None]
     if unclear:
