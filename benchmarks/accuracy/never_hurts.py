@@ -169,7 +169,7 @@ def bad_views(scene: str, rows: Runs, recipe: str) -> Iterator[str]:
     """Views with haze, with fog outside the mask, or far under plain splatting, a line each."""
     for seed, run in rows[recipe].items():
         for view, scores in run["views"].items():
-            for key, most in (("haze", MOST_HAZE), ("alpha_outside", MOST_OUTSIDE)):
+            for key, most in (("haze_alpha", MOST_HAZE), ("alpha_outside", MOST_OUTSIDE)):
                 if (scores.get(key) or 0.0) > most:
                     yield f"{scene}, seed {seed}, {view}: {BY_KEY[key].label} {100 * scores[key]:.1f} %"
             peers = [

@@ -95,7 +95,7 @@ def test_eval_writes_a_valid_record(
     for key in (
         "stokes_error",
         "depth_error_median_percent",
-        "haze",
+        "haze_alpha",
         "depth_beyond",
         "mesh_fscore_1",
         "specular_psnr_dielectric",

@@ -264,11 +264,6 @@ def depth_error_percent(pred: Tensor, true: Tensor, keep: Selection, extent: flo
     return 100 / extent * _median((keep.pick(pred) - keep.pick(true)).abs())
 
 
-def haze_share(in_front: Tensor, keep: Selection) -> Tensor:
-    """Compute the share of pixels with at least half of their alpha [H, W] in front; NaN without a pixel to score."""
-    return (keep.pick(in_front) >= 0.5).to(torch.float64).mean()
-
-
 def beyond_share(pred: Tensor, true: Tensor, keep: Selection) -> Tensor:
     """Compute the share of pixels with a depth [H, W] behind the true surface; NaN without a pixel to score.
 
