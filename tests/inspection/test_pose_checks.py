@@ -13,7 +13,7 @@ from captures import write_scene
 from glossy_ball import camera_at
 
 from polarguide.geometry.camera import Camera
-from polarguide.inspection import inspect
+from polarguide.inspection import inspect, view_checks
 from polarguide.inspection.capture import Capture, read_capture
 from polarguide.inspection.inspect import PairError, _fundamental, _pair_error, epipolar_errors, view_errors
 
@@ -140,3 +140,36 @@ def test_a_turned_camera_of_the_demo_stands_out(whole_demo) -> None:
         views.append(dataclasses.replace(view, camera=camera))
     after = view_errors(epipolar_errors(dataclasses.replace(capture, views=tuple(views))))
     assert name not in after or after[name] > 2.5 * errors[name]
+
+
+def turned_round(camera: Camera) -> Camera:
+    """Turn a camera by 180 degrees about its vertical axis."""
+    turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
+    return dataclasses.replace(camera, rotation=turn @ camera.rotation, translation=turn @ camera.translation)
+
+
+def test_held_out_views_that_look_elsewhere_are_named(whole_demo) -> None:
+    capture = read_capture(whole_demo)
+    usual = view_checks.held_out_check(capture)
+    name = capture.test_names[-1]
+    turned = tuple(
+        dataclasses.replace(view, camera=turned_round(view.camera)) if view.name == name else view
+        for view in capture.views
+    )
+    check = view_checks.held_out_check(dataclasses.replace(capture, views=turned))
+    assert check.verdict == "warning"
+    assert check.views[0] == name
+    assert check.figures["unseen"][name] > 0.5 > usual.figures["unseen"][name]
+
+
+def test_held_out_views_between_training_views_are_fine(whole_demo) -> None:
+    capture = read_capture(whole_demo)
+    middle = sorted(view_checks.held_out_check(capture).figures["unseen"].items(), key=lambda item: item[1])[
+        0
+    ][0]
+    check = view_checks.held_out_check(dataclasses.replace(capture, test_names=(middle,)))
+    assert (check.verdict, check.views) == ("ok", ())
+
+
+def test_without_held_out_views_there_is_nothing_to_judge(posed) -> None:
+    assert view_checks.held_out_check(dataclasses.replace(posed, test_names=())).verdict == "n/a"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,14 @@ from polarguide.capture.layout import CaptureFiles, find_layout, select_views
 from polarguide.capture.metadata import (
     Origin,
     applied_calibration,
+    held_out,
     indices_of,
     keeps_gains,
     origin_of,
     refractive_index_of,
 )
 from polarguide.capture.point_exposures import PointExposures
-from polarguide.capture.scene import read_views
+from polarguide.capture.scene import chosen_views, read_views
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.view_reader import StoredViews
 from polarguide.core.files import read_file
@@ -89,6 +91,7 @@ class Capture:
         digest: SHA-256 over the stored pictures.
         origin: kind of files that ``prepare`` developed.
         exposures: exposures of the views by shared points, or None.
+        test_names: names of the held-out views.
         keeps_gains: True for scenes of ``prepare --gains none``.
     """
 
@@ -107,6 +110,7 @@ class Capture:
     origin: Origin = "other"
     exposures: PointExposures | None = None
     keeps_gains: bool = False
+    test_names: tuple[str, ...] = ()
 
     @property
     def four(self) -> bool:
@@ -169,7 +173,16 @@ def read_capture(
         origin=origin_of(metadata, text),
         exposures=stored.exposures,
         keeps_gains=keeps_gains(metadata, text),
+        test_names=_test_names(root / "split.json", names, model),
     )
+
+
+def _test_names(path: Path, names: Sequence[str], model: ColmapModel | None) -> tuple[str, ...]:
+    """Return the names of the views that a training holds out by default."""
+    if path.exists():
+        return held_out(path, read_file(path, largest=LARGEST_RECORD), list(names))
+    posed = frozenset(() if model is None else model.names)
+    return chosen_views({name: model.camera(name) for name in names if model and name in posed}, "directions")
 
 
 def _fitting_factor(layout: CaptureFiles, name: str) -> int:

@@ -56,7 +56,7 @@ from polarguide.inspection.shots import (
     pictures_check,
     shot_checks,
 )
-from polarguide.inspection.view_checks import lens_check, view_exposure_check
+from polarguide.inspection.view_checks import held_out_check, lens_check, view_exposure_check
 from polarguide.raster import Backend
 
 RUN_FOLDER = "short_run"
@@ -336,7 +336,7 @@ def inspect_scene(
     checks += [] if calibrated is None else [calibrated]
     checks.append(view_exposure_check(capture))
     with reporter.track("matching features", 1):
-        checks += [pose_check(capture), lens_check(capture), coverage_check(capture)]
+        checks += [pose_check(capture), lens_check(capture), coverage_check(capture), held_out_check(capture)]
     angles, pixels = _angles(capture, out, settings, index, pairing or 0, backend, reporter)
     angles = with_noise(angles, measurements)
     checks += [*angle_checks(angles), dielectric_check(measurements, pixels, index)]
@@ -355,7 +355,7 @@ def _shots(
     """Return the checks of a capture with pictures at other angles, and the findings on their polarizers."""
     checks = [pictures_check(capture), *agreement_checks(capture), *light_checks(capture, measurements)]
     with reporter.track("matching features", 1):
-        checks += [pose_check(capture), lens_check(capture), coverage_check(capture)]
+        checks += [pose_check(capture), lens_check(capture), coverage_check(capture), held_out_check(capture)]
     needed = "The angles are checked by a short training, which"
     if len(capture.posed) < PoseLimits.fewest_to_train:
         findings = ShotFindings(why=f"{needed} needs {PoseLimits.fewest_to_train} views with a pose.")

@@ -53,6 +53,7 @@ TITLES = {
     "poses": "Pose quality",
     "focal_lengths": "Focal lengths",
     "coverage": "Coverage",
+    "held_out": "Surroundings of the held-out views",
     "angle_order": "Order of the angles",
     "handedness": "Sense of the angles",
     "zero_offset": "Zero of the angles",

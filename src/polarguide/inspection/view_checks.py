@@ -6,16 +6,22 @@ import math
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator
 from scipy.optimize import least_squares
+from scipy.spatial import QhullError
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from polarguide.capture.angle_evidence import TO_DEVIATION
 from polarguide.capture.colmap.model import ColmapModel
 from polarguide.capture.point_exposures import significant
 from polarguide.capture.view import listed
+from polarguide.geometry.camera import Camera, seen_at
 from polarguide.inspection.capture import Capture
 from polarguide.inspection.settings import Check, first_outcome
+from polarguide.results.evaluation.coverage import Coverage, DepthMap
 
 
 class ViewLimits:
@@ -27,12 +33,18 @@ class ViewLimits:
             0.25 degrees.
         focal_wrong: the same for the verdict "wrong".
         step: step of camera exposures in stops; with a larger error, equal exposures are not confirmed.
+        unseen: share of a held-out view without a training view of the same content, above which it is named.
+        cells: number of cells across a picture in which content is compared.
+        most: number of points, about, that give the depths of these cells.
     """
 
     fewest = 50
     focal_differs = 0.01
     focal_wrong = 0.05
     step = 1 / 3
+    unseen = 0.1
+    cells = 64
+    most = 2000
 
 
 def view_exposure_check(capture: Capture) -> Check:
@@ -74,6 +86,59 @@ def view_exposure_check(capture: Capture) -> Check:
         (True, "ok", f"Shared points are equally bright in all views ({precision}).", ""),
     )
     return Check("view_exposure", *outcome, tuple(names[k] for k in strongest), figures)
+
+
+def held_out_check(capture: Capture) -> Check:
+    """Check if training views show what the held-out views show.
+
+    The points of the model give the depth of each cell of a picture. Cells outside their convex hull show background.
+    """
+    cameras = {view.name: camera for view, camera in capture.cameras}
+    tests = [name for name in capture.test_names if name in cameras]
+    if capture.model is None or not tests:
+        return Check("held_out", "n/a", "No held-out view has a pose.")
+    points = capture.model.points.double()
+    points = points[:: max(1, len(points) // ViewLimits.most)]
+    maps = {name: _point_depths(camera, points) for name, camera in cameras.items()}
+    coverage = Coverage({name: maps[name] for name in tests})
+    for name in maps.keys() - set(tests):
+        coverage.add(maps[name])
+    shares = {name: 1 - float(seen.double().mean()) for name, seen in coverage.seen.items()}
+    named = sorted(
+        (name for name in tests if shares[name] > ViewLimits.unseen), key=lambda name: -shares[name]
+    )
+    mean = sum(shares.values()) / len(shares)
+    finding = f"Training views show {1 - mean:.0%} of the content of {len(tests)} held-out views."
+    outcome = first_outcome(
+        (not named, "ok", finding, ""),
+        (
+            True,
+            "warning",
+            f"{finding} They do not show much of {listed([f'{name} ({shares[name]:.0%})' for name in named])}.",
+            "Scores of these views measure a guess: compare the scores of seen pixels. Next time, add a low ring of "
+            "views that shows the surroundings.",
+        ),
+    )
+    return Check("held_out", *outcome, tuple(named), {"unseen": shares})
+
+
+def _point_depths(camera: Camera, points: Tensor) -> DepthMap:
+    """Return the depths of the cells of a picture, interpolated between the points [M, 3] in it."""
+    cells = camera.downscaled(max(1, camera.width // ViewLimits.cells))
+    _, depth, inside = seen_at(points - cells.center, cells)
+    map_of_background = DepthMap(
+        cells, torch.full((cells.height, cells.width), torch.inf, dtype=torch.float64)
+    )
+    local = cells.to_camera(points[inside] - cells.center).numpy()
+    if len(local) < 3:
+        return map_of_background
+    places = local[:, :2] / local[:, 2:] * (cells.fx, cells.fy) + (cells.cx, cells.cy)
+    rows, columns = np.mgrid[: cells.height, : cells.width] + 0.5
+    try:
+        inverse = LinearNDInterpolator(places, 1 / depth[inside].numpy(), fill_value=0.0)(columns, rows)
+    except QhullError:  # all points on a line
+        return map_of_background
+    return DepthMap(cells, torch.from_numpy(inverse).reciprocal())
 
 
 def lens_check(capture: Capture) -> Check:
