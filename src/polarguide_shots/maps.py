@@ -166,7 +166,7 @@ def estimated_noise(intensities: Any, usable: NDArray[np.bool_], step: float) ->
 
     Args:
         intensities: four arrays of one shape, by angle, of cells or of pixels.
-        usable: mask in this shape of samples that are neither dark nor saturated.
+        usable: mask in this shape of samples that are not dark or saturated.
         step: one stored value as a share of full scale, which bounds the noise from below.
     """
     chosen = np.flatnonzero(usable)

@@ -179,7 +179,7 @@ def _subset(read: Shots, codes: NDArray[Any]) -> Shots:
 
 
 def require_no_order(calibration: Calibration, name: str) -> None:
-    """Check that a calibration has neither gains nor an order, which apply to 0, 45, 90 and 135 degrees only.
+    """Check that a calibration has no gains and no order, which apply to 0, 45, 90 and 135 degrees only.
 
     Raises:
         PolarguideError: the calibration has gains or an order.

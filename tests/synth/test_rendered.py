@@ -201,7 +201,7 @@ SURFACES = {
 def test_material_truth_is_what_mitsuba_renders_with(
     variant: Variant, camera: Camera, tmp_path: Path
 ) -> None:
-    """Of the dielectrics, Mitsuba's own diffuse lobe, less its two passages through the coat at normal incidence."""
+    """The reference for dielectrics is Mitsuba's diffuse lobe without two passages through the coat."""
     if variant.note:
         pytest.skip("a sampled spectrum has no exact colors")
     built = build_scene(parse_scene(SURFACES, "surfaces", folder=tmp_path), tmp_path, variant)
@@ -244,7 +244,7 @@ def test_material_truth_is_what_mitsuba_renders_with(
 
 
 def test_base_color_is_the_mean_of_each_pixel(ball: BuiltScene, camera: Camera) -> None:
-    """Of what shows an object: also where the ball ends within the pixel, and nowhere else."""
+    """The mean includes only the part of the pixel that shows the ball."""
     albedo = ground_truth_maps(ball, camera)["albedo"].astype(float)
     drawn = albedo.any(axis=-1)
     np.testing.assert_allclose(albedo[drawn], [[0.6, 0.3, 0.15]] * drawn.sum(), atol=1e-3)

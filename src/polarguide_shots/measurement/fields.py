@@ -1,4 +1,4 @@
-"""The fields of the table, and the limits that a file sets to them."""
+"""Fields of the table, and limits files."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.records import read_record
 
 FORMAT = 2
-"""Version of the table. It grows whenever a field changes its name, place or meaning, or is added."""
+"""Version of the table. Any change of the name, order or meaning of fields increases it."""
 PERCENTILES = (1, 5, 50, 95, 99)
+"""Percentiles of S0 and DoLP."""
 DIFFERENCE_PERCENTILE = 99
+"""Percentile of absolute differences."""
 Value = int | float | str | None
 
 Status = Literal["measured", "within", "beyond", "unread"]
@@ -25,13 +27,13 @@ Status = Literal["measured", "within", "beyond", "unread"]
 
 @dataclass(frozen=True)
 class Field:
-    """One field.
+    """A field of the table.
 
     Attributes:
-        key: its name.
-        unit: unit of its numbers; empty where it has none.
-        about: what it says.
-        bounded: whether a limits file may bound it.
+        key: name.
+        unit: unit of the numbers; empty without a unit.
+        about: description.
+        bounded: True if a limits file may bound the field.
     """
 
     key: str
@@ -63,20 +65,20 @@ def _difference(key: str, unit: str, what: str, mean: str, more: str = "") -> tu
 
 FIELDS = (
     Field("shot", "", "name of the shot", False),
-    Field("files", "", "paths of its files, separated by semicolons", False),
-    Field("taken", "", "when the last of its files was written, UTC; empty of a shot without files", False),
-    Field("region", "", "name of the region; empty where the shot could not be read", False),
+    Field("files", "", "paths of the files, separated by semicolons", False),
+    Field("taken", "", "time of the last change of the files, UTC; empty for a shot without files", False),
+    Field("region", "", "name of the region; empty for a shot that could not be read", False),
     Field("x", "pixels", "left column of the region", False),
     Field("y", "pixels", "top row of the region", False),
     Field("width", "pixels", "of the region", False),
     Field("height", "pixels", "of the region", False),
-    Field("status", "", "measured (nothing bounds it), within, beyond (a limit), or unread", False),
-    Field("why", "", "the limits that it is beyond, or why the shot could not be read", False),
+    Field("status", "", "measured (without a limit), within, beyond (a limit), or unread", False),
+    Field("why", "", "the exceeded limits, or the reason why the shot could not be read", False),
     Field("pixels", "pixels", "in the region"),
-    Field("usable", "pixels", "that have an angle: no reason against them"),
+    Field("usable", "pixels", "with a valid angle"),
     Field("noise", "pixels", "whose DoLP is not above its noise"),
-    Field("dark", "pixels", "without light to be told from the noise"),
-    Field("saturated", "pixels", "made from a sample at full scale"),
+    Field("dark", "pixels", "whose light is not above the noise"),
+    Field("saturated", "pixels", "with a sample at full scale"),
     Field("masked", "pixels", "marked as invalid, or outside of the mask"),
     Field("usable_share", "", "usable / pixels"),
     *_spread("s0", "full scale", "S0 (at most 2) over pixels that are usable or have the reason noise"),
@@ -95,32 +97,32 @@ FIELDS = (
     *_difference("dolp", "", "debiased DoLP", "mean"),
     *_difference("aolp", "degrees", "AoLP", "circular mean", ", -90 to 90"),
 )
-"""In the order of the columns. Without a value (no pixel for it, no reference) a cell is empty, in JSON null."""
+"""Fields in the order of the columns. A missing value is an empty cell, in JSON null."""
 KEYS = tuple(field.key for field in FIELDS)
+"""Names of the fields."""
 BOUNDED = tuple(field.key for field in FIELDS if field.bounded)
+"""Names of the fields that a limits file may bound."""
 COMPARED = KEYS[KEYS.index("compared") :]
-"""Those that need a reference."""
+"""Names of the fields that need a reference."""
 AXIAL = ("aolp_mean",)
-"""Those that go round: 180 degrees are 0."""
-
-
+"""Names of the fields with a period of 180 degrees."""
 _REMEDY = "Correct the file."
 
 
 class Bound(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Smallest and largest allowed value, both allowed themselves; None: none."""
+    """Smallest and largest allowed value; None: no bound."""
 
     min: float | None = None
     max: float | None = None
 
 
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The limits of a file.
+    """Content of a limits file.
 
     Attributes:
-        format: 1.
-        limits: by field, for every region.
-        regions: by region, then by field; they take the place of those in ``limits``.
+        format: version of the file, 1.
+        limits: bounds by field, for all regions.
+        regions: bounds by region and field, which replace those in ``limits``.
     """
 
     format: int = 1
@@ -128,22 +130,24 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     regions: dict[str, dict[str, Bound]] = {}
 
     def of(self, region: str) -> dict[str, Bound]:
-        """The bounds of a region, by field."""
+        """Return the bounds of a region, by field."""
         return {**self.limits, **self.regions.get(region, {})}
 
 
 NO_LIMITS = Limits()
+"""Limits without a bound."""
 
 
 def read_limits(path: Path, regions: Collection[str], *, reference: bool) -> Limits:
     """Read a limits file.
 
     Args:
-        path: JSON: ``{"limits": {field: {"min": a, "max": b}}, "regions": {region: {field: ...}}}``.
-        regions: names that may occur in it. reference: whether shots are compared with one.
+        path: JSON file ``{"limits": {field: {"min": a, "max": b}}, "regions": {region: {field: ...}}}``.
+        regions: names of the regions.
+        reference: True if shots are compared with a reference.
 
     Raises:
-        PolarguideError: the file cannot be read, names an unknown field or region, or bounds nothing.
+        PolarguideError: the file cannot be read, a field or region is unknown, or the file has no bound.
     """
     limits = read_record(path, Limits, remedy=_REMEDY)
     if limits.format != 1:
@@ -162,54 +166,52 @@ def read_limits(path: Path, regions: Collection[str], *, reference: bool) -> Lim
 
 
 def _check(path: Path, place: str, field: str, bound: Bound, reference: bool) -> None:
+    """Validate the bound of a field.
+
+    Raises:
+        PolarguideError: the field is unknown or needs a reference, or the bound is invalid.
+    """
     if field not in BOUNDED:
-        near = difflib.get_close_matches(field, BOUNDED, 3, 0.5)
-        raise _wrong(path, place, "a field of the table", field, near)
+        near = " or ".join(difflib.get_close_matches(field, BOUNDED, 3, 0.5))
+        raise _wrong(path, place, "a field of the table", field, f"Did you mean {near}?" if near else _REMEDY)
     if field in COMPARED and not reference:
-        raise PolarguideError(
-            f"{path} ({place})",
-            expected="a golden part, because this field limits the difference from it",
-            found="none",
-            remedy="Give the golden part with --reference, or remove the field.",
-        )
-    if bound.min is None and bound.max is None:
+        expected = "a golden part, because this field limits the difference from it"
+        remedy = "Give the golden part with --reference, or remove the field."
+        raise _wrong(path, place, expected, "none", remedy)
+    numbers = [value for value in (bound.min, bound.max) if value is not None]
+    if not numbers:
         raise _wrong(path, place, "min, max or both", "neither")
-    for value in (bound.min, bound.max):
-        if field in AXIAL and value is not None and not 0 <= value <= 180:
-            raise _wrong(path, place, "angles from 0 to 180", f"{value:g}")
-    if bound.min is not None and bound.max is not None and bound.min > bound.max and field not in AXIAL:
-        raise _wrong(path, place, "a min up to the max", f"{bound.min:g} and {bound.max:g}")
+    found = " and ".join(f"{value:g}" for value in numbers)
+    if field in AXIAL and not all(0 <= value <= 180 for value in numbers):
+        raise _wrong(path, place, "angles from 0 to 180", found)
+    if field not in AXIAL and numbers[0] > numbers[-1]:
+        raise _wrong(path, place, "a min up to the max", found)
 
 
-def _wrong(
-    path: Path, place: str, expected: str, found: str, near: list[str] | None = None
-) -> PolarguideError:
-    hint = f"Perhaps {' or '.join(near)} is meant." if near else _REMEDY
-    return PolarguideError(f"{path} ({place})", expected=expected, found=found, remedy=hint)
+def _wrong(path: Path, place: str, expected: str, found: str, remedy: str = _REMEDY) -> PolarguideError:
+    return PolarguideError(f"{path} ({place})", expected=expected, found=found, remedy=remedy)
 
 
 def faults(figures: Mapping[str, Value], bounds: Mapping[str, Bound]) -> list[str]:
-    """Which figures are beyond their bounds, in words. One without a value is: nothing says that it is within."""
+    """Describe the figures that are beyond their bounds. A missing value is beyond a bound."""
     beyond = []
     for field, bound in bounds.items():
         value = figures[field]
-        if not isinstance(value, int | float):
-            beyond.append(f"{field} has no value")
-            continue
         low = -math.inf if bound.min is None else bound.min
         high = math.inf if bound.max is None else bound.max
-        if low > high:  # the allowed angles go through 180
+        if not isinstance(value, int | float):
+            beyond.append(f"{field} has no value")
+        elif low > high:  # the allowed angles contain 180
             if high < value < low:
                 beyond.append(f"{field} {value:.5g} outside {low:g} through 180 to {high:g}")
-        elif value < low:
-            beyond.append(f"{field} {value:.5g} under {low:g}")
-        elif value > high:
-            beyond.append(f"{field} {value:.5g} over {high:g}")
+        elif not low <= value <= high:
+            limit = f"under {low:g}" if value < low else f"over {high:g}"
+            beyond.append(f"{field} {value:.5g} {limit}")
     return beyond
 
 
 def verdict(beyond: Sequence[str], bounds: Mapping[str, Bound]) -> dict[str, Value]:
-    """The fields that say how a region compares with its limits."""
+    """Return the status of a region, and the exceeded limits."""
     return {
         "status": "beyond" if beyond else "within" if bounds else "measured",
         "why": ", ".join(beyond),
@@ -217,6 +219,6 @@ def verdict(beyond: Sequence[str], bounds: Mapping[str, Bound]) -> dict[str, Val
 
 
 def worst(regions: Sequence[Mapping[str, Value]]) -> Status:
-    """The worst status of regions."""
+    """Return the worst status of regions."""
     statuses = [figures["status"] for figures in regions]
     return "beyond" if "beyond" in statuses else "within" if "within" in statuses else "measured"

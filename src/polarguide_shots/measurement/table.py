@@ -1,10 +1,9 @@
-"""The table of a folder of shots on disk: it survives a kill at any moment without a lost or a doubled line.
+"""The table of a folder of shots on disk. No line is lost or repeated if the process is killed.
 
-``table.jsonl`` has one line per shot, with all of its regions and the files that it was read from: it is the table
-and the journal of what is done in one, so that the two cannot disagree. A line is written in one piece and forced to
-disk before anything else happens; what a kill leaves of one is cut off at the next start, and its shot is measured
-again.
-``table.csv`` has one line per region. It is written after the other, and made anew from it at every start.
+``table.jsonl`` has one line per shot, with all regions and files. It is both the table and the journal of measured
+shots. A line is written at once and forced to disk before the next step. The next start removes an incomplete line, and
+its shot is measured again.
+``table.csv`` has one line per region. It is written after ``table.jsonl`` and recreated from it at every start.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import hashlib
 import itertools
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
@@ -22,7 +21,7 @@ from typing import Annotated, Any, BinaryIO
 import msgspec
 from msgspec import Meta
 
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import (
     atomic,
     check_out,
@@ -42,12 +41,12 @@ CSV = "table.csv"
 SETTINGS = "measure.json"
 LOCK = ".lock"
 _LAST = 2**63 - 1
-"""Of the nanoseconds that a time may lie from 1970, 292 years; some disks have later ones."""
-_ANEW = "Give another --out, or --overwrite to begin this table anew."
+"""Largest time in nanoseconds since 1970, 292 years. Some disks have later times."""
+_REPLACE = "Give another --out, or --overwrite to replace this table."
 
 
 class FileStamp(msgspec.Struct, frozen=True):
-    """A file as it was read: path, size in bytes, and time of its last change in nanoseconds."""
+    """State of a file: path, size in bytes, and time of its last change in nanoseconds."""
 
     path: str
     bytes: int
@@ -55,14 +54,14 @@ class FileStamp(msgspec.Struct, frozen=True):
 
 
 def stamps(paths: Sequence[Path]) -> tuple[FileStamp, ...]:
-    """The present state of files.
+    """Return the current state of files.
 
     Raises:
-        OSError: one is not there.
+        OSError: a file is missing.
     """
-    about = ((os.path.abspath(path), os.stat(path)) for path in paths)
+    states = ((os.path.abspath(path), os.stat(path)) for path in paths)
     return tuple(
-        FileStamp(path, state.st_size, min(max(state.st_mtime_ns, -_LAST), _LAST)) for path, state in about
+        FileStamp(path, state.st_size, min(max(state.st_mtime_ns, -_LAST), _LAST)) for path, state in states
     )
 
 
@@ -71,13 +70,13 @@ class Entry(msgspec.Struct, frozen=True):
 
     Attributes:
         format: ``fields.FORMAT``.
-        shot: its name.
-        files: it was read from.
-        status: the worst of its regions; unread where it could not be read.
-        why: then, the reason.
-        notes: what was assumed about it.
-        regions: by ``Field.key``, from ``region`` on.
-        picture: name of its pictures without suffix, "" where none was drawn.
+        shot: name of the shot.
+        files: files of the shot.
+        status: worst status of the regions; "unread" for a shot that could not be read.
+        why: reason of an unread shot, else empty.
+        notes: assumptions about the shot.
+        regions: figures of the regions by ``Field.key``, from ``region`` on.
+        picture: name of the pictures without suffix; empty without pictures.
     """
 
     format: int
@@ -90,25 +89,38 @@ class Entry(msgspec.Struct, frozen=True):
     picture: str = ""
 
     def line(self) -> bytes:
-        """The line of ``table.jsonl``; JSON's escapes keep names that are no Unicode."""
+        """Return the line of ``table.jsonl``. Escapes of JSON keep names that are not valid Unicode."""
         return json.dumps(msgspec.to_builtins(self)).encode() + b"\n"
 
     def rows(self) -> Iterator[list[Value]]:
-        """The lines of the CSV table."""
-        shared: dict[str, Value] = {
-            "shot": self.shot,
-            "files": ";".join(file.path for file in self.files),
-            "taken": "",
-        }
+        """Return the lines of the CSV table."""
+        taken = ""
         if self.files:
             newest = datetime.fromtimestamp(max(file.modified for file in self.files) / 1e9, timezone.utc)
-            shared["taken"] = newest.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+            taken = newest.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        files = ";".join(file.path for file in self.files)
         for figures in self.regions or ({"status": self.status, "why": self.why},):
-            yield [{**shared, **figures}.get(key) for key in KEYS]
+            row: dict[str, Value] = {"shot": self.shot, "files": files, "taken": taken, **figures}
+            yield [row.get(key) for key in KEYS]
 
 
 class Table(contextlib.AbstractContextManager["Table"]):
-    """A table that is open for more lines. Close it, or use it as a context."""
+    """An open table. The context manager closes it.
+
+    Args:
+        folder: folder to create.
+        settings: all settings that the figures depend on, which are equal for all shots of a table.
+        overwrite: replace a table with other settings. A table without a measured shot is always replaced.
+        judge: function that compares a line with the limits of the settings, for a table with other limits.
+
+    Attributes:
+        judged_again: number of lines that were compared with new limits.
+        close: release the table for other processes.
+
+    Raises:
+        PolarguideError: another process writes the table, it has other settings, it is damaged before its end, or it
+            cannot be written.
+    """
 
     def __init__(
         self,
@@ -116,180 +128,166 @@ class Table(contextlib.AbstractContextManager["Table"]):
         settings: Mapping[str, Any],
         *,
         overwrite: bool = False,
-        judged: Callable[[Entry], Entry] | None = None,
+        judge: Callable[[Entry], Entry] | None = None,
     ) -> None:
-        """Open the table of a folder, or begin one.
-
-        Args:
-            folder: is made. settings: all that the figures depend on; a table has the same for all of its shots.
-            judged: a line by the limits of the settings, where the table was made with other limits alone.
-            overwrite: begin anew where it was made with others; so is a table without a single measured shot.
-
-        Raises:
-            PolarguideError: another process writes it, it was made with other settings, it is damaged (but for its
-                end), or it cannot be written.
-        """
         check_out(folder)
         make_folder(folder)
         self.folder = folder
         self.judged_again = 0
-        """Lines that were judged by other limits than before."""
         self._done: dict[bytes, Entry] = {}
         self._pictures: set[str] = set()
         self._files: list[BinaryIO] = []
         with contextlib.ExitStack() as stack:
+            found = "another polarguide measure at work on it"
             stack.enter_context(
-                only_writer(
-                    folder / LOCK,
-                    expected="a table that nobody else writes",
-                    found="another polarguide measure at work on it",
-                )
+                only_writer(folder / LOCK, expected="a table without another writer", found=found)
             )
-            self._begin({"format": FORMAT, **settings}, overwrite, judged)
+            self._open({"format": FORMAT, **settings}, overwrite, judge)
             for name in (LINES, CSV):
                 with writing(folder / name):
                     self._files.append(stack.enter_context(open(folder / name, "ab", buffering=0)))
             self.close = stack.pop_all().close
-            """Let others write the table."""
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def status_of(self, files: tuple[FileStamp, ...]) -> Status | None:
-        """The status in the line of these files as they are, None where there is no such line."""
-        entry = self.entry_of(files)
-        return None if entry is None else entry.status
-
     def entry_of(self, files: tuple[FileStamp, ...]) -> Entry | None:
-        """The line of these files as they are, with figures where it is beyond; None where there is no such line."""
+        """Return the line of files in their current state, or None. Only a line beyond its limits has figures."""
         return self._done.get(_key(files))
 
     def picture_name(self, shot: str) -> str:
-        """A name for the pictures of a shot that those of no other have, upper and lower case taken alike."""
+        """Return a new name for the pictures of a shot, unique without regard to case."""
         names = itertools.chain((shot,), (f"{shot}-{number}" for number in itertools.count(2)))
         return next(name for name in names if name.casefold() not in self._pictures)
 
-    def add(self, entry: Entry) -> None:
-        """Write the lines of a shot; when this returns, they are on disk.
+    def add(self, entry: Entry) -> Entry:
+        """Write the lines of a shot, force them to disk, and return the entry.
 
         Raises:
             PolarguideError: the lines cannot be written, as on a full disk, or the table was removed.
         """
-        self.require_there()
+        self.require_present()
         lines, rows = self._files
         _append(self.folder / LINES, lines, entry.line())
-        self._note(entry)
+        self._record(entry)
         _append(self.folder / CSV, rows, _csv(entry.rows()))
+        return entry
 
-    def require_there(self) -> None:
-        """Check that the files are still those that are written to: what is removed meanwhile takes lines silently.
+    def require_present(self) -> None:
+        """Check that the open files still exist under their names. A removed file would lose lines silently.
 
         Raises:
-            PolarguideError: one was removed, renamed or replaced.
+            PolarguideError: a file was removed, renamed or replaced.
         """
         for name, file in zip((LINES, CSV), self._files, strict=True):
             path = self.folder / name
-            try:
-                there = os.path.samestat(os.fstat(file.fileno()), os.stat(path))
-            except OSError:
-                there = False
-            if not there:
-                raise PolarguideError(
-                    path,
-                    expected="the table that was opened",
-                    found="that it was removed, renamed or replaced meanwhile",
-                    remedy="Put it back if you can; the same command measures what is not in it.",
-                )
+            present = False
+            with contextlib.suppress(OSError):
+                present = os.path.samestat(os.fstat(file.fileno()), os.stat(path))
+            require(
+                present,
+                path,
+                expected="the table that was opened",
+                found="a removed, renamed or replaced file",
+                remedy="Restore it if possible; the same command measures the missing shots.",
+            )
 
-    def _note(self, entry: Entry) -> None:
+    def _record(self, entry: Entry) -> None:
+        """Keep a line in memory, with figures if it is beyond its limits."""
         short = entry if entry.status == "beyond" else msgspec.structs.replace(entry, regions=(), notes=())
         self._done[_key(entry.files)] = short
         if entry.picture:
             self._pictures.add(entry.picture.casefold())
 
-    def _begin(
-        self, settings: dict[str, Any], overwrite: bool, judged: Callable[[Entry], Entry] | None
+    def _open(
+        self, settings: dict[str, Any], overwrite: bool, judge: Callable[[Entry], Entry] | None
     ) -> None:
-        """Make what there is whole again, or begin anew."""
+        """Repair an existing table, or create a new one.
+
+        Raises:
+            PolarguideError: the table has other settings, is damaged, or cannot be written.
+        """
         path = self.folder / SETTINGS
         lines = self.folder / LINES
         for place in (path, lines):
-            if os.path.lexists(place):  # somebody else may have made the folder
+            if os.path.lexists(place):  # the folder may come from another user
                 require_inside(self.folder, place)
-                require_file(place, expected="a file of a table", remedy=_ANEW)
+                require_file(place, expected="a file of a table", remedy=_REPLACE)
         if path.exists() and lines.exists():
-            before = read_record(path, dict[str, Any], remedy=_ANEW) if not overwrite else None
+            before = read_record(path, dict[str, Any], remedy=_REPLACE) if not overwrite else None
             now: dict[str, Any] = json.loads(to_json(settings))
+            without_limits = {**now, "limits": None}
             if before == now:
-                self._mend()
+                self._repair()
                 return
-            if (
-                judged is not None
-                and before is not None
-                and {**before, "limits": None} == {**now, "limits": None}
-            ):
-                write_whole(path, to_json({**now, "limits": None}))  # until all lines are by the same
-                self._mend()
-                self._judge(judged)
+            if judge is not None and before is not None and {**before, "limits": None} == without_limits:
+                # Settings without limits mark a table whose lines are compared with new limits.
+                write_whole(path, to_json(without_limits))
+                self._repair()
+                self._judge(judge)
                 write_whole(path, to_json(settings))
-                self._done.clear()
-                self._pictures.clear()
-                self._mend()
+                self._repair()
                 return
-            if before is not None and _holds_measurements(lines):
-                name, was, is_now = first_differing_value("", before, now)
+            if before is not None and _has_measurements(lines):
+                name, was, requested = first_differing_value("", before, now)
                 raise PolarguideError(
                     f"{path} ({name[1:]})",
                     expected=shortened(was, 200),
-                    found=shortened(is_now, 200),
-                    remedy=f"One table has one set of options. {_ANEW}",
+                    found=shortened(requested, 200),
+                    remedy=f"One table has one set of options. {_REPLACE}",
                 )
-        elif lines.exists() and not overwrite:
-            raise PolarguideError(
-                path, expected="the options that this table was made with", found="nothing", remedy=_ANEW
+        elif not overwrite:
+            require(
+                not lines.exists(),
+                path,
+                expected="the options of this table",
+                found="no file",
+                remedy=_REPLACE,
             )
-        elif os.path.lexists(self.folder / CSV) and not overwrite:
-            raise PolarguideError(
+            require(
+                not os.path.lexists(self.folder / CSV),
                 self.folder / CSV,
-                expected=f"a new table, or one with {LINES} beside it",
-                found="a file of this name alone",
-                remedy=_ANEW,
+                expected=f"a new table, or a table with {LINES}",
+                found="a file of this name only",
+                remedy=_REPLACE,
             )
         write_whole(lines, b"")
         write_whole(path, to_json(settings))
-        self._mend()
+        self._repair()
 
-    def _mend(self) -> None:
-        """Cut off a torn last line, note what is done, and make the CSV table anew."""
+    def _repair(self) -> None:
+        """Read all lines, remove an incomplete last line, and recreate the CSV table.
+
+        Raises:
+            PolarguideError: a line is invalid, or a file cannot be written.
+        """
         path = self.folder / LINES
-        whole = 0
+        self._done.clear()
+        self._pictures.clear()
+        complete = 0
         with atomic(self.folder / CSV) as temporary, open(temporary, "wb") as rows, open(path, "rb") as lines:
             rows.write(_csv([list(KEYS)]))
             for number, line in enumerate(lines, 1):
                 if not line.endswith(b"\n"):
                     break
-                entry = decode(line, Entry, f"{path} (line {number})", remedy=_ANEW)
-                if entry.format != FORMAT:
-                    raise PolarguideError(
-                        f"{path} (line {number}, format)",
-                        expected=str(FORMAT),
-                        found=str(entry.format),
-                        remedy=_ANEW,
-                    )
-                self._note(entry)
+                entry = decode(line, Entry, f"{path} (line {number})", remedy=_REPLACE)
+                place = f"{path} (line {number}, format)"
+                found = str(entry.format)
+                require(entry.format == FORMAT, place, expected=str(FORMAT), found=found, remedy=_REPLACE)
+                self._record(entry)
                 rows.write(_csv(entry.rows()))
-                whole += len(line)
-        if whole < path.stat().st_size:
+                complete += len(line)
+        if complete < path.stat().st_size:
             with writing(path), open(path, "r+b") as file:
-                file.truncate(whole)
+                file.truncate(complete)
                 os.fsync(file.fileno())
 
-    def _judge(self, judged: Callable[[Entry], Entry]) -> None:
-        """Write all lines anew, as other limits judge them."""
+    def _judge(self, judge: Callable[[Entry], Entry]) -> None:
+        """Compare all lines with new limits, and replace them."""
         path = self.folder / LINES
         with atomic(path) as temporary, open(temporary, "wb") as new, open(path, "rb") as lines:
             for number, line in enumerate(lines, 1):
-                entry = judged(decode(line, Entry, f"{path} (line {number})", remedy=_ANEW))
+                entry = judge(decode(line, Entry, f"{path} (line {number})", remedy=_REPLACE))
                 if entry.status == "beyond" and not entry.picture:
                     entry = msgspec.structs.replace(entry, picture=self.picture_name(entry.shot))
                     self._pictures.add(entry.picture.casefold())
@@ -298,7 +296,7 @@ class Table(contextlib.AbstractContextManager["Table"]):
 
 
 def _append(path: Path, file: BinaryIO, data: bytes) -> None:
-    """Write at the end of a file and force it to disk: all of it, or nothing."""
+    """Append data to a file completely or not at all, and force it to disk."""
     with writing(path):
         size = os.fstat(file.fileno()).st_size
         try:
@@ -312,7 +310,7 @@ def _append(path: Path, file: BinaryIO, data: bytes) -> None:
             raise
 
 
-def _csv(rows: Any) -> bytes:
+def _csv(rows: Iterable[Iterable[object]]) -> bytes:
     return csv_lines(rows).encode("utf-8", "backslashreplace")
 
 
@@ -320,6 +318,6 @@ def _key(files: tuple[FileStamp, ...]) -> bytes:
     return hashlib.sha256(json.dumps(msgspec.to_builtins(files)).encode()).digest()[:16]
 
 
-def _holds_measurements(path: Path) -> bool:
+def _has_measurements(path: Path) -> bool:
     with open(path, "rb") as lines:
         return any(b'"status": "unread"' not in line for line in lines)
