@@ -102,7 +102,6 @@ def _print_entry(entry: Any, *, every: bool) -> None:
 
 
 def _print_outcome(outcome: Any) -> None:
-    """Print the numbers of shots, and the files of the table."""
     counts = outcome.counts
     shots = ", ".join(
         f"{counts[status]} {status}"

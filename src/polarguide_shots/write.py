@@ -515,10 +515,8 @@ def drawn(kind: MapKind, values: NDArray[Any], maps: ShotMaps, stretch: Stretch,
 def _colored(
     kind: MapKind, values: NDArray[Any], dolp: NDArray[Any], reason: NDArray[np.uint8], stretch: Stretch
 ) -> Picture:
-    """Convert some rows of a map to colors."""
     if kind.look == "reason":
-        table = np.array([REASON_COLORS[code] for code in Reason], np.uint8)
-        return np.asarray(table[values])
+        return np.asarray(np.array([REASON_COLORS[code] for code in Reason], np.uint8)[values])
     numbers = torch.from_numpy(np.ascontiguousarray(values))
     if kind.look == "radiance":
         return figures.radiance_to_rgb((numbers / (2 * stretch.high)).expand(-1, -1, 3))

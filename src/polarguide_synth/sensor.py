@@ -174,8 +174,9 @@ def filter_jpeg(
     light = behind_filter(stokes, rays, shot.angle) * 2.0**shot.stops
     encoded = srgb_encode_array(np.clip(noisy(light, noise, random, sensor), 0.0, 1.0))
     stored = apply_orientation(np.rint(255 * encoded).astype(np.uint8), INVERSE[shot.orientation])
-    bgr = np.ascontiguousarray(stored[..., ::-1])
-    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    _, data = cv2.imencode(
+        ".jpg", np.ascontiguousarray(stored[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+    )
     time = _TIME * Fraction(2.0**shot.stops) if shot.noted else None
     block = b"Exif\0\0" + exif_tags(shot.orientation, time)
     segment = b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block
@@ -299,8 +300,7 @@ def _sums(
     index = dr.arange(mi.UInt32, pixels * count)
     pixel = index // per_pixel
     sample = index - pixel * per_pixel + first
-    parts = _path(scene, lens, pixel, sample, seed, limits, center)
-    flat = [value for color in parts for value in color]
+    flat = [value for color in _path(scene, lens, pixel, sample, seed, limits, center) for value in color]
     dr.eval(flat)
     return [dr.block_reduce(dr.ReduceOp.Add, value, count) for value in flat]
 

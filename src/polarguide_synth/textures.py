@@ -220,8 +220,12 @@ def make_texture(data: dict[str, Any], where: str, folder: Path) -> Array:
         PolarguideError: the type, a field or a value is invalid.
     """
     makers: dict[str, Callable[..., Array]] = {**TEXTURES, "image": functools.partial(image, folder=folder)}
-    expected = f'a color, "own", or a texture with type {", ".join(TEXTURES)}'
-    return make(makers, data, f"{where} material.color", expected)
+    return make(
+        makers,
+        data,
+        f"{where} material.color",
+        f'a color, "own", or a texture with type {", ".join(TEXTURES)}',
+    )
 
 
 def _grid(pixels: int) -> tuple[Array, Array]:
@@ -419,5 +423,6 @@ def make_environment(data: dict[str, Any], where: str, folder: Path) -> Array:
         **ENVIRONMENTS,
         "image": functools.partial(image, folder=folder),
     }
-    expected = f"a type of {', '.join(ENVIRONMENTS)} with its fields"
-    return make(makers, data, f"{where} (environment)", expected)
+    return make(
+        makers, data, f"{where} (environment)", f"a type of {', '.join(ENVIRONMENTS)} with its fields"
+    )

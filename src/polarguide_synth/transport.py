@@ -288,8 +288,14 @@ def _scatter(
         [S0, S1, S2] at the camera, and (active, ray, gain, place, density, delta) of the ray that leaves.
     """
     if active is False:  # the scalar variant: there is no surface
-        dark = [mi.UnpolarizedSpectrum(0.0)] * 3
-        return dark, (False, mi.Ray3f(ray), gain, mi.Interaction3f(si), 0.0, False)
+        return [mi.UnpolarizedSpectrum(0.0)] * 3, (
+            False,
+            mi.Ray3f(ray),
+            gain,
+            mi.Interaction3f(si),
+            0.0,
+            False,
+        )
     choose, turn, light = numbers
     bsdf = si.bsdf(ray)
     ds, brought = scene.sample_emitter_direction(si, light, True, active)

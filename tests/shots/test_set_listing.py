@@ -14,7 +14,7 @@ import polarguide
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide_shots.exposures import find_shots, list_shots
-from polarguide_shots.measurement.fields import KEYS
+from polarguide_shots.measurement.table import KEYS
 from polarguide_shots.options import ShotOptions, WatchOptions
 from polarguide_shots.read import read_shot
 from polarguide_shots.sets import ExposureSet

@@ -27,8 +27,7 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.visualization.figures import write_png
 from polarguide_shots.calibration.report import Position, calibration_picture, lines, positions
 from polarguide_shots.calibration.settings import CalibrateSettings
-from polarguide_shots.calibration.shots import ShotMeans, Shots
-from polarguide_shots.calibration.solve import ShotFit, solve_shots
+from polarguide_shots.calibration.shots import ShotFit, ShotMeans, Shots, solve_shots
 
 BLOCK = 32
 """Default side of a block in pixels."""
@@ -95,8 +94,7 @@ def fit_pixels(
         saturated = saturated | clipped
     normal = np.linalg.inv(light.T @ light)
     vectors = np.einsum("ij,jhw->ihw", normal, moments)
-    residuals = np.maximum(squares - np.einsum("ihw,ihw->hw", vectors, moments), 0.0)
-    variance = residuals / max(1, len(light) - 3)
+    variance = np.maximum(squares - np.einsum("ihw,ihw->hw", vectors, moments), 0.0) / max(1, len(light) - 3)
     level = _brightness(2 * vectors[0], pattern)
     vectors /= level
     defects = saturated | ~plausible(
@@ -246,8 +244,9 @@ def _at_places(
     """
     x = ((np.arange(shape[1]) - corner[0] - 0.5) / step).astype(np.float32)
     y = ((np.arange(shape[0]) - corner[1] - 0.5) / step).astype(np.float32)
-    surface = cv2.remap(cells, *np.meshgrid(x, y), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(surface, np.float64)
+    return np.asarray(
+        cv2.remap(cells, *np.meshgrid(x, y), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float64
+    )
 
 
 def _smooth(values: NDArray[np.float64], side: int) -> NDArray[np.float64]:
@@ -320,9 +319,8 @@ def calibrate_sensor(
         PolarguideError: a file or setting is invalid, the shots contradict each other, or ``out`` exists.
     """
     settings = settings.checked()
-    _require_new(out)
+    _require_new(out, Path(source), settings)
     files = Shots(Path(source), settings)
-    _require_apart(out, Path(source), settings)
     known = settings.known_angles(files.files)
     reference = settings.reference or ("mean" if known is None else "angles")
     ratio = settings.polarizer_extinction
@@ -338,8 +336,7 @@ def calibrate_sensor(
         files=files.files,
     )
     _say_shots(fit, settings, measured, reporter)
-    light = fit.stokes(diattenuation)
-    pixels = fit_pixels(files.linear(measured.levels, reporter), light, files.pattern)
+    pixels = fit_pixels(files.linear(measured.levels, reporter), fit.stokes(diattenuation), files.pattern)
     defects = int(pixels.defects.sum())
     require(
         defects <= MOST_DEFECTS * pixels.defects.size,
@@ -364,27 +361,11 @@ def calibrate_sensor(
     return Calibrated(out, picture, calibration, analyzers, fit, choice, defects)
 
 
-def _require_apart(out: Path, shots: Path, settings: CalibrateSettings) -> None:
-    """Check that the picture is not written to a folder of shots, where the next call would read it.
+def _require_new(out: Path, shots: Path, settings: CalibrateSettings) -> None:
+    """Check that the files of the output are new, and not in a folder of shots, where the next call would read them.
 
     Raises:
-        PolarguideError: ``out`` is in a folder of shots.
-    """
-    for folder in (shots, settings.flat, settings.dark_frame):
-        require(
-            folder is None or not folder.is_dir() or folder.resolve() != out.parent.resolve(),
-            out,
-            expected=f"a place outside of {folder}",
-            found="the folder of the shots, where the picture would count as a shot",
-            remedy="Give another --out; nothing was written.",
-        )
-
-
-def _require_new(out: Path) -> None:
-    """Check the suffix of the output, and that its files do not exist.
-
-    Raises:
-        PolarguideError: the suffix is wrong, or a file exists.
+        PolarguideError: the suffix is wrong, a file exists, or ``out`` is in a folder of shots.
     """
     require(
         out.suffix.lower() == SUFFIX,
@@ -400,6 +381,14 @@ def _require_new(out: Path) -> None:
             expected="a new file",
             found="an existing file",
             remedy="Give another --out, or remove it; nothing was written.",
+        )
+    for folder in (shots, settings.flat, settings.dark_frame):
+        require(
+            folder is None or not folder.is_dir() or folder.resolve() != out.parent.resolve(),
+            out,
+            expected=f"a place outside of {folder}",
+            found="the folder of the shots, where the picture would count as a shot",
+            remedy="Give another --out; nothing was written.",
         )
 
 
@@ -446,7 +435,6 @@ def _say_shots(fit: ShotFit, settings: CalibrateSettings, measured: ShotMeans, r
 def _say_choice(
     choice: BlockChoice, settings: CalibrateSettings, files: Shots, defects: int, reporter: Reporter
 ) -> None:
-    """Report the size of the blocks, and the number of defects."""
     single = choice.block == files.pattern.period
     reporter.say(
         f"Pixels of a block differ by {choice.scatter:.2%}, the noise of one pixel's vector is {choice.noise:.2%}: "

@@ -15,7 +15,7 @@ from polarguide.capture.sensor.analyzers import AnalyzerCalibration
 from polarguide.capture.sensor.pattern import Pattern
 from polarguide.geometry.polarizer import ANGLES, stokes_of_four
 from polarguide.visualization.figures import FONT, INK, Picture, contact_sheet, scalar_to_rgb, scale_bar
-from polarguide_shots.calibration.solve import ShotFit
+from polarguide_shots.calibration.shots import ShotFit
 
 COUNTLESS = 1000.0
 """Largest extinction ratio that can be measured, limited by noise and the polarizer."""
@@ -54,8 +54,7 @@ def positions(calibration: AnalyzerCalibration) -> list[Position]:
         mask = pattern.angles == angle
         if color is not None and pattern.colors is not None:
             mask &= pattern.colors == color
-        vectors = calibration.vectors[:, :, mask].astype(np.float64).mean(axis=2)
-        s0, s1, s2 = np.moveaxis(vectors, -1, 0)
+        s0, s1, s2 = np.moveaxis(calibration.vectors[:, :, mask].astype(np.float64).mean(axis=2), -1, 0)
         strength = np.hypot(s1, s2)
         extinction = (s0 + strength) / np.maximum(s0 - strength, (s0 + strength) / COUNTLESS)
         error = np.angle(np.exp(1j * (np.arctan2(s2, s1) - 2 * np.radians(angle)))) / 2
@@ -166,8 +165,7 @@ def _maps(analyzers: Sequence[Position]) -> Picture:
         footer.append(scale_bar(low, high, colormap))
         # Positions of a color are in the order of the angles.
         for row, position in zip(rows, (p for p in analyzers if p.color == color), strict=True):
-            values = torch.from_numpy(getattr(position, name).copy())
-            row.append(scalar_to_rgb(values, low, high, colormap))
+            row.append(scalar_to_rgb(torch.from_numpy(getattr(position, name).copy()), low, high, colormap))
     return contact_sheet(
         rows,
         [f"{angle} deg" for angle in ANGLES],

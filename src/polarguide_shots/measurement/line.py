@@ -22,17 +22,6 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.visualization.figures import write_png
 from polarguide_shots.exposures import find_shots, require_elsewhere
 from polarguide_shots.maps import ShotMaps
-from polarguide_shots.measurement.fields import (
-    FORMAT,
-    KEYS,
-    NO_LIMITS,
-    Status,
-    Value,
-    faults,
-    read_limits,
-    verdict,
-    worst,
-)
 from polarguide_shots.measurement.pictures import difference_picture, regions_picture
 from polarguide_shots.measurement.regions import (
     WHOLE,
@@ -44,8 +33,23 @@ from polarguide_shots.measurement.regions import (
     placed,
     read_reference,
     region_figures,
+    subtract,
 )
-from polarguide_shots.measurement.table import Entry, FileStamp, Table, stamps
+from polarguide_shots.measurement.table import (
+    FORMAT,
+    KEYS,
+    NO_LIMITS,
+    Entry,
+    FileStamp,
+    Status,
+    Table,
+    Value,
+    faults,
+    read_limits,
+    stamps,
+    verdict,
+    worst,
+)
 from polarguide_shots.options import MeasureOptions, ShotOptions
 from polarguide_shots.read import (
     NAME,
@@ -112,7 +116,7 @@ class Measurer:
     @property
     def reference_files(self) -> tuple[Path, ...]:
         """Files of the reference, which are not measured in a watched folder."""
-        return () if self.reference is None else self.reference.shot.paths
+        return () if self.reference is None else self.reference.files
 
     def read(self, shot: ExposureSet, *, whole: bool = False) -> ShotMaps:
         """Read the maps of a shot: of the regions at least, or of the whole picture if requested or with a reference.
@@ -129,7 +133,7 @@ class Measurer:
             PolarguideError: the shot does not fit the regions or the reference.
         """
         regions = placed(self._regions, maps.whole or maps.size, shot.where)
-        differences = None if self.reference is None else self.reference.differences(maps)
+        differences = None if self.reference is None else subtract(maps, self.reference)
         figures = []
         beyond = []
         for region in regions:
@@ -164,8 +168,9 @@ class Measurer:
         for figures in entry.regions:
             bounds = self.limits.of(str(figures["region"]))
             regions.append({**figures, **verdict(faults(figures, bounds), bounds)})
-        status = worst(regions) if regions else entry.status
-        return msgspec.structs.replace(entry, status=status, regions=tuple(regions))
+        return msgspec.structs.replace(
+            entry, status=worst(regions) if regions else entry.status, regions=tuple(regions)
+        )
 
     def settings(self) -> dict[str, Any]:
         """Return the settings that the figures depend on, as JSON data."""
@@ -304,13 +309,12 @@ class Line(contextlib.AbstractContextManager["Line"]):
         if measured.beyond:
             self._draw_beyond(shot, measured, name)
         if measured.differences is not None and reference is not None:
-            picture = difference_picture(measured.differences, measured.maps.name, reference.shot.name)
+            picture = difference_picture(measured.differences, measured.maps.name, reference.name)
             make_folder(self.out / DIFFERENCES)
             write_png(self.out / DIFFERENCES / f"{name}.png", picture)
         return name
 
     def _draw_beyond(self, shot: ExposureSet, measured: MeasuredShot, name: str) -> None:
-        """Write the picture of a shot beyond its limits."""
         maps = measured.maps if measured.maps.whole is None else self.measurer.read(shot, whole=True)
         picture = regions_picture(maps, measured.beyond, self.measurer.limits, measured.differences)
         make_folder(self.out / BEYOND)
@@ -323,8 +327,7 @@ class Line(contextlib.AbstractContextManager["Line"]):
             PolarguideError, OSError, MemoryError: the shot cannot be read, or the picture cannot be written.
         """
         if entry.status == "beyond":
-            measured = self.measurer.measured(shot, self.measurer.read(shot))
-            self._draw_beyond(shot, measured, entry.picture)
+            self._draw_beyond(shot, self.measurer.measured(shot, self.measurer.read(shot)), entry.picture)
         elif entry.picture:
             (self.out / BEYOND / f"{entry.picture}.png").unlink(missing_ok=True)
 

@@ -22,8 +22,8 @@ from polarguide.visualization.figures import (
     dolp_to_rgb,
 )
 from polarguide_shots.maps import Map, Reason, ShotMaps
-from polarguide_shots.measurement.fields import NO_LIMITS, Bound, Limits
 from polarguide_shots.measurement.regions import Differences, Region
+from polarguide_shots.measurement.table import NO_LIMITS, Bound, Limits
 
 S0_RANGE = 0.2
 """Difference of S0 with the full color, in full scales."""

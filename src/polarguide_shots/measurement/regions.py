@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,9 @@ from polarguide.core.errors import PolarguideError, require
 from polarguide.core.records import shortened
 from polarguide_shots.exposures import find_shots
 from polarguide_shots.maps import Map, Part, Reason, ShotMaps
-from polarguide_shots.measurement.fields import COMPARED, DIFFERENCE_PERCENTILE, PERCENTILES, Value
+from polarguide_shots.measurement.table import COMPARED, DIFFERENCE_PERCENTILE, PERCENTILES, Value
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.read import read_shot
-from polarguide_shots.sets import ExposureSet
 
 WHOLE = "all"
 """Name of the default region, the whole picture."""
@@ -242,8 +241,9 @@ def _distribution(key: str, values: Floats, error: float | None) -> dict[str, Va
     if not values.size:
         return dict.fromkeys(names)
     mean, deviation = (float(moment[0, 0]) for moment in cv2.meanStdDev(values))  # one pass, in float64
-    percentiles = map(float, np.percentile(values, PERCENTILES))
-    return dict(zip(names, (mean, error, deviation, *percentiles), strict=True))
+    return dict(
+        zip(names, (mean, error, deviation, *map(float, np.percentile(values, PERCENTILES))), strict=True)
+    )
 
 
 def _angles(aolp: Floats, error: float | None) -> dict[str, Value]:
@@ -281,52 +281,31 @@ class Differences:
     aolp: Map
 
 
-class Reference:
-    """The maps of the golden part that shots are compared with.
+def subtract(maps: ShotMaps, golden: ShotMaps) -> Differences:
+    """Subtract the maps of the golden part from the maps of a shot.
 
-    Args:
-        shot: the golden part.
-        maps: its maps.
-
-    Attributes:
-        shot: the golden part.
-        size: width and height of its maps.
+    Raises:
+        PolarguideError: the sizes differ.
     """
-
-    def __init__(self, shot: ExposureSet, maps: ShotMaps) -> None:
-        self.shot = shot
-        self.size = maps.size
-        # The copy releases the memory of S1 and S2.
-        self._s0 = maps.s0.copy()
-        self._dolp = maps.dolp_debiased
-        self._aolp = maps.aolp
-        self._reason = maps.reason
-
-    def differences(self, maps: ShotMaps) -> Differences:
-        """Subtract the reference from the maps of a shot.
-
-        Raises:
-            PolarguideError: the sizes differ.
-        """
-        require(
-            maps.size == self.size,
-            maps.files[0] if maps.files else maps.name,
-            expected=f"{self.size[0]}x{self.size[1]} pixels like the reference {self.shot.name}",
-            found=f"{maps.size[0]}x{maps.size[1]}",
-            remedy="Take both with one camera and one region, and develop them alike.",
-        )
-        reason = np.maximum(maps.reason, self._reason)
-        angle = np.remainder(maps.aolp - self._aolp + math.pi / 2, math.pi) - math.pi / 2
-        nan = np.float32(np.nan)
-        return Differences(
-            np.where(reason <= Reason.NOISE, maps.s0 - self._s0, nan),
-            np.where(reason <= Reason.NOISE, maps.dolp_debiased - self._dolp, nan),
-            np.where(reason == Reason.USABLE, angle, nan),
-        )
+    require(
+        maps.size == golden.size,
+        maps.files[0] if maps.files else maps.name,
+        expected=f"{golden.size[0]}x{golden.size[1]} pixels like the reference {golden.name}",
+        found=f"{maps.size[0]}x{maps.size[1]}",
+        remedy="Take both with one camera and one region, and develop them alike.",
+    )
+    reason = np.maximum(maps.reason, golden.reason)
+    angle = np.remainder(maps.aolp - golden.aolp + math.pi / 2, math.pi) - math.pi / 2
+    nan = np.float32(np.nan)
+    return Differences(
+        np.where(reason <= Reason.NOISE, maps.s0 - golden.s0, nan),
+        np.where(reason <= Reason.NOISE, maps.dolp_debiased - golden.dolp_debiased, nan),
+        np.where(reason == Reason.USABLE, angle, nan),
+    )
 
 
-def read_reference(path: Path, options: ShotOptions) -> Reference:
-    """Read a reference.
+def read_reference(path: Path, options: ShotOptions) -> ShotMaps:
+    """Read the maps of a golden part, without its intensities.
 
     Args:
         path: path of a mosaic, of one of four shots through a filter, or of a folder with one shot.
@@ -348,7 +327,8 @@ def read_reference(path: Path, options: ShotOptions) -> Reference:
         found=f"{len(shots)} in {path}",
         remedy="Name a file of the shot.",
     )
-    return Reference(shots[0], read_shot(shots[0], options))
+    maps = read_shot(shots[0], options)
+    return replace(maps, intensities=maps.intensities[:, :0].copy())
 
 
 def difference_figures(differences: Differences | None, region: Region) -> dict[str, Value]:

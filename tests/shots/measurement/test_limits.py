@@ -11,9 +11,9 @@ from faults import Fault
 
 from polarguide.visualization.figures import LINE_HEIGHT
 from polarguide_shots.maps import NoiseModel, Reason, ShotMaps
-from polarguide_shots.measurement.fields import Bound, Limits, faults, read_limits
 from polarguide_shots.measurement.pictures import _layers, _pixels_beyond, regions_picture
 from polarguide_shots.measurement.regions import Differences, Region, parse_regions, placed
+from polarguide_shots.measurement.table import Bound, Limits, faults, read_limits
 
 
 def test_regions_with_and_without_names() -> None:

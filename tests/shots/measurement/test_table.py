@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from faults import Fault
 
-from polarguide_shots.measurement.fields import FORMAT, KEYS
 from polarguide_shots.measurement.line import measure_shots
-from polarguide_shots.measurement.table import CSV, LINES, Entry, FileStamp, Table, stamps
+from polarguide_shots.measurement.table import CSV, FORMAT, KEYS, LINES, Entry, FileStamp, Table, stamps
 from polarguide_shots.options import MeasureOptions, ShotOptions
 
 SETTINGS = {"threshold": 0.05}
