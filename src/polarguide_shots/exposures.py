@@ -12,7 +12,7 @@ from polarguide.capture.exposures import TABLE
 from polarguide.capture.filter import shots as filter_shots
 from polarguide.capture.filter.consecutive import VIDEO_SUFFIXES
 from polarguide.capture.layout import (
-    Layout,
+    CaptureFiles,
     angle_folders,
     angle_of_folder,
     describe_contents,
@@ -240,7 +240,7 @@ def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
     return videos + _filter_sets(filter_shots.list_shots(root)[0])
 
 
-def _views(layout: Layout) -> list[ExposureSet]:
+def _views(layout: CaptureFiles) -> list[ExposureSet]:
     """Create the sets of the views of a scene. Pictures that do not determine Stokes vectors are a fault.
 
     Raises:
