@@ -386,8 +386,9 @@ def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:
     if thing.shape.get("type") == "ball":
         mesh = sphere(decode(thing.shape, Ball, f"{thing.name} shape", remedy=REMEDY).radius)
     elif thing.shape.get("type") == "mesh":
-        file = decode(thing.shape, MeshFile, f"{thing.name} shape", remedy=REMEDY).file
-        mesh = _user_mesh(spec.folder / file)
+        mesh = _user_mesh(
+            spec.folder / decode(thing.shape, MeshFile, f"{thing.name} shape", remedy=REMEDY).file
+        )
     else:
         mesh = make_mesh(thing.shape, thing.name)
     moved = mesh.moved(thing.scale, rotation(thing.rotation), np.array(thing.position, float))

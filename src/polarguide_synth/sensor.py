@@ -135,8 +135,11 @@ class FilterShot:
 def plan_shot(seed: int, number: int) -> FilterShot:
     """Return the angle, exposure and orientation of the photograph of view ``number``."""
     random = np.random.default_rng((seed, 47, number))
-    angle = STEP * int(random.integers(0, 180 // STEP))
-    return FilterShot(angle, float(random.uniform(-STOPS, STOPS)), int(random.choice(_TURNS)))
+    return FilterShot(
+        STEP * int(random.integers(0, 180 // STEP)),
+        float(random.uniform(-STOPS, STOPS)),
+        int(random.choice(_TURNS)),
+    )
 
 
 def behind_filter(stokes: Array, rays: Array, degrees: float) -> Array:
@@ -177,8 +180,9 @@ def filter_jpeg(
     _, data = cv2.imencode(
         ".jpg", np.ascontiguousarray(stored[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
     )
-    time = _TIME * Fraction(2.0**shot.stops) if shot.noted else None
-    block = b"Exif\0\0" + exif_tags(shot.orientation, time)
+    block = b"Exif\0\0" + exif_tags(
+        shot.orientation, _TIME * Fraction(2.0**shot.stops) if shot.noted else None
+    )
     segment = b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block
     return data[:2].tobytes() + segment + data[2:].tobytes()
 
