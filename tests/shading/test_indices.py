@@ -20,7 +20,7 @@ from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import RenderRequest, render, single_colors, splatting
 from polarguide.shading.model import PLAIN
 from polarguide.shading.result import RenderResult
-from polarguide.training.actions import outward_directions
+from polarguide.training.callbacks import outward_directions
 from polarguide.training.loop import TrainingLoop
 
 SHADING = DeferredShading("fresnel", local=True, metal=True, indices=True)
