@@ -1,4 +1,4 @@
-"""The one exception that means: the user's input or environment is at fault, and what to do about it."""
+"""Errors in the user's input or environment, with a remedy."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from typing import Any, NamedTuple
 
 
 class PolarguideError(Exception):
-    """A mistake in what was given to the program.
+    """Error in input.
 
-    The message names the file or field, what was expected, what was found, and what to do. The command line
-    prints it as one line without a traceback.
+    The message names the file or field, the expected and the actual value, and a remedy. The command line prints it as
+    one line without a traceback.
 
     Args:
-        where: the file, folder, flag or field.
-        expected: what should have been there.
-        found: what was there.
-        remedy: what to do about it.
+        where: file, folder, option or field.
+        expected: valid value, a noun phrase.
+        found: actual value.
+        remedy: how to correct the error, an imperative sentence.
     """
 
     def __init__(self, where: object, *, expected: str, found: str, remedy: str) -> None:
         super().__init__(f"{where}: expected {expected}, found {found}. {remedy}")
         self.where = str(where)
-        self.is_path = isinstance(where, os.PathLike)  # one may be called like an option
+        self.is_path = isinstance(where, os.PathLike)  # its name can look like an option
         self.expected = expected
         self.found = found
         self.remedy = remedy
@@ -134,16 +134,16 @@ def requirements() -> list[Requirement]:
 
 
 def require_package(module: str, what: str) -> None:
-    """Check that a package is there, without loading it: before work begins, not after. See ``optional_import``.
+    """Check that a package is installed before work begins, without importing it; see ``optional_import``.
 
     Raises:
         PolarguideError: the package is not installed.
     """
     try:
-        there = importlib.util.find_spec(module) is not None
-    except (ImportError, ValueError):  # a package whose own metadata is broken
-        there = False
-    if not there:
+        is_installed = importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):  # broken metadata of the package
+        is_installed = False
+    if not is_installed:
         raise _missing(module, what)
 
 
@@ -162,15 +162,20 @@ def optional_import(module: str, what: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError:
-        raise PolarguideError(
-            what,
-            expected=f"the Python package {module.partition('.')[0]}",
-            found="no such package",
-            remedy=f"Install it with {install_package(module)} and repeat the command.",
-        ) from None
+        raise _missing(module, what) from None
     finally:
         if before is not None and signal.getsignal(signal.SIGINT) is not before:
             signal.signal(signal.SIGINT, before)
+
+
+def _missing(module: str, what: str) -> PolarguideError:
+    """Return the error for a missing package."""
+    return PolarguideError(
+        what,
+        expected=f"the Python package {module.partition('.')[0]}",
+        found="no such package",
+        remedy=f"Install it with {install_package(module)} and repeat the command.",
+    )
 
 
 def import_part(module: str, what: str) -> Any:
