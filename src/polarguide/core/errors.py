@@ -173,7 +173,7 @@ def _missing(module: str, what: str) -> PolarguideError:
     return PolarguideError(
         what,
         expected=f"the Python package {module.partition('.')[0]}",
-        found="no such package",
+        found="package not installed",
         remedy=f"Install it with {install_package(module)} and repeat the command.",
     )
 
@@ -196,6 +196,6 @@ def import_part(module: str, what: str) -> Any:
         raise PolarguideError(
             what,
             expected=f"the package {package}, a part of polarguide",
-            found="no such package",
+            found="package not installed",
             remedy="Install polarguide again.",
         ) from None

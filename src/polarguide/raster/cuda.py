@@ -93,7 +93,7 @@ def load_gsplat(say: Callable[[str], None]) -> None:
         raise PolarguideError(
             "--device cuda",
             expected="the package gsplat",
-            found="no such package",
+            found="package not installed",
             remedy=f"Install it with {install_extra('cuda')} and repeat the command, or use --device cpu.",
         )
     notice = "compiling gsplat's CUDA kernels; this takes minutes, once for each machine and PyTorch ..."
