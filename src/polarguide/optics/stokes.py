@@ -47,15 +47,14 @@ def _of_full_scale(intensities: Any) -> Any:
     Raises:
         ValueError: the values are other integers.
     """
-    values = intensities.numpy() if intensities.dtype in (torch.uint8, torch.uint16) else intensities
-    if isinstance(values, np.ndarray) and values.dtype.kind == "u" and values.dtype.itemsize <= 2:
-        shares = values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max)
+    kind = getattr(intensities.dtype, "name", str(intensities.dtype).removeprefix("torch."))
+    if kind in ("uint8", "uint16"):
+        shares = np.asarray(intensities).astype(np.float32) / np.float32(np.iinfo(kind).max)
         return torch.from_numpy(shares) if isinstance(intensities, Tensor) else shares
-    kind = values.dtype.kind if isinstance(values, np.ndarray) else "f" if values.is_floating_point() else "i"
-    if kind in "iub":
-        found = f"found {values.dtype}; divide them by full scale"
+    if "int" in kind or kind == "bool":
+        found = f"found {intensities.dtype}; divide them by full scale"
         raise ValueError(f"intensities: expected floats, or codes of type uint8 or uint16, {found}")
-    return values
+    return intensities
 
 
 @for_arrays

@@ -12,6 +12,7 @@ background is 0.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -140,6 +141,15 @@ def check_shapes(splats: Splats, statistic: ScreenStatistic | None, still: tuple
         if len(set(chosen)) < len(chosen) or not all(0 <= channel < channels for channel in chosen):
             remedy = "Specify existing channels, each once."
             raise refusal(name, f"different channels below {channels}", str(chosen), remedy)
+
+
+def some_channels(values: Tensor, channels: Sequence[int]) -> Tensor:
+    """Return some channels of [..., D]: a slice if possible, and no index, which would be copied to the device."""
+    first = channels[0]
+    end = first + len(channels)
+    if list(channels) == list(range(first, end)):
+        return values[..., first:end]
+    return torch.stack([values[..., channel] for channel in channels], dim=-1)
 
 
 def not_finite(name: str, index: int) -> PolarguideError:
