@@ -103,7 +103,10 @@ def rasterize_cpu(
     check_shapes(splats, statistic, still)
     for name, tensor in splats._asdict().items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            found = f"{tensor.dtype} on {tensor.device}"
-            remedy = "Convert it, or use rasterize_reference."
-            raise refusal(name, "float32 on the CPU", found, remedy)
+            raise refusal(
+                name,
+                "float32 on the CPU",
+                f"{tensor.dtype} on {tensor.device}",
+                "Convert the tensor, or use rasterize_reference.",
+            )
     return Rasterized(*applied(_Rasterize, camera, statistic, still, *splats))
