@@ -19,7 +19,7 @@ view = run.scene.test_names[0]
 layers = run.render(view, layers=["final", "normal", "depth"])
 print(f"view {view}: mean radiance {layers['final'].mean():.4f}, median depth {layers['depth'].median():.3f}")
 
-# What polarguide eval, or run.evaluate(), has measured, if it has.
+# Scores of polarguide eval or run.evaluate(), if they exist.
 try:
     print(f"PSNR of the test views: {run.metrics()['psnr']:.2f} dB")
 except polarguide.PolarguideError as error:
