@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from polarguide.capture.sensor.pattern import SENSORS
-from polarguide.capture.write import write_png, write_view
+from polarguide.capture.write import write_png_file, write_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import Reporter
 from polarguide.geometry.camera import Camera
@@ -232,7 +232,7 @@ def render_view(job: Job, number: int) -> None:
     random = np.random.default_rng((settings.seed, 31, number))
     if job.mosaics:
         raw = mosaic(light.stokes * job.exposure, settings.sensor, settings.noise, random, job.sensor)
-        write_png(job.out / "raw" / f"{name}.png", raw)
+        write_png_file(job.out / "raw" / f"{name}.png", raw)
         light = LobeRadiance(_halved(light.specular), _halved(light.diffuse), _halved(light.emitted))
     stokes = light.stokes * job.exposure
     if job.has_ground_truth(name):

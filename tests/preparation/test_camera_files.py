@@ -445,7 +445,7 @@ def test_the_full_scale_that_a_file_states_is_used(tmp_path, kind, full):
     source = MosaicSource(tmp_path, settings)
     measured = source.measure(lambda done: None)
     assert (measured.levels.white, measured.levels.saturation) == (full, full)
-    assert f"{full} is full scale, as the files state" in measured.notes[-1]
+    assert f"{full} is full scale" in measured.notes[-1]
     shot = read_shot(path, ShotOptions(sensor="IMX250MZR"))
     assert any("full scale, as the file" in note for note in shot.notes)
 

@@ -38,7 +38,7 @@ from polarguide.capture.write import (
     intensity_codes,
     picture_name,
     picture_names,
-    write_png,
+    write_png_file,
     write_view,
 )
 from polarguide.core.errors import PolarguideError
@@ -379,8 +379,8 @@ class Workshop:
                 if view not in known or not path.exists():
                     done = developed(self._pictures, view, measured)
                     if done.mask is not None:
-                        write_png(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
-                    write_png(path, tone_mapped(done.intensities, self._settings.sfm_pictures))
+                        write_png_file(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
+                    write_png_file(path, tone_mapped(done.intensities, self._settings.sfm_pictures))
                     known[view] = done.record.geometry
                     self._folder.save()
                 advance(count)

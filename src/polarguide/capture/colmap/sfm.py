@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from polarguide.capture.colmap import steps
 from polarguide.capture.colmap.model import PosedCamera, colmap_camera, load_model
 from polarguide.capture.filter.camera_files import Lens
-from polarguide.capture.write import write_png
+from polarguide.capture.write import write_png_file
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder, writing
 from polarguide.core.progress import Reporter
@@ -138,7 +138,7 @@ def _copy_masks(masks: Path, sizes: Mapping[str, tuple[int, int]]) -> Path:
             with writing(copy):
                 shutil.copyfile(mask, copy)
         else:
-            write_png(copy, np.full((height, width), 255, np.uint8))
+            write_png_file(copy, np.full((height, width), 255, np.uint8))
     return folder
 
 
