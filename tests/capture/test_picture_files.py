@@ -255,7 +255,7 @@ def test_bmp_variants(tmp_path: Path, bits: int, options: dict[str, range], shap
     np.testing.assert_array_equal(found, expected)
     for length in (20, 60, len(data) - 1):
         assert "a BMP file cut short" in str(find_damage(data[:length]))
-    assert "no place of its pixels" in str(find_damage(data[:10] + bytes(4) + data[14:]))
+    assert "place of its pixels" in str(find_damage(data[:10] + bytes(4) + data[14:]))
 
 
 @pytest.mark.parametrize(("kind", "channels"), [(b"P5", 1), (b"P6", 3)])
