@@ -396,13 +396,13 @@ def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor:
 def _check_truth(path: Path, name: str, array: NDArray[Any], size: tuple[int, int]) -> None:
     """Refuse an array of another size or type, or with impossible values."""
     shape = (*size, _CHANNELS[name]) if _CHANNELS[name] else size
-    if array.shape != shape or array.dtype.kind not in "biuf":
-        raise PolarguideError(
-            f"{path} ({name})",
-            expected=f"an array of shape {list(shape)} like the pictures",
-            found=f"{array.dtype} of shape {list(array.shape)}",
-            remedy="Write the ground truth at the size of the pictures.",
-        )
+    require(
+        array.shape == shape and array.dtype.kind in "biuf",
+        f"{path} ({name})",
+        expected=f"an array of shape {list(shape)} like the pictures",
+        found=f"{array.dtype} of shape {list(array.shape)}",
+        remedy="Write the ground truth at the size of the pictures.",
+    )
     if name == "objid" and (
         array.dtype.kind not in "iu" or not 0 <= array.min() <= array.max() <= LARGEST_ID
     ):
@@ -425,10 +425,10 @@ def _check_truth(path: Path, name: str, array: NDArray[Any], size: tuple[int, in
         return
     most = min(_LARGEST_TRUTH, float(np.finfo(array.dtype).max))
     broken = array.size - int(np.count_nonzero(np.abs(array) <= most))  # NaN compares False
-    if broken:
-        raise PolarguideError(
-            f"{path} ({name})",
-            expected=f"finite numbers up to {_LARGEST_TRUTH:g}",
-            found=f"{broken} of {array.size} values that are NaN, infinite or larger",
-            remedy="Write 0 for unknown or too large values, and set these pixels of the mask to 0.",
-        )
+    require(
+        not broken,
+        f"{path} ({name})",
+        expected=f"finite numbers up to {_LARGEST_TRUTH:g}",
+        found=f"{broken} of {array.size} values that are NaN, infinite or larger",
+        remedy="Write 0 for unknown or too large values, and set these pixels of the mask to 0.",
+    )

@@ -19,7 +19,7 @@ from polarguide.capture.box_filter import agreed, every, maximum, mean_codes
 from polarguide.capture.exposures import FOUR, PLAIN, Exposure
 from polarguide.capture.scene import Scene
 from polarguide.capture.view import EVEN, FULL_CODE, Latest, Loader, View
-from polarguide.core.errors import PolarguideError, require
+from polarguide.core.errors import require
 from polarguide.core.options import EXPOSURES, Exposures, check_choice
 from polarguide.geometry.camera import seen_at
 from polarguide.geometry.polarizer import ANGLES
@@ -74,13 +74,13 @@ def mask_background(scene: Scene) -> Scene:
     """
     views = []
     for view in scene.views:
-        if view.mask is None:
-            raise PolarguideError(
-                scene.root / "masks",
-                expected="a mask of every view for --background masked",
-                found=f"no mask for view {view.name}",
-                remedy=f"Add masks/{view.name}.png, white where the subject is, or choose another background.",
-            )
+        require(
+            view.mask is not None,
+            scene.root / "masks",
+            expected="a mask of every view for --background masked",
+            found=f"no mask for view {view.name}",
+            remedy=f"Add masks/{view.name}.png, white where the subject is, or choose another background.",
+        )
         views.append(view.masked())
     # Training must not use the masks of held-out views.
     inside = _in_masks(scene.points, [view for view in views if view.name not in scene.test_names])

@@ -615,22 +615,22 @@ def is_sound(image: Any, camera: Any, tolerance: float) -> bool:
 def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
     """Convert pycolmap's image and camera to a ``Camera``."""
     where = f"{folder} (camera {camera.camera_id}, image {image.name})"
-    if not is_pinhole(camera):
-        raise PolarguideError(
-            where,
-            expected="an undistorted camera (PINHOLE or SIMPLE_PINHOLE)",
-            found=f"{camera.model_name} with parameters {', '.join(f'{value:g}' for value in camera.params)}",
-            remedy="Undistort the four intensities of each view, and the model with them.",
-        )
+    require(
+        is_pinhole(camera),
+        where,
+        expected="an undistorted camera (PINHOLE or SIMPLE_PINHOLE)",
+        found=f"{camera.model_name} with parameters {', '.join(f'{value:g}' for value in camera.params)}",
+        remedy="Undistort the four intensities of each view, and the model with them.",
+    )
     pose = image.cam_from_world()
     inner = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
-    if not is_sound(image, camera, 1e-6):
-        raise PolarguideError(
-            where,
-            expected=f"a unit quaternion, a translation up to {FARTHEST:g} and {LENS}",
-            found=f"quaternion {pose.rotation.quat}, translation {pose.translation}, intrinsics {inner}",
-            remedy="Export the model again.",
-        )
+    require(
+        is_sound(image, camera, 1e-6),
+        where,
+        expected=f"a unit quaternion, a translation up to {FARTHEST:g} and {LENS}",
+        found=f"quaternion {pose.rotation.quat}, translation {pose.translation}, intrinsics {inner}",
+        remedy="Export the model again.",
+    )
     rotation, translation = (
         torch.from_numpy(np.array(part, np.float64)) for part in (pose.rotation.matrix(), pose.translation)
     )

@@ -206,13 +206,13 @@ class Poses:
         )
         self._images = {view: images[view][0] for view in self.views}
         for view in self.views:
-            if len(images[view]) > 1:
-                raise PolarguideError(
-                    self.folder,
-                    expected=f"one image called {view}",
-                    found=", ".join(sorted(image.name for image in images[view])),
-                    remedy="Keep one of them.",
-                )
+            require(
+                len(images[view]) == 1,
+                self.folder,
+                expected=f"one image called {view}",
+                found=", ".join(sorted(image.name for image in images[view])),
+                remedy="Keep one of them.",
+            )
             self._require_numbers(view)
         self._warps: dict[tuple[int, Geometry], Undistortion] = {}
         self._of_camera: dict[int, Undistortion] = {}
@@ -296,13 +296,13 @@ class Poses:
         if key not in self._warps:
             self._warps[key] = undistortion(camera_for_picture(self._model.cameras[number], geometry, where))
         warp = self._warps[key]
-        if self._of_camera.setdefault(number, warp) is not warp:
-            raise PolarguideError(
-                where,
-                expected="pictures of one size for one camera",
-                found=f"{geometry.size[0]}x{geometry.size[1]} and another size",
-                remedy="Use a separate camera in the model for each size.",
-            )
+        require(
+            self._of_camera.setdefault(number, warp) is warp,
+            where,
+            expected="pictures of one size for one camera",
+            found=f"{geometry.size[0]}x{geometry.size[1]} and another size",
+            remedy="Use a separate camera in the model for each size.",
+        )
         return warp
 
     def write(self, folder: Path) -> None:
@@ -329,13 +329,13 @@ class Poses:
         if not is_sound(image, camera, 1e-3):
             pose = image.cam_from_world()
             length = float(np.linalg.norm(pose.rotation.quat))
-            if 1e-3 < abs(length - 1) < FARTHEST:
-                raise PolarguideError(
-                    f"{self.folder} (image {image.name})",
-                    expected="a quaternion of length 1",
-                    found=f"one of length {length:g}",
-                    remedy="Normalize the quaternion, or export the model again.",
-                )
+            require(
+                not 1e-3 < abs(length - 1) < FARTHEST,
+                f"{self.folder} (image {image.name})",
+                expected="a quaternion of length 1",
+                found=f"one of length {length:g}",
+                remedy="Normalize the quaternion, or export the model again.",
+            )
             raise PolarguideError(
                 f"{self.folder} (image {image.name})",
                 expected=f"a pose and a lens of numbers up to {FARTHEST:g}, {LENS}",

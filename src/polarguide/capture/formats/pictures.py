@@ -95,15 +95,15 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
 
 def _codes_of_floats(path: Path, pixels: NDArray[Any]) -> NDArray[np.uint16]:
     """Convert intensities from 0 to 1 to 16-bit codes."""
-    if not np.isfinite(pixels).all() or float(np.median(pixels)) > 1.0:
-        raise PolarguideError(
-            path,
-            expected="floating-point values from 0 to 1, where 1 is full scale",
-            found="values that are not finite"
-            if not np.isfinite(pixels).all()
-            else f"up to {float(pixels.max()):g}",
-            remedy="Divide by the value at which the camera saturates, or save 16-bit whole numbers.",
-        )
+    require(
+        np.isfinite(pixels).all() and float(np.median(pixels)) <= 1.0,
+        path,
+        expected="floating-point values from 0 to 1, where 1 is full scale",
+        found="values that are not finite"
+        if not np.isfinite(pixels).all()
+        else f"up to {float(pixels.max()):g}",
+        remedy="Divide by the value at which the camera saturates, or save 16-bit whole numbers.",
+    )
     # Half precision ends at 65504, below the largest code, so double precision is used.
     return np.rint(np.clip(pixels.astype(np.float64), 0.0, 1.0) * FULL_CODE).astype(np.uint16)
 
@@ -172,13 +172,13 @@ def _require_one_mask(path: Path, pixels: NDArray[Any], mask: NDArray[np.bool_])
     if pixels.shape[2:] != (4,) or pixels.dtype.kind != "u":
         return
     opaque = pixels[..., 3] > np.iinfo(pixels.dtype).max // 2
-    if not opaque.all() and (opaque != mask).any():
-        raise PolarguideError(
-            path,
-            expected="a mask without transparency",
-            found=f"{1 - float(opaque.mean()):.1%} of it transparent, in contradiction to its colors",
-            remedy="Save it as a gray picture, white where the mask is.",
-        )
+    require(
+        opaque.all() or (opaque == mask).all(),
+        path,
+        expected="a mask without transparency",
+        found=f"{1 - float(opaque.mean()):.1%} of it transparent, in contradiction to its colors",
+        remedy="Save it as a gray picture, white where the mask is.",
+    )
 
 
 def decode_materials(path: Path, data: bytes) -> NDArray[np.uint8]:
@@ -196,13 +196,13 @@ def decode_materials(path: Path, data: bytes) -> NDArray[np.uint8]:
         remedy=f"Save it as PNG. {MATERIAL_REMEDY}",
     )
     gray = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)
-    if int(gray.max(initial=0)) > MOST_MATERIAL:
-        raise PolarguideError(
-            path,
-            expected=f"the numbers of materials, up to {MOST_MATERIAL}",
-            found=f"{int(gray.max())}",
-            remedy=MATERIAL_REMEDY,
-        )
+    require(
+        int(gray.max(initial=0)) <= MOST_MATERIAL,
+        path,
+        expected=f"the numbers of materials, up to {MOST_MATERIAL}",
+        found=f"{int(gray.max())}",
+        remedy=MATERIAL_REMEDY,
+    )
     return np.asarray(gray, np.uint8)
 
 

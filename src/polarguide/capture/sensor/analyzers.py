@@ -21,7 +21,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from polarguide.capture.sensor.pattern import SENSORS, Pattern, sensor_pattern
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import in_utf8, require_file, write_whole
 from polarguide.core.records import decode
 from polarguide.geometry.polarizer import ANGLES
@@ -159,13 +159,13 @@ class AnalyzerCalibration:
         Raises:
             PolarguideError: the calibration is of another sensor.
         """
-        if sensor is not None and sensor != self.sensor:
-            raise PolarguideError(
-                where,
-                expected=f"a calibration of the sensor {sensor}",
-                found=f"the calibration of {self.sensor}",
-                remedy="Use the calibration of this camera, or the --sensor of the calibration.",
-            )
+        require(
+            sensor is None or sensor == self.sensor,
+            where,
+            expected=f"a calibration of the sensor {sensor}",
+            found=f"the calibration of {self.sensor}",
+            remedy="Use the calibration of this camera, or the --sensor of the calibration.",
+        )
 
     def require_region(self, offset: tuple[int, int], size: tuple[int, int], where: object) -> None:
         """Refuse a region outside the calibrated one.
@@ -181,13 +181,13 @@ class AnalyzerCalibration:
             low <= start and start + length <= low + side
             for low, side, start, length in zip(self.offset, self.size, offset, size, strict=True)
         )
-        if not inside:
-            raise PolarguideError(
-                where,
-                expected=f"a calibration that covers {_region(offset, size)}",
-                found=f"the calibration of {_region(self.offset, self.size)}",
-                remedy="Calibrate with the region of these files; --offset-x and --offset-y specify its start.",
-            )
+        require(
+            inside,
+            where,
+            expected=f"a calibration that covers {_region(offset, size)}",
+            found=f"the calibration of {_region(self.offset, self.size)}",
+            remedy="Calibrate with the region of these files; --offset-x and --offset-y specify its start.",
+        )
 
     def record(self) -> dict[str, str]:
         """Return the calibration's entry in ``scene.json``."""
@@ -300,13 +300,13 @@ class AnalyzerCalibration:
         columns, rows = ((self.offset[axis] + self.size[axis] - start[axis]) // 2 * 2 for axis in (0, 1))
         height, width = shape
         fitting = [step for step in (1, 2, 4) if (rows // step, columns // step) == (height, width)]
-        if scale is None and not fitting:
-            raise PolarguideError(
-                "calibration",
-                expected=f"the calibration of a sensor with pictures of {width}x{height} pixels",
-                found=f"the calibration of {_region(self.offset, self.size)}",
-                remedy="Use the calibration of this camera, made with the region of these pictures.",
-            )
+        require(
+            scale is not None or fitting,
+            "calibration",
+            expected=f"the calibration of a sensor with pictures of {width}x{height} pixels",
+            found=f"the calibration of {_region(self.offset, self.size)}",
+            remedy="Use the calibration of this camera, made with the region of these pictures.",
+        )
         step = fitting[0] if scale is None else scale
         self.require_region(start, (width * step, height * step), "calibration")
         return self.correction_of_angles(start, (width * step, height * step), step)
@@ -493,15 +493,18 @@ def read_analyzers(path: Path) -> AnalyzerCalibration:
     if _ENTRY not in entries or vectors is None:
         raise _damaged(path, "another safetensors file")
     metadata = decode(entries[_ENTRY].encode(), _Metadata, path, remedy=_REMEDY)
-    if metadata.format != FORMAT or metadata.version != VERSION:
-        raise _damaged(path, f"{metadata.format}, version {metadata.version}")
-    if _checksum(metadata, vectors) != metadata.sha256:
-        raise PolarguideError(
-            path,
-            expected=f"content with the checksum {metadata.sha256[:16]}...",
-            found="other content: the file is damaged or was changed",
-            remedy=_REMEDY,
-        )
+    _require(
+        metadata.format == FORMAT and metadata.version == VERSION,
+        path,
+        f"{metadata.format}, version {metadata.version}",
+    )
+    require(
+        _checksum(metadata, vectors) == metadata.sha256,
+        path,
+        expected=f"content with the checksum {metadata.sha256[:16]}...",
+        found="other content: the file is damaged or was changed",
+        remedy=_REMEDY,
+    )
     calibration = AnalyzerCalibration(
         metadata.sensor, metadata.lens, (metadata.offset_x, metadata.offset_y), (metadata.width, metadata.height),
         metadata.block, vectors, metadata.reference, metadata.polarizer_extinction, metadata.sha256,
@@ -516,33 +519,47 @@ def _require_sound(path: Path, calibration: AnalyzerCalibration) -> None:
     Raises:
         PolarguideError: the sensor is unknown, or the vectors have another shape or belong to no polarizer.
     """
-    if calibration.sensor not in SENSORS:
-        raise _damaged(path, f"the unknown sensor {calibration.sensor!r}")
+    _require(calibration.sensor in SENSORS, path, f"the unknown sensor {calibration.sensor!r}")
     period = calibration.pattern.period
     shape = (*grid_shape(calibration.offset, calibration.size, calibration.block), period, period, 3)
-    if (
-        calibration.block % period
-        or calibration.vectors.shape != shape
-        or calibration.vectors.dtype != np.float32
-    ):
-        raise _damaged(
-            path,
-            f"vectors {list(calibration.vectors.shape)} of {calibration.vectors.dtype} instead of {list(shape)}",
-        )
+    _require(
+        calibration.block % period == 0
+        and calibration.vectors.shape == shape
+        and calibration.vectors.dtype == np.float32,
+        path,
+        f"vectors {list(calibration.vectors.shape)} of {calibration.vectors.dtype} instead of {list(shape)}",
+    )
     gain = calibration.vectors[..., 0]
-    if not (np.isfinite(calibration.vectors).all() and (gain > 0).all()):
-        raise _damaged(path, "vectors that are not finite or have no throughput")
-    if gain.min() < 1 / MOST_THROUGHPUT or gain.max() > MOST_THROUGHPUT:
-        raise _damaged(path, f"throughputs of {gain.min():g} to {gain.max():g} instead of a mean of 1/2")
-    if (
-        np.hypot(calibration.vectors[..., 1], calibration.vectors[..., 2]) < LEAST_DIATTENUATION * gain
-    ).any():
-        raise _damaged(path, "vectors of pixels that hardly polarize")
+    _require(
+        np.isfinite(calibration.vectors).all() and (gain > 0).all(),
+        path,
+        "vectors that are not finite or have no throughput",
+    )
+    _require(
+        gain.min() >= 1 / MOST_THROUGHPUT and gain.max() <= MOST_THROUGHPUT,
+        path,
+        f"throughputs of {gain.min():g} to {gain.max():g} instead of a mean of 1/2",
+    )
+    _require(
+        (
+            np.hypot(calibration.vectors[..., 1], calibration.vectors[..., 2]) >= LEAST_DIATTENUATION * gain
+        ).all(),
+        path,
+        "vectors of pixels that hardly polarize",
+    )
     nominal = 2 * np.radians(calibration.pattern.angles)
     angles = np.arctan2(calibration.vectors[..., 2], calibration.vectors[..., 1])
     # Equal angles would not determine the light.
-    if (np.cos(angles - nominal) < np.cos(2 * FARTHEST_ANGLE)).any():
-        raise _damaged(path, "vectors of polarizers far from the sensor's angles")
+    _require(
+        (np.cos(angles - nominal) >= np.cos(2 * FARTHEST_ANGLE)).all(),
+        path,
+        "vectors of polarizers far from the sensor's angles",
+    )
+
+
+def _require(condition: object, path: Path, found: str) -> None:
+    if not condition:
+        raise _damaged(path, found)
 
 
 def _damaged(path: Path, found: str) -> PolarguideError:

@@ -13,7 +13,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 from tyro.constructors import PrimitiveConstructorSpec
 
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 
 _CELL = np.array([[90, 45], [135, 0]])
 _BAYER = np.array([[0, 1], [1, 2]])  # R G / G B, one entry per polarizer cell
@@ -269,26 +269,26 @@ def estimate_levels(
         bits = stated.bit_length()
     elif bits is None:
         bits = (None if alone else clipped) or (12 if container == 16 and largest < 4096 else container)
-    if largest >= 1 << bits:
-        raise PolarguideError(
-            "--bits",
-            expected=f"values below {1 << bits} for {bits} bits",
-            found=str(largest),
-            remedy="Enter the number of bits that the files use.",
-        )
+    require(
+        largest < 1 << bits,
+        "--bits",
+        expected=f"values below {1 << bits} for {bits} bits",
+        found=str(largest),
+        remedy="Enter the number of bits that the files use.",
+    )
     white = stated or (1 << bits) - 1
     unused = (used & -used).bit_length() - 1 if used else 0
     if container == 16 and 0 < unused <= 8:
         white = white >> unused << unused
     top = white if clipped is None else min(white, largest)
     top = top if saturation is None else saturation
-    if not 0 <= black < top <= white:
-        raise PolarguideError(
-            "--black-level" if not 0 <= black < white else "--saturation",
-            expected=f"0 <= black level < saturation <= {white}",
-            found=f"black level {black:g}, saturation {top}",
-            remedy=f"Enter both in stored values, for {bits} bits.",
-        )
+    require(
+        0 <= black < top <= white,
+        "--black-level" if not 0 <= black < white else "--saturation",
+        expected=f"0 <= black level < saturation <= {white}",
+        found=f"black level {black:g}, saturation {top}",
+        remedy=f"Enter both in stored values, for {bits} bits.",
+    )
     return Levels(bits, white, top, float(black))
 
 
@@ -300,13 +300,13 @@ def agreed_full_scale(stated: Mapping[Path, int | None]) -> int | None:
     """
     (first, full), *others = stated.items()
     for path, other in others:
-        if other != full:
-            raise PolarguideError(
-                path,
-                expected=f"{_full_text(full)}, like {first.name}",
-                found=_full_text(other),
-                remedy="Export all files with the same settings, or use --bits.",
-            )
+        require(
+            other == full,
+            path,
+            expected=f"{_full_text(full)}, like {first.name}",
+            found=_full_text(other),
+            remedy="Export all files with the same settings, or use --bits.",
+        )
     return full
 
 

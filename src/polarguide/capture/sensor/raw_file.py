@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from polarguide.capture.formats.arrays import array_kind, read_array
 from polarguide.capture.formats.pictures import decode_stored, read_picture, stated_full_scale
 from polarguide.capture.sensor.pattern import Packing
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import read_file
 
 PACKINGS: dict[Packing, tuple[int, int, int]] = {
@@ -116,21 +116,21 @@ def require_mosaic(where: Path | str, values: NDArray[Any], *, least: int) -> No
     Raises:
         PolarguideError: the mosaic is too small, or consists of four pictures.
     """
-    if min(values.shape) < least:
-        raise PolarguideError(
-            where,
-            expected=f"a mosaic of at least {least}x{least} pixels",
-            found=f"{values.shape[1]}x{values.shape[0]}",
-            remedy="Use the whole picture of the sensor.",
-        )
-    if is_tiled(values):
-        raise PolarguideError(
-            where,
-            expected="a raw mosaic, in which the four angles alternate from pixel to pixel",
-            found="the same view four times, side by side",
-            remedy="Save the output of the sensor (a pixel format such as Mono12 or BayerRG12), not one with separate "
-            "angles; or cut the file into four shots, NAME_0, NAME_45, NAME_90 and NAME_135.",
-        )
+    require(
+        min(values.shape) >= least,
+        where,
+        expected=f"a mosaic of at least {least}x{least} pixels",
+        found=f"{values.shape[1]}x{values.shape[0]}",
+        remedy="Use the whole picture of the sensor.",
+    )
+    require(
+        not is_tiled(values),
+        where,
+        expected="a raw mosaic, in which the four angles alternate from pixel to pixel",
+        found="the same view four times, side by side",
+        remedy="Save the output of the sensor (a pixel format such as Mono12 or BayerRG12), not one with separate "
+        "angles; or cut the file into four shots, NAME_0, NAME_45, NAME_90 and NAME_135.",
+    )
 
 
 def _read_plain(path: Path, raw: RawFormat) -> NDArray[Any]:
@@ -139,22 +139,22 @@ def _read_plain(path: Path, raw: RawFormat) -> NDArray[Any]:
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     values = values.astype(values.dtype.newbyteorder("="), copy=False)
-    if values.ndim != 2 or values.dtype not in (np.uint8, np.uint16) or 0 in values.shape:
-        raise PolarguideError(
-            path,
-            expected="a raw mosaic: one channel of 8- or 16-bit whole numbers",
-            found=array_kind(values),
-            remedy="Save the output of the sensor before any demosaicing or conversion to color.",
-        )
+    require(
+        values.ndim == 2 and values.dtype in (np.uint8, np.uint16) and 0 not in values.shape,
+        path,
+        expected="a raw mosaic: one channel of 8- or 16-bit whole numbers",
+        found=array_kind(values),
+        remedy="Save the output of the sensor before any demosaicing or conversion to color.",
+    )
     size = (values.shape[1], values.shape[0])
     expected = (raw.width or size[0], raw.height or size[1])
-    if size != expected:
-        raise PolarguideError(
-            path,
-            expected=f"{expected[0]}x{expected[1]} pixels, as specified by --width and --height",
-            found=f"{size[0]}x{size[1]}",
-            remedy="Omit the two options for files that state their size.",
-        )
+    require(
+        size == expected,
+        path,
+        expected=f"{expected[0]}x{expected[1]} pixels, as specified by --width and --height",
+        found=f"{size[0]}x{size[1]}",
+        remedy="Omit the two options for files that state their size.",
+    )
     return values
 
 
@@ -168,13 +168,13 @@ def _read_packed(path: Path, data: bytes, raw: RawFormat) -> NDArray[Any]:
             remedy=f"Specify the settings of the camera; packings are {', '.join(PACKINGS)} and are never guessed.",
         )
     size = packed_size(raw.width, raw.height, raw.packing)
-    if len(data) != size:
-        raise PolarguideError(
-            path,
-            expected=f"{size} bytes for {raw.width}x{raw.height} pixels in {raw.packing}",
-            found=f"{len(data)}",
-            remedy="Check --width, --height and --packing; a short file may be truncated.",
-        )
+    require(
+        len(data) == size,
+        path,
+        expected=f"{size} bytes for {raw.width}x{raw.height} pixels in {raw.packing}",
+        found=f"{len(data)}",
+        remedy="Check --width, --height and --packing; a short file may be truncated.",
+    )
     values = unpack(data, raw.width, raw.height, raw.packing)
     _require_smooth(path, data, values, raw.packing)
     return values
@@ -261,10 +261,10 @@ def _require_smooth(path: Path, data: bytes, values: NDArray[Any], packing: Pack
     rough = {options: _worst_roughness(unpack(data, *other)) for options, other in others.items()}
     # The smoothest one, because two packings that differ only in the low bits are both smooth.
     for options in sorted(rough, key=lambda options: rough[options])[:1]:
-        if own > _ROUGHER * rough[options] > 0:
-            raise PolarguideError(
-                path,
-                expected="a picture with similar neighbors behind one analyzer",
-                found=f"noise with --packing {packing} at {width}x{height}",
-                remedy=f"Read the file with {options}.",
-            )
+        require(
+            not own > _ROUGHER * rough[options] > 0,
+            path,
+            expected="a picture with similar neighbors behind one analyzer",
+            found=f"noise with --packing {packing} at {width}x{height}",
+            remedy=f"Read the file with {options}.",
+        )
