@@ -34,8 +34,7 @@ from relief import DEPTHS, write_relief
 from polarguide.capture import load_scene
 from polarguide.capture.colmap import triangulate as points_module
 from polarguide.capture.colmap.model import PosedCamera, posed_model
-from polarguide.capture.colmap.sfm import match_features, tone_mapped
-from polarguide.capture.colmap.triangulate import sample_visual_hull
+from polarguide.capture.colmap.sfm import match_features, sample_visual_hull, tone_mapped
 from polarguide.capture.write import write_png_file
 from polarguide.core.progress import SILENT
 from polarguide.preparation.prepare import prepare_scene

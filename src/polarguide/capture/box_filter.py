@@ -70,5 +70,6 @@ def _boxed(values: NDArray[Any], factor: int) -> NDArray[Any]:
     """Split [H, W, ...] into boxes [H // K, K, W // K, K, ...]."""
     rows = values.shape[0] // factor
     columns = values.shape[1] // factor
-    cut = values[: rows * factor, : columns * factor]
-    return cut.reshape(rows, factor, columns, factor, *values.shape[2:])
+    return values[: rows * factor, : columns * factor].reshape(
+        rows, factor, columns, factor, *values.shape[2:]
+    )

@@ -281,8 +281,7 @@ def _numbered_folders(folders: Sequence[Path]) -> dict[int, Path]:
     sets: dict[tuple[str, str], dict[int, Path]] = {}
     for path in folders:
         for match in _NUMBER.finditer(path.name):
-            rest = path.name[: match.start()], path.name[match.end() :]
-            sets.setdefault(rest, {})[int(match[0])] = path
+            sets.setdefault((path.name[: match.start()], path.name[match.end() :]), {})[int(match[0])] = path
     complete = [by_angle for by_angle in sets.values() if set(by_angle) == set(ANGLES)]
     return complete[0] if len(complete) == 1 else {}
 

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from polarguide.capture import box_filter as boxes
 from polarguide.capture.calibration import Calibration, Sense, combined
-from polarguide.capture.formats.arrays import decode_arrays
-from polarguide.capture.formats.pictures import MOST_MATERIAL
+from polarguide.capture.formats.pictures import MOST_MATERIAL, decode_arrays
 from polarguide.core.errors import PolarguideError, require, unknown_view
 from polarguide.core.records import decode
 from polarguide.core.text import canonical

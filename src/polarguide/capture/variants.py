@@ -47,8 +47,7 @@ def black_pixels(view: View) -> Tensor:
 
 def has_black_background(views: Sequence[View]) -> bool:
     """Return True if nearly all pictures have a black edge, see ``BLACK_EDGE``."""
-    black = sum(_black_edge(view) for view in views)
-    return bool(views) and black >= BLACK_VIEWS * len(views)
+    return bool(views) and sum(_black_edge(view) for view in views) >= BLACK_VIEWS * len(views)
 
 
 def empty_pixels(view: View) -> Tensor:

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Geometry, Poses
-from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError, reconstruct, tone_mapped
-from polarguide.capture.colmap.triangulate import add_points
+from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError, add_points, reconstruct, tone_mapped
 from polarguide.capture.exposures import Angle
 from polarguide.capture.filter.camera_files import TURNS
 from polarguide.capture.filter.consecutive import chosen_matching

@@ -384,8 +384,10 @@ def read_model(root: Path) -> ColmapModel:
         remedy="Triangulate points with the known poses (colmap point_triangulator).",
     )
     beyond = f"not finite, or farther than {FARTHEST:g}, and were ignored."
-    warning = f"{dropped} of {dropped + len(points)} 3D points are {beyond}"
-    warnings = (*stale, *([warning] if dropped else []))
+    warnings = (
+        *stale,
+        *([f"{dropped} of {dropped + len(points)} 3D points are {beyond}"] if dropped else []),
+    )
     rows = {number: row for row, number in enumerate(numbers)}
     return ColmapModel(folder, files, points, colors, warnings, images, dict(model.cameras), tracks, rows)
 

@@ -312,8 +312,9 @@ class Poses:
             if image.camera_id in self._of_camera and len(image.points2D):
                 places = np.array([point.xy for point in image.points2D])
                 rays = np.nan_to_num(model.cameras[image.camera_id].cam_from_img(places))
-                target = self._of_camera[image.camera_id].target
-                moved = target.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+                moved = self._of_camera[image.camera_id].target.img_from_cam(
+                    np.column_stack([rays, np.ones(len(rays))])
+                )
                 for point, place in zip(image.points2D, moved, strict=True):
                     point.xy = place
         for number, warp in self._of_camera.items():

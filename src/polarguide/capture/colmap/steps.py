@@ -141,8 +141,9 @@ def run_request() -> None:
     pycolmap.set_random_seed(request["seed"])
     try:
         step = STEPS[request["step"]]
-        value = step(request["seed"], lambda count: print(count, file=answers), **request["arguments"])
-        answer = {"value": value}
+        answer = {
+            "value": step(request["seed"], lambda count: print(count, file=answers), **request["arguments"])
+        }
     except Exception as error:  # any C++ error
         lines = str(error).strip().splitlines() or [type(error).__name__]
         answer = {"error": lines[0].rstrip(".")}

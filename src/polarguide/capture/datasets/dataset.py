@@ -16,14 +16,17 @@ from scipy.linalg import rq
 
 from polarguide.capture.calibration import Sense
 from polarguide.capture.colmap.model import PosedCamera
-from polarguide.capture.formats.arrays import (
+from polarguide.capture.formats.pictures import (
+    SUFFIXES,
+    decode_mask,
+    decode_stored,
     finite_numbers,
     read_arrays,
+    read_picture,
     read_radiance,
     require_camera,
     wrong_camera,
 )
-from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, decode_stored, read_picture
 from polarguide.capture.layout import index_files
 from polarguide.core.errors import PolarguideError, PolarguideWarning, require
 from polarguide.core.text import listed
@@ -277,7 +280,8 @@ _LARGEST_SKEW = 1e-3
 """Largest skew of a pixel, relative to the focal length."""
 # Entries of IDR and related programs.
 _IDR_ENTRY = re.compile(r"((world|scale|camera)_mat_(inv_)?|pose_mat_)\d{1,6}")
-_SQUARE = ((3, 4), (4, 4))
+POSE_SHAPES = ((3, 4), (4, 4))
+"""Shapes of a camera pose in files."""
 Matrix = NDArray[np.float64]
 
 
@@ -327,7 +331,7 @@ def read_projections(path: Path) -> Projections:
             f"{inner_key}, which scales them to a picture from -1 to 1",
         )
         require_entries(path, arrays, scale_key)
-        world = finite_numbers(f"{path} ({key})", arrays[key], _SQUARE)
+        world = finite_numbers(f"{path} ({key})", arrays[key], POSE_SHAPES)
         scale = finite_numbers(f"{path} ({scale_key})", arrays[scale_key], ((4, 4),))
         size = float(np.linalg.norm(scale[:3, :3], 2))
         if size:  # the matrix must be a rotation with a uniform scale
@@ -375,12 +379,13 @@ def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Mat
     return checked_intrinsics(where, inner / inner[2, 2]), rotation, translation
 
 
-def checked_intrinsics(where: object, inner: Matrix) -> Matrix:
-    """Check an intrinsic matrix and return it.
+def checked_intrinsics(where: object, matrix: object) -> Matrix:
+    """Check an intrinsic matrix, which may be padded to 3x4 or 4x4, and return its [3, 3] part.
 
     Raises:
-        PolarguideError: focal lengths are not positive, or pixels are skewed.
+        PolarguideError: the shape is invalid, focal lengths are not positive, or pixels are skewed.
     """
+    inner = finite_numbers(where, matrix, ((3, 3), *POSE_SHAPES))[:3, :3]
     lower = np.abs([inner[1, 0], inner[2, 0], inner[2, 1], inner[2, 2] - 1]).max()
     skew = abs(inner[0, 1]) / max(abs(inner[0, 0]), 1e-12)
     require_camera(
@@ -425,8 +430,13 @@ def distorted_camera(
         PolarguideError: the number of coefficients differs.
     """
     k = finite_numbers(where, np.ravel(np.asarray(coefficients)), ((4,), (5,), (8,)))
-    padded = [*k, *[0.0] * (8 - len(k))]
-    parameters = (inner[0, 0], inner[1, 1], inner[0, 2] + 0.5, inner[1, 2] + 0.5, *padded)
+    parameters = (
+        inner[0, 0],
+        inner[1, 1],
+        inner[0, 2] + 0.5,
+        inner[1, 2] + 0.5,
+        *[*k, *[0.0] * (8 - len(k))],
+    )
     rotation, translation = pose
     return PosedCamera(*size, "FULL_OPENCV", tuple(float(p) for p in parameters), rotation, translation)
 

@@ -331,8 +331,9 @@ def heif_damage(data: bytes) -> str | None:
 def heif_tags(data: bytes) -> bytes:
     """Return the EXIF block of a HEIC file; empty without a block or without the package pillow-heif."""
     try:
-        opened = optional_import("pillow_heif", "EXIF").open_heif(io.BytesIO(data))
-        return bytes(opened.info.get("exif") or b"")
+        return bytes(
+            optional_import("pillow_heif", "EXIF").open_heif(io.BytesIO(data)).info.get("exif") or b""
+        )
     except Exception:  # reported when the pixels are read
         return b""
 

@@ -332,8 +332,9 @@ class AnalyzerCalibration:
         if pattern.colors is None:
             planes = [_repeated(cells, 2 // scale)]
             if scale == 4:
-                parts = [cells[..., r::2, c::2] for r, c in np.ndindex(2, 2)]
-                planes = [np.mean(parts, axis=0, dtype=np.float32)]
+                planes = [
+                    np.mean([cells[..., r::2, c::2] for r, c in np.ndindex(2, 2)], axis=0, dtype=np.float32)
+                ]
         else:
             corners = [(row, column) for row, column in np.ndindex(2, 2)]
             planes = []

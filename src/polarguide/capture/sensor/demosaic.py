@@ -186,8 +186,7 @@ def spoiled(bad: Mask, pattern: Pattern, *, mode: str, interpolation: str, regis
         # The 3x3 pixels around a pixel have all angles that it uses.
         full = _dilated(colored, 1 if interpolation == "bilinear" else GUIDED_RADIUS)
         bad = full if mode == "full" else colored | full if registered else colored
-    blocks = bad.reshape(bad.shape[0] // step, step, bad.shape[1] // step, step)
-    return np.asarray(blocks.any(axis=(1, 3)))
+    return np.asarray(bad.reshape(bad.shape[0] // step, step, bad.shape[1] // step, step).any(axis=(1, 3)))
 
 
 def _spoiled_colors(bad: Mask, pattern: Pattern, place: tuple[int, int], interpolation: str) -> Mask:

@@ -9,8 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.arrays import array_kind, read_array
-from polarguide.capture.formats.pictures import decode_stored, read_picture, stated_full_scale
+from polarguide.capture.formats.pictures import (
+    array_kind,
+    decode_stored,
+    read_array,
+    read_picture,
+    stated_full_scale,
+)
 from polarguide.capture.sensor.pattern import Packing
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import read_file
@@ -134,8 +139,7 @@ def require_mosaic(where: Path | str, values: NDArray[Any], *, least: int) -> No
 
 
 def _read_plain(path: Path, raw: RawFormat) -> NDArray[Any]:
-    suffix = path.suffix.lower()
-    values = read_array(path) if suffix == ".npy" else decode_stored(path, read_picture(path))
+    values = read_array(path) if path.suffix.lower() == ".npy" else decode_stored(path, read_picture(path))
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     values = values.astype(values.dtype.newbyteorder("="), copy=False)
