@@ -32,7 +32,7 @@ from heard import Heard
 from relief import DEPTHS, write_relief
 
 from polarguide.capture import load_scene
-from polarguide.capture.colmap import triangulate as points_module
+from polarguide.capture.colmap import sfm as points_module
 from polarguide.capture.colmap.model import PosedCamera, posed_model
 from polarguide.capture.colmap.sfm import match_features, sample_visual_hull, tone_mapped
 from polarguide.capture.write import write_png_file

@@ -146,8 +146,15 @@ def read_calibration(path: Path) -> Calibration:
         PolarguideError: the file cannot be read, or has unknown keys or invalid values.
     """
     file = read_record(path, _File, remedy="See docs/reference/formats.md for the calibration file.")
-    gains = None if file.gains is None else msgspec.structs.astuple(file.gains)
-    return checked(Calibration(gains, file.order, file.sense, file.zero), path)
+    return checked(
+        Calibration(
+            None if file.gains is None else msgspec.structs.astuple(file.gains),
+            file.order,
+            file.sense,
+            file.zero,
+        ),
+        path,
+    )
 
 
 def pair_ratio(angles: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> float | None:
@@ -199,5 +206,6 @@ def oriented(intensities: NDArray[np.float32], calibration: Calibration) -> NDAr
         return permuted
     s0, s1, s2 = stokes_of_four(permuted)
     cosine, sine = (f(2.0 * math.radians(calibration.zero)) for f in (math.cos, math.sin))
-    rotated = four_intensities((s0, s1 * cosine - s2 * sine, s1 * sine + s2 * cosine))
-    return np.maximum(np.stack(rotated), 0.0).astype(np.float32)
+    return np.maximum(
+        np.stack(four_intensities((s0, s1 * cosine - s2 * sine, s1 * sine + s2 * cosine))), 0.0
+    ).astype(np.float32)

@@ -226,7 +226,6 @@ def _pose_of(where: str, frame: _Frame) -> Any:
 def _camera_of(
     where: str, lens: Mapping[str, Any], to_world: Any, sizes: Callable[[], Sequence[Size]]
 ) -> PosedCamera:
-    """Create the camera of a frame."""
     fisheye = _is_fisheye(where, lens)
     coefficients = _distortion(where, lens, fisheye)
     center = (lens["cx"], lens["cy"])
@@ -237,8 +236,12 @@ def _camera_of(
     focal = _focal_lengths(where, lens, size, fisheye)
     middle = [size[k] / 2 if center[k] is None else float(center[k]) for k in range(2)]
     inner = (*focal, *middle)
-    lens_model = (_FISHEYE, (*inner, *coefficients)) if fisheye else brown_camera(inner, coefficients)
-    return camera_to_world(where, size, lens_model, to_world)
+    return camera_to_world(
+        where,
+        size,
+        (_FISHEYE, (*inner, *coefficients)) if fisheye else brown_camera(inner, coefficients),
+        to_world,
+    )
 
 
 def _is_fisheye(where: str, lens: Mapping[str, Any]) -> bool:
@@ -560,7 +563,6 @@ def read_metashape(path: Path, views: Collection[str]) -> dict[str, PosedCamera]
 
 
 def _warn(path: Path, text: str) -> None:
-    """Warn about a feature of a pose file."""
     warnings.warn(f"{path.name} has {text}.", PolarguideWarning, stacklevel=3)
 
 

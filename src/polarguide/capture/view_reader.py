@@ -306,8 +306,11 @@ class ViewFiles:
         return None if path is None else Loader(functools.partial(self._read_truth, path, size), self._truths)
 
     def _read_codes(self, name: str) -> Tensor:
-        raw = _read_pictures(Files(self._digests), self._layout.files(name))
-        return torch.from_numpy(_codes(raw, self._transfer, self._factor))
+        return torch.from_numpy(
+            _codes(
+                _read_pictures(Files(self._digests), self._layout.files(name)), self._transfer, self._factor
+            )
+        )
 
     def _read_truth(self, path: Path, size: tuple[int, int]) -> GroundTruth | None:
         return read_ground_truth(
@@ -583,6 +586,7 @@ class StoredViews:
         names = [item.name for item in self.data]
         scale = self.full_scale
         blown = [0.0 if scale is None else float((item.peak >= scale).mean()) for item in self.data]
-        largest = max(int(item.peak.max()) for item in self.data)
-        warnings = checks.exposure_warnings(names, self.measures, blown, largest, self.largest_value)
+        warnings = checks.exposure_warnings(
+            names, self.measures, blown, max(int(item.peak.max()) for item in self.data), self.largest_value
+        )
         return warnings + checks.polarization_warnings(names, self.measures, transfer)

@@ -133,8 +133,9 @@ def _png_data(path: Path, pixels: NDArray[Any]) -> bytes:
 
 
 def _encoded(path: Path, stored: NDArray[Any], png_filter: int) -> bytes:
-    options = (cv2.IMWRITE_PNG_FILTER, png_filter, cv2.IMWRITE_PNG_COMPRESSION, _LEVEL)
-    success, data = cv2.imencode(".png", stored, options)
+    success, data = cv2.imencode(
+        ".png", stored, (cv2.IMWRITE_PNG_FILTER, png_filter, cv2.IMWRITE_PNG_COMPRESSION, _LEVEL)
+    )
     if not success:
         raise OSError(f"{path}: the picture cannot be encoded")
     return data.tobytes()

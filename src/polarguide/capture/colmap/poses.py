@@ -20,16 +20,15 @@ from polarguide.capture.colmap.model import (
     PosedCamera,
     find_model,
     is_pinhole,
-    is_sound,
     load_model,
     other_text_model,
     posed_images,
     posed_model,
+    require_sound,
 )
 from polarguide.capture.filter.develop import remapped_mask
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.text import listed
-from polarguide.geometry.camera import FARTHEST, LENS
 
 
 @dataclass(frozen=True)
@@ -213,7 +212,9 @@ class Poses:
                 found=", ".join(sorted(image.name for image in images[view])),
                 remedy="Keep one of them.",
             )
-            self._require_numbers(view)
+            image = self._images[view]
+            where_image = f"{self.folder} (image {image.name})"
+            require_sound(where_image, image, model.cameras[image.camera_id], 1e-3)
         self._warps: dict[tuple[int, Geometry], Undistortion] = {}
         self._of_camera: dict[int, Undistortion] = {}
 
@@ -322,24 +323,3 @@ class Poses:
             for name in ("model", "width", "height", "params"):
                 setattr(camera, name, getattr(warp.target, name))
         model.write_binary(str(folder))
-
-    def _require_numbers(self, view: str) -> None:
-        """Raise an error if the pose or the lens of a view is invalid."""
-        image = self._images[view]
-        camera = self._model.cameras[image.camera_id]
-        if not is_sound(image, camera, 1e-3):
-            pose = image.cam_from_world()
-            length = float(np.linalg.norm(pose.rotation.quat))
-            require(
-                not 1e-3 < abs(length - 1) < FARTHEST,
-                f"{self.folder} (image {image.name})",
-                expected="a quaternion of length 1",
-                found=f"one of length {length:g}",
-                remedy="Normalize the quaternion, or export the model again.",
-            )
-            raise PolarguideError(
-                f"{self.folder} (image {image.name})",
-                expected=f"a pose and a lens of numbers up to {FARTHEST:g}, {LENS}",
-                found=f"quaternion {pose.rotation.quat}, translation {pose.translation}, camera {camera.params}",
-                remedy="Export the model again, or remove the image from it.",
-            )

@@ -87,8 +87,15 @@ def match_features(
         elif len(groups) > 1 and lenses:
             _scale_focal_lengths(database, groups, lenses)
         done = functools.partial(_rows, database, "two_view_geometries")
-        matched = {"database": str(database), "matching": matching}
-        run_step("match", matched, seed, reporter, "matching pairs", pairs, done)
+        run_step(
+            "match",
+            {"database": str(database), "matching": matching},
+            seed,
+            reporter,
+            "matching pairs",
+            pairs,
+            done,
+        )
     except PolarguideError:
         for path in database.parent.glob(f"{database.name}*"):
             with contextlib.suppress(OSError):
@@ -374,8 +381,11 @@ def reconstruct(
         reporter.say(
             f"{_registered(models)} of {len(sizes)} views registered; retrying with fewer matches per view."
         )
-        others = _map(database, images, trial, len(sizes), seed, reporter, free, weak=True)
-        models = max(models, others, key=_registered)
+        models = max(
+            models,
+            _map(database, images, trial, len(sizes), seed, reporter, free, weak=True),
+            key=_registered,
+        )
     best = max(models, key=lambda candidate: candidate.num_reg_images(), default=None)
     registered = _registered(models)
     by_chance = best is not None and connected_views(database, sizes) < LEAST_VIEWS
@@ -611,8 +621,9 @@ def _triangulated(
         with writing(start):
             posed_model(cameras, numbers).write_binary(str(start))
         paths = {"database": database, "images": images, "start": start, "out": trial}
-        arguments = {name: str(path) for name, path in paths.items()}
-        run_step("triangulate", arguments, seed, reporter, "triangulating")
+        run_step(
+            "triangulate", {name: str(path) for name, path in paths.items()}, seed, reporter, "triangulating"
+        )
     except PolarguideError as error:
         reporter.warn(f"Triangulation failed ({error.found}).")
         return 0, None
@@ -680,5 +691,6 @@ def _colors(
         column, row = pixel[inside].astype(int).T
         total[inside] += cv2.blur(picture, (3, 3))[row, column]
         counts[inside] += 1
-    gray = np.where(counts[:, None] > 0, total / np.maximum(counts, 1)[:, None], 128)
-    return np.rint(gray).astype(np.uint8)
+    return np.rint(np.where(counts[:, None] > 0, total / np.maximum(counts, 1)[:, None], 128)).astype(
+        np.uint8
+    )

@@ -109,8 +109,9 @@ def masks_beside(root: Path, views: Mapping[str, int]) -> dict[str, Path]:
 
 def not_as_published(where: object, expected: str, found: str) -> PolarguideError:
     """Return the error of a file that differs from the published dataset."""
-    remedy = "Use the files of the dataset as they were published."
-    return PolarguideError(where, expected=expected, found=found, remedy=remedy)
+    return PolarguideError(
+        where, expected=expected, found=found, remedy="Use the files of the dataset as they were published."
+    )
 
 
 def require_published(condition: object, where: object, expected: str, found: str) -> None:
@@ -344,7 +345,6 @@ def read_projections(path: Path) -> Projections:
 
 
 def _is_identity(matrix: NDArray[Any]) -> bool:
-    """Return True for an identity matrix of any size."""
     return (
         matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and np.allclose(matrix, np.eye(len(matrix)))
     )
@@ -354,8 +354,11 @@ def require_known_names(path: Path, unknown: Iterable[str]) -> None:
     """Warn about unknown fields of a camera file, if there are any."""
     names = sorted(unknown)
     if names:
-        text = f"{path.name} has unknown fields, which are ignored: {listed(names)}."
-        warnings.warn(text, PolarguideWarning, stacklevel=2)
+        warnings.warn(
+            f"{path.name} has unknown fields, which are ignored: {listed(names)}.",
+            PolarguideWarning,
+            stacklevel=2,
+        )
 
 
 def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Matrix, Matrix]:
@@ -375,8 +378,7 @@ def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Mat
     signs = np.diag(np.sign(np.diag(inner)))
     inner = inner @ signs
     rotation = signs @ rotation
-    translation = np.linalg.solve(inner, projection[:, 3])
-    return checked_intrinsics(where, inner / inner[2, 2]), rotation, translation
+    return checked_intrinsics(where, inner / inner[2, 2]), rotation, np.linalg.solve(inner, projection[:, 3])
 
 
 def checked_intrinsics(where: object, matrix: object) -> Matrix:

@@ -205,8 +205,9 @@ def _cameras(
         offsets[-1],
     )
     cameras = {number: pinhole_camera(size, *camera) for number, camera in known.items()}
-    numbers = {view: number + chosen for view, number in views.items()}
-    return cameras_of_views(path, numbers, cameras, "world_mat_"), chosen
+    return cameras_of_views(
+        path, {view: number + chosen for view, number in views.items()}, cameras, "world_mat_"
+    ), chosen
 
 
 def _camera_size(path: Path, inner: Sequence[NDArray[np.float64]], size: Size, light: Path | None) -> Size:
@@ -275,8 +276,9 @@ def open_neisf(root: Path) -> Dataset:
     files = {view: [root / part / f"{view}.exr" for part in _NEISF_PARTS] for view in numbers}
     cameras_file = root / "poses_bounds.npy"
     cameras = cameras_of_views(cameras_file, numbers, _llff_cameras(cameras_file), "row ")
-    masks = masks_beside(root, numbers)
-    return stokes_dataset("neisf", _NEISF_PARTS, files, cameras_file, cameras, masks, sense_known=False)
+    return stokes_dataset(
+        "neisf", _NEISF_PARTS, files, cameras_file, cameras, masks_beside(root, numbers), sense_known=False
+    )
 
 
 def _llff_cameras(path: Path) -> dict[int, PosedCamera]:

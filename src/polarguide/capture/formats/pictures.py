@@ -227,7 +227,6 @@ def read_radiance(path: Path) -> NDArray[np.float32]:
 
 
 def _read_hdr(path: Path) -> NDArray[Any]:
-    """Read a Radiance picture, [H, W, 3]."""
     data = read_file(path)
     found = "an empty file" if not data else "a file of another kind"
     if (size := hdr_size(data)) is not None:
@@ -355,7 +354,6 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
 
 
 def _codes_of_floats(path: Path, pixels: NDArray[Any]) -> NDArray[np.uint16]:
-    """Convert intensities from 0 to 1 to 16-bit codes."""
     require(
         np.isfinite(pixels).all() and float(np.median(pixels)) <= 1.0,
         path,
@@ -675,8 +673,9 @@ def read_picture(path: Path) -> bytes:
         PolarguideError: the file is too large or cannot be read.
     """
     size = stated_size(path)
-    largest = ROOM if size is None else min(LARGEST_FILE, ROOM + LARGEST_PIXEL * size[0] * size[1])
-    return read_file(path, largest=largest)
+    return read_file(
+        path, largest=ROOM if size is None else min(LARGEST_FILE, ROOM + LARGEST_PIXEL * size[0] * size[1])
+    )
 
 
 def _array_size(head: bytes) -> tuple[int, int] | None:

@@ -47,23 +47,15 @@ def correction_matrices(analyzers: list[Array], nominal: NDArray[Any]) -> Array:
     def dot(x: list[Any], y: list[Any]) -> Any:
         return x[0] * y[0] + x[1] * y[1] + x[2] * y[2] + x[3] * y[3]
 
-    uu = dot(u, u)
-    uv = dot(u, v)
-    uw = dot(u, w)
-    vv = dot(v, v)
-    vw = dot(v, w)
-    ww = dot(w, w)
+    gram = [[dot(x, y) for y in (u, v, w)] for x in (u, v, w)]
     # The adjugate inverts A^T A, because LAPACK's calls would take seconds for millions of 3x3 matrices.
-    a00 = vv * ww - vw * vw
-    a01 = uw * vw - uv * ww
-    a02 = uv * vw - uw * vv
-    a11 = uu * ww - uw * uw
-    a12 = uv * uw - uu * vw
-    a22 = uu * vv - uv * uv
-    scale = 1 / (uu * a00 + uv * a01 + uw * a02)
+    adjugate = [
+        [gram[i - 2][j - 2] * gram[i - 1][j - 1] - gram[i - 2][j - 1] * gram[i - 1][j - 2] for j in range(3)]
+        for i in range(3)
+    ]
+    scale = 1 / (gram[0][0] * adjugate[0][0] + gram[0][1] * adjugate[0][1] + gram[0][2] * adjugate[0][2])
     inverse = [
-        [(r[0] * u[j] + r[1] * v[j] + r[2] * w[j]) * scale for j in range(4)]
-        for r in ((a00, a01, a02), (a01, a11, a12), (a02, a12, a22))
+        [(row[0] * u[j] + row[1] * v[j] + row[2] * w[j]) * scale for j in range(4)] for row in adjugate
     ]
     left = []
     for j in range(4):
@@ -473,8 +465,13 @@ def write_analyzers(path: Path, calibration: AnalyzerCalibration) -> str:
     )  # fmt: skip
     metadata.sha256 = _checksum(metadata, vectors)
     # A single entry, because safetensors writes several entries in any order.
-    text = json.dumps(msgspec.to_builtins(metadata), ensure_ascii=False)
-    write_whole(path, save({_TENSOR: vectors}, metadata={_ENTRY: text}))
+    write_whole(
+        path,
+        save(
+            {_TENSOR: vectors},
+            metadata={_ENTRY: json.dumps(msgspec.to_builtins(metadata), ensure_ascii=False)},
+        ),
+    )
     return metadata.sha256
 
 

@@ -270,8 +270,9 @@ def _superpixels(values: Array, pattern: Pattern) -> Array:
     for index, angle in enumerate(ANGLES):
         for channel in range(picture.shape[3]):
             chosen = angles == angle if colors is None else (angles == angle) & (colors == channel)
-            samples = [blocks[:, row, :, column] for row, column in np.argwhere(chosen)]
-            picture[index, ..., channel] = np.mean(samples, axis=0, dtype=np.float32)
+            picture[index, ..., channel] = np.mean(
+                [blocks[:, row, :, column] for row, column in np.argwhere(chosen)], axis=0, dtype=np.float32
+            )
     return picture
 
 
@@ -366,16 +367,14 @@ def _is_isolated(rise: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 def defects(mosaics: Iterable[NDArray[Any]], period: int) -> NDArray[np.bool_]:
     """Return a mask [H, W] of samples that are outliers in half of the mosaics and differ in nearly all."""
-    votes: NDArray[np.int32] | None = None
-    signs: NDArray[np.int32] | None = None
+    votes: Any = 0
+    signs: Any = 0
     count = 0
     for values in mosaics:
         out, sign = outliers(values, period)
-        votes = out.astype(np.int32) if votes is None else votes + out
-        signs = sign.astype(np.int32) if signs is None else signs + sign
+        votes = np.add(votes, out, dtype=np.int32)
+        signs = np.add(signs, sign, dtype=np.int32)
         count += 1
-    assert votes is not None
-    assert signs is not None
     return np.asarray((votes >= _AGREE * count) & (np.abs(signs) >= _SAME_SIGN * count))
 
 
