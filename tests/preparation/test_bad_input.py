@@ -24,7 +24,7 @@ from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 
 # The light of these tests has no outlines: nothing tells the sense of NeRSP's and NeISF's angles.
-pytestmark = pytest.mark.filterwarnings("ignore:The sense of .* is not certain")
+pytestmark = pytest.mark.filterwarnings("ignore:The sense of .* is uncertain")
 PLAIN = PrepareSettings(poses="none", gains="none")
 MOSAIC = replace(PLAIN, sensor="IMX250MYR")
 COLOR = ("R90 R45 G90 G45", "R135 R0 G135 G0", "G90 G45 B90 B45", "G135 G0 B135 B0")

@@ -163,7 +163,7 @@ def test_labels_of_objects_are_no_mask(tmp_path, levels):
     path = tmp_path / "v.png"
     discs = [np.hypot(*(np.mgrid[:60, :90] - np.array([[[30]], [[15 + 30 * k]]]))) < 9 for k in range(3)]
     cv2.imwrite(str(path), np.sum([d * v for d, v in zip(discs, levels, strict=True)], 0).astype(np.uint8))
-    Fault(found=f"areas of {levels[0]} beside a maximum of {levels[2]}").raised_by(
+    Fault(found=f"areas of {levels[0]} and a maximum of {levels[2]}").raised_by(
         decode_mask, path, path.read_bytes(), any_value=False
     )
     cv2.imwrite(str(path), cv2.GaussianBlur(np.any(discs, 0) * np.uint8(255), (0, 0), 3))
@@ -500,7 +500,7 @@ def test_a_tag_that_one_file_of_several_lacks_corrects_nothing(tmp_path, name, v
     gains, missing = stated_exposures({"cup": files[:1], "other": files[1:]})
     assert not gains
     assert "1 of 3 files have no" in missing
-    assert "EXIF corrects no exposure" in missing
+    assert "not corrected by EXIF" in missing
     assert missing in read_shot(tmp_path, ShotOptions()).notes
     measured = SinglesSource(tmp_path, PrepareSettings(poses="none")).measure(lambda done: None)
     assert (measured.light, measured.notes[-1]) == ({}, missing)

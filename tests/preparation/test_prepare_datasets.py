@@ -40,7 +40,7 @@ from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 
 # The light of these tests has no outlines: nothing tells the sense of NeRSP's and NeISF's angles.
-pytestmark = pytest.mark.filterwarnings("ignore:The sense of .* is not certain")
+pytestmark = pytest.mark.filterwarnings("ignore:The sense of .* is uncertain")
 PLAIN = PrepareSettings(poses="none", gains="none")
 NAMES = {
     "pandora": ["01", "02", "03", "04"],

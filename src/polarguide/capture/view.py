@@ -173,7 +173,7 @@ class View:
 
     def __repr__(self) -> str:
         size = f"{self.camera.width}x{self.camera.height}"
-        angles = ", ".join(e.words for e in self.exposures)
+        angles = ", ".join(e.label for e in self.exposures)
         optional = {"mask": self.mask, "materials": self.materials, "ground truth": self.truth}
         parts = ", ".join(name for name, value in optional.items() if value is not None) or "no mask"
         return (
@@ -183,7 +183,7 @@ class View:
         )
 
     def _repr_html_(self) -> str:
-        facts = {"pictures": ", ".join(exposure.words for exposure in self.exposures), "state": repr(self)}
+        facts = {"pictures": ", ".join(exposure.label for exposure in self.exposures), "state": repr(self)}
         return figure(self.photograph().cpu().numpy(), self.name) + table(self.name, facts)
 
     @property
@@ -287,7 +287,7 @@ class View:
 
     def undetermined(self, what: str) -> PolarguideError:
         """Return the error that the pictures do not determine a quantity."""
-        angles = ", ".join(exposure.words for exposure in self.exposures)
+        angles = ", ".join(exposure.label for exposure in self.exposures)
         return PolarguideError(
             f"view {self.name}",
             expected=f"pictures that determine {what}: at three or more angles that differ enough",
