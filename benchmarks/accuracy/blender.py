@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 from polarguide import open_run
-from polarguide.capture.formats.arrays import read_radiance
+from polarguide.capture.formats.pictures import read_radiance
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import srgb_encode_array
 from polarguide.results.rendering.relight import write_exr

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.formats.pictures import decode_picture, linear_codes
-from polarguide.capture.layout import Layout, find_layout
+from polarguide.capture.layout import CaptureFiles, find_layout
 from polarguide.capture.sensor.pattern import sensor_pattern
 from polarguide.capture.view import ANGLES
 from polarguide.core.files import read_file
@@ -28,7 +28,7 @@ from polarguide.core.files import read_file
 FULL = 4095
 
 
-def linear_intensities(layout: Layout, view: str, transfer: str) -> NDArray[np.float64]:
+def linear_intensities(layout: CaptureFiles, view: str, transfer: str) -> NDArray[np.float64]:
     """Intensities of a view in [0, 1], [4, H, W, 3]."""
     pictures = (
         decode_picture(path, read_file(path)) for path in (layout.pictures[view][angle] for angle in ANGLES)

@@ -22,7 +22,7 @@ import pycolmap
 import torch
 
 from polarguide.capture import Scene, load_scene
-from polarguide.capture.write import write_png
+from polarguide.capture.write import write_png_file
 from polarguide.optics.color import srgb_encode
 from polarguide.results.export.placement import write_colmap
 
@@ -35,7 +35,7 @@ def write_project(scene: Scene, folder: Path) -> None:
     (folder / "images").mkdir(parents=True)
     for view in scene.train_views:
         shown = srgb_encode(view.photograph().clamp(0, 1)) * 255
-        write_png(folder / "images" / f"{view.name}.png", shown.round().to(torch.uint8).numpy())
+        write_png_file(folder / "images" / f"{view.name}.png", shown.round().to(torch.uint8).numpy())
     cameras = {view.name: view.camera for view in scene.train_views}
     model = folder / "sparse" / "0"
     write_colmap(model, cameras, scene.points, scene.point_colors)

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from polarguide.capture.sensor.pattern import SENSORS
-from polarguide.capture.write import write_png, write_view
+from polarguide.capture.write import write_png_file, write_view
 from polarguide.core.errors import require
 from polarguide.core.progress import Reporter
 from polarguide.core.text import decimals
@@ -246,10 +246,8 @@ def render_view(job: Job, number: int) -> None:
     light = render_lobes(job.built.scenes, big, samples, seed=settings.seed * 100003 + number, limits=limits)
     random = np.random.default_rng((settings.seed, 31, number))
     if job.mosaics:
-        write_png(
-            job.out / "raw" / f"{name}.png",
-            mosaic(light.stokes * job.exposure, settings.sensor, settings.noise, random, job.sensor),
-        )
+        raw = mosaic(light.stokes * job.exposure, settings.sensor, settings.noise, random, job.sensor)
+        write_png_file(job.out / "raw" / f"{name}.png", raw)
         light = LobeRadiance(_halved(light.specular), _halved(light.diffuse), _halved(light.emitted))
     stokes = light.stokes * job.exposure
     if job.has_ground_truth(name):

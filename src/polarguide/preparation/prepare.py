@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Geometry, Poses, Undistortion
-from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError, reconstruct, tone_mapped
-from polarguide.capture.colmap.triangulate import add_points
+from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError, add_points, reconstruct, tone_mapped
 from polarguide.capture.exposures import Angle
 from polarguide.capture.filter.camera_files import TURNS
 from polarguide.capture.filter.consecutive import chosen_matching
@@ -38,7 +37,7 @@ from polarguide.capture.write import (
     intensity_codes,
     picture_name,
     picture_names,
-    write_png,
+    write_png_file,
     write_view,
 )
 from polarguide.core.errors import PolarguideError
@@ -376,8 +375,8 @@ class PoseEstimation:
                 if view not in known or not path.exists():
                     done = develop_view(self._pictures, view, measured)
                     if done.mask is not None:
-                        write_png(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
-                    write_png(path, tone_mapped(done.intensities, self._settings.sfm_pictures))
+                        write_png_file(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
+                    write_png_file(path, tone_mapped(done.intensities, self._settings.sfm_pictures))
                     known[view] = done.record.geometry
                     self._folder.save()
                 advance(count)

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from polarguide.capture.calibration import Calibration
-from polarguide.capture.formats.arrays import array_kind
 from polarguide.capture.formats.headers import (
     LARGEST_PIXELS,
     ORIENTATION,
@@ -32,7 +31,7 @@ from polarguide.capture.formats.headers import (
     picture_kind,
     png_chunk,
 )
-from polarguide.capture.formats.pictures import read_picture
+from polarguide.capture.formats.pictures import array_kind, read_picture
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import read_file
 from polarguide.core.text import listed

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.filter.camera_files import is_camera_raw, read_camera_raw
 from polarguide.capture.formats.pictures import decode_picture, read_picture
-from polarguide.capture.write import write_png
+from polarguide.capture.write import write_png_file
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, write_text
 from polarguide.core.progress import Reporter
@@ -147,7 +147,7 @@ def extract_frames(video: Path, folder: Path, reporter: Reporter) -> int:
 
 
 def _write(folder: Path, number: int, picture: NDArray[np.uint8]) -> None:
-    write_png(folder / f"frame_{number:04d}.png", np.ascontiguousarray(picture[..., ::-1]))
+    write_png_file(folder / f"frame_{number:04d}.png", np.ascontiguousarray(picture[..., ::-1]))
 
 
 _MANY = 100
