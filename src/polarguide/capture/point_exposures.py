@@ -107,7 +107,7 @@ def exposures_of_points(values: Array, places: Array) -> PointExposures:
     count, channels = values.shape[1:]
     unknown = np.full((count, channels), np.nan)
     errors = np.full((2, count), np.inf)
-    valid = _measured(values)
+    valid = np.isfinite(values).all(axis=-1)
     chosen_points = np.argsort(-valid.sum(axis=1), kind="stable")[:MOST_POINTS]
     chosen_points = chosen_points[valid[chosen_points].sum(axis=1) >= min(_LEAST_TRACK, count)]
     values = values[chosen_points]
@@ -128,11 +128,6 @@ def exposures_of_points(values: Array, places: Array) -> PointExposures:
     return PointExposures(logs, errors[0], errors[1], numbers)
 
 
-def _measured(values: Array) -> NDArray[np.bool_]:
-    """Return a mask of values [..., C] that are finite in all channels."""
-    return np.asarray(np.isfinite(values).all(axis=-1), np.bool_)
-
-
 def _connected(valid: NDArray[np.bool_], fewest: int) -> NDArray[np.int64]:
     """Return the indices of the largest set of pictures that shared points connect."""
     enough = np.flatnonzero(valid.sum(axis=0) >= fewest)
@@ -145,7 +140,7 @@ def _connected(valid: NDArray[np.bool_], fewest: int) -> NDArray[np.int64]:
 
 def _solve(values: Array) -> Array:
     """Return the logarithms of the exposures of connected pictures, [V, C], with mean 0."""
-    valid = _measured(values)
+    valid = np.isfinite(values).all(axis=-1)
     paired = valid.sum(axis=1) >= 2
     point, picture = np.nonzero(valid[paired])
     logs = np.log(values[paired][point, picture].astype(np.float64))
@@ -202,7 +197,7 @@ def _errors(values: Array, parts: NDArray[np.int64], logs: Array) -> Array:
     used = np.zeros(len(logs), np.int64)
     for part in np.unique(parts):
         members = values[parts == part]
-        valid = _measured(members)
+        valid = np.isfinite(members).all(axis=-1)
         chosen = _connected(valid, FEWEST // 4)
         if len(chosen) < 2:
             continue

@@ -98,8 +98,7 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
         kind = detect_dataset(root) or ("singles" if are_single_shots(root, settings) else "filter")
         if kind == "filter" and not angle_folders(root):
             shots = find_shots(root, nested=settings.sensor is None)
-            several = any(len(files) > 1 for files in shots.values())
-            kind = "filter" if several else "mosaic"
+            kind = "filter" if any(len(files) > 1 for files in shots.values()) else "mosaic"
             if kind == "mosaic" and settings.sensor is None:
                 _require_photographs(root)
                 kind = "singles"
@@ -270,8 +269,7 @@ def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
     files = list_files(root, SHOT_SUFFIXES)
     if not files:
         return any(angle not in ANGLES for angle in folders_of_angles(root).values())
-    named = angles_of_names([stem_of(path) for path in files])
-    shots = [name for name in named if name is not None]
+    shots = [name for name in angles_of_names([stem_of(path) for path in files]) if name is not None]
     if any(angle not in ANGLES for _, angle in shots):
         return True
     return len({view for view, _ in shots}) == len(files)

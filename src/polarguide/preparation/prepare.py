@@ -153,8 +153,7 @@ class SceneFolder:
             settings |= {name: now[name] for name in _POSE_SETTINGS}
         model = request.model if follows_none else before.request.model
         old = msgspec.structs.replace(before.request, settings=settings, model=model)
-        new = msgspec.structs.replace(request, settings=now)
-        difference = changed_entry(old, new)
+        difference = changed_entry(old, msgspec.structs.replace(request, settings=now))
         if difference is not None:
             name, was, is_now = difference
             raise PolarguideError(
@@ -280,12 +279,12 @@ def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
     """
     pictures = re.compile(rf"polar/{re.escape(view)}_{_LABEL}\.png")
     own = {f"invalid/{view}.png", f"masks/{view}.png"}
-    strangers = sorted(name for name in set(files) - own if not pictures.fullmatch(name))
-    if strangers or "/" in view or "\\" in view or "\0" in view:
+    others = sorted(name for name in set(files) - own if not pictures.fullmatch(name))
+    if others or set(view) & set("/\\\0"):
         raise PolarguideError(
             f"{journal} (views, {shortened(view)})",
             expected=f"pictures of this view, {picture_name('VIEW', 0)} and so on",
-            found=shortened(strangers[0] if strangers else view),
+            found=shortened(others[0] if others else view),
             remedy=REMEDY,
         )
 
@@ -440,12 +439,10 @@ def prepare_scene(
         PolarguideError: the source or a setting is invalid, ``out`` contains other files, or structure from motion does
             not connect the views. Then this call leaves no files in ``out``.
     """
-    settings = settings or PrepareSettings()
     reporter = reporter or Reporter()
-    root = Path(source)
     target = Path(out)
-    settings = settings.checked()
-    root, settings = frames_of_video(root, target, settings, reporter)
+    settings = (settings or PrepareSettings()).checked()
+    root, settings = frames_of_video(Path(source), target, settings, reporter)
     pictures = open_source(root, settings)
     settings = replace(settings, poses=origin_of_poses(pictures, settings.poses))
     if settings.poses != "sfm" and settings.intrinsics is not None:
@@ -479,15 +476,14 @@ def prepare_scene(
         reporter.say(f"{target} is already complete.")
         return _outcome(folder, pictures, settings, new=False)
     reporter.say(f"{len(pictures.views)} views, format {pictures.kind}.")
-    if frames:
-        reporter.say(frames)
-    for note in poses.notes if poses is not None else ():
-        reporter.say(note)
-    for warning in poses.warnings if poses is not None else ():
-        reporter.warn(warning)
-    unused = [name for name in POSE_NAMES if (root / name).exists()]
+    if poses is not None:
+        for note in filter(None, (frames, *poses.notes)):
+            reporter.say(note)
+        for warning in poses.warnings:
+            reporter.warn(warning)
+    unused = [f"--poses {shlex.quote(str(root / name))}" for name in POSE_NAMES if (root / name).exists()]
     if unused and settings.poses == "sfm":
-        options = " or ".join(f"--poses {shlex.quote(str(root / name))}" for name in unused)
+        options = " or ".join(unused)
         reporter.say(f"Poses by structure from motion. The folder also contains poses: use {options}.")
     if folder.state.measured is None:
         with reporter.track("measuring", len(pictures.views)) as advance:
