@@ -67,7 +67,7 @@ class Ours:
         trainer, state = self.trainer, self.trainer.state
         render(
             state.gaussians,
-            trainer.view_at(state.step + self._next()).camera,
+            trainer.feed.view_at(state.step + self._next()).camera,
             trainer.context.backend.rasterize,
             RenderRequest(depth=True),
             shading=trainer.context.shading,
@@ -86,7 +86,7 @@ class Ours:
     def frame(self, *, layers: bool) -> None:
         """A picture of a trained scene: the final one, or all layers."""
         trainer, state = self.trainer, self.trainer.state
-        view = trainer.view_at(state.step + self._next())
+        view = trainer.feed.view_at(state.step + self._next())
         render(
             state.gaussians,
             view.camera,
@@ -99,7 +99,7 @@ class Ours:
     def parts(self) -> dict[str, Any]:
         """The rasterizer, SSIM and the optimizer of a step by themselves, as calls."""
         trainer, gaussians = self.trainer, self.trainer.state.gaussians
-        view = trainer.view_at(trainer.state.step)
+        view = trainer.feed.view_at(trainer.state.step)
         inputs = Splats(
             gaussians["means"],
             gaussians["quaternions"],
@@ -108,7 +108,7 @@ class Ours:
             torch.rand(len(gaussians), 8, device=gaussians["means"].device),
         )
         splats = Splats(*(t.detach().requires_grad_() for t in inputs))
-        shown = trainer.feed.targets(trainer.state.step, view, Weights(), None).picture
+        shown = trainer.feed.targets(trainer.state.step, view, Weights()).picture
         prediction = shown.clone().requires_grad_()
 
         def raster() -> None:

@@ -21,7 +21,6 @@ from packed import SUFFIX, enlarged, read_scene
 
 import polarguide
 from polarguide.capture import Scene
-from polarguide.gaussians.densify import DensityStatistics
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.raster import Backend, choose_backend
 from polarguide.raster.cuda import has_gsplat
@@ -176,7 +175,7 @@ def stress(job: Job) -> dict[str, Any]:
     count, size = (10_000, (96, 80)) if job.tiny else (1_000_000, (1224, 1024))
     state = trained(job, "spheres")
     gaussians = Gaussians(split_to(state, count), RECIPE.rates)
-    state = TrainingState(0, gaussians, state.environment, DensityStatistics(count, 1, job.backend.device))
+    state = TrainingState(0, gaussians, state.environment)
     return bench(job, enlarged(job.scene("spheres"), *size, views=8), state)
 
 

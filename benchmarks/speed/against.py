@@ -64,7 +64,10 @@ trained.keep(torch.arange(count) % len(trained))
 for name in trained.names:
     if name in kept:
         trained.overwrite(name, torch.from_numpy(kept[name]))
-trainer.state.statistics.clear(count)
+if hasattr(trainer.state, "statistics"):
+    trainer.state.statistics.clear(count)
+else:
+    trainer.begin(trainer.current, trainer.state)
 longest = max(RECIPES[recipe].stages, key=lambda stage: stage.fraction)
 every = RECIPES[recipe].densification.every
 calm = [

@@ -144,7 +144,7 @@ def main() -> None:
             recipe = run.recipe if run is not None else recipe_named(name)
             state = load_checkpoint(options.source, recipe) if run is not None else None
             if state is not None:
-                state.frozen = None
+                state.drop("frozen.")
             settings = resolve(TrainSettings(5000, 0), scene, recipe)
             context = TrainingContext(scene, recipe, settings, choose_backend("cpu"))
             trainer, _ = gaussian_training(context, state)

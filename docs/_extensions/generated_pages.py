@@ -2,7 +2,6 @@
 
 reference/api/*.md           a page for each room of the product and for each neighbor, with all public modules
 generated/command-line.md    every verb and option, as the program's own help states them
-generated/rooms.md           the order of the rooms, as tests/test_imports.py enforces it
 generated/python.md          the names of ``import polarguide``
 """
 
@@ -117,14 +116,6 @@ def escaped(text: str) -> str:
     return "".join(parts)
 
 
-def rooms_table(docs: Path) -> str:
-    """The rooms in order, with the first sentence of each."""
-    lines = ["| | room | what is in it |", "|---:|---|---|"]
-    for number, room in enumerate(rooms(docs), 1):
-        lines.append(f"| {number} | `{room}` | {escaped(summary(room))} |")
-    return "\n".join(lines) + "\n"
-
-
 def public_names() -> str:
     """Every name of ``import polarguide``, described where it stands: functions, the run, then all else."""
     package = importlib.import_module(PACKAGE)
@@ -236,7 +227,6 @@ def generate(app: Sphinx) -> None:
             stale.unlink()
     for name, text in pages.items():
         write(api / f"{name}.md", text)
-    write(docs / "generated" / "rooms.md", rooms_table(docs))
     write(docs / "generated" / "python.md", public_names())
     write(docs / "generated" / "command-line.md", command_line())
 

@@ -26,8 +26,8 @@ from polarguide.results.evaluation.target import SceneFacts, ViewTarget
 from polarguide.runs import opened as opening
 from polarguide.viewer import run_scenery
 from polarguide.viewer.scenery import Appearance, Painter
-from polarguide_bench.record import read_results
-from polarguide_bench.verbs.compare import chosen_steps
+from polarguide_bench.results import read_results
+from polarguide_bench.verbs import chosen_steps
 
 
 @pytest.fixture
@@ -94,7 +94,7 @@ def test_pictures_by_other_light_and_along_a_path(elsewhere: Path, tmp_path: Pat
 def test_the_inspection_trains_there_and_compares_here(
     demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("polarguide.gaussians.adam.adam", unfused_adam)
+    monkeypatch.setattr("polarguide.gaussians.gaussians.adam", unfused_adam)
     scene = load_scene(demo_scene, downscale=8)
 
     def stop(report: object) -> None:

@@ -6,7 +6,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from polarguide.gaussians.densify import DensityStatistics
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.geometry.camera import Camera, look_at
 from polarguide.recipes import RECIPES
@@ -53,7 +52,8 @@ def random_state(name: str, count: int = 300, *, metal: bool = False) -> tuple[T
         gaussians["outward"][::5] = 0  # not seen by any view
     environment = Environment(light, recipe.light_rates) if light else None
     trained = Gaussians(gaussians, recipe.learning_rates)
-    state = TrainingState(0, trained, environment, DensityStatistics(count))
+    state = TrainingState(0, trained, environment)
+    state.extra = {name: torch.zeros(count) for name in ("statistics.gradient", "statistics.seen")}
     return state, recipe.shading.bind(1.5)
 
 

@@ -12,7 +12,7 @@ from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.result import RenderResult
-from polarguide.training.native_terms import S1_AND_S2, PolarizationTerm, Terms, pixel_terms
+from polarguide.training.losses import S1_AND_S2, PolarizationTerm, Terms, pixel_terms
 
 COUNT = 30
 RESOLUTION = 8

@@ -10,9 +10,9 @@ from polarguide.capture import Scene
 from polarguide.raster import Backend, choose_backend
 from polarguide.runs.folder import resolve
 from polarguide.training.angles.fits import AngleFits, gaussian_training
-from polarguide.training.callback import Callback
+from polarguide.training.callback import Callback, Loop
 from polarguide.training.context import TrainingContext
-from polarguide.training.loop import Loop, TrainingLoop
+from polarguide.training.loop import TrainingLoop
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState

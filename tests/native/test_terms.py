@@ -13,8 +13,14 @@ from polarguide.geometry.camera import Camera
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
-from polarguide.training.losses import Weights, normal_terms, normal_terms_reference
-from polarguide.training.native_terms import PolarizationTerm, Terms, pixel_terms
+from polarguide.training.losses import (
+    PolarizationTerm,
+    Terms,
+    Weights,
+    normal_terms,
+    normal_terms_reference,
+    pixel_terms,
+)
 from polarguide.training.targets import Step, StepTargets, ViewPriors, stokes_weight, surface_weight
 
 HEIGHT, WIDTH = 37, 70  # more than one block of pixels in a row, and more than one part

@@ -114,7 +114,7 @@ def test_a_finished_training_goes_back_once_and_takes_what_was_painted(
     write_painted(out, pictures(scene))
     told = Heard()
     again = train(demo_scene, out, resume=True, reporter=told)
-    assert any("from step 51" in text for text in told.said)
+    assert any("at step 51" in text for text in told.said)
     assert float(again.gaussians["metalness"].mean()) > 3 * itself
     assert trained_steps(out) == STEPS
     assert [row["step"] for row in RunLog(out).rows()] == list(range(9, STEPS, 10))
@@ -139,7 +139,7 @@ def test_a_training_that_is_not_so_far_goes_on(
     write_painted(out, pictures(scene))
     told = Heard()
     run = train(demo_scene, out, resume=True, reporter=told)
-    assert not any("from step" in text for text in told.said)
+    assert not any("at step" in text for text in told.said)
     assert float(run.gaussians["metalness"].mean()) > 0.1
 
 
@@ -153,7 +153,7 @@ def test_what_no_step_would_read_is_refused(
     out = tmp_path / "run"
     polarguide.train(demo_scene, out, recipe=recipe, settings=settings, reading=READING)
     write_painted(out, pictures(scene))
-    Fault(FOLDER, "what is metal", recipe).raised_by(
+    Fault(FOLDER, "search for metals", recipe).raised_by(
         polarguide.train, demo_scene, out, recipe=recipe, settings=settings, reading=READING, resume=True
     )
 

@@ -9,11 +9,10 @@ import pytest
 
 from polarguide.capture import Scene
 from polarguide.core.progress import Advance, Reporter
-from polarguide.runs import stopwatch
-from polarguide.runs.callbacks import Look
+from polarguide.runs import callbacks
+from polarguide.runs.callbacks import Look, in_words
 from polarguide.runs.folder import RunLog
-from polarguide.runs.stopwatch import in_words
-from polarguide.runs.train import train
+from polarguide.runs.train import train_gaussians
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.settings import TrainSettings
 
@@ -51,7 +50,7 @@ def test_pauses_of_a_training_do_not_count(
     """Each step takes two seconds, and others look for a thousand seconds after each."""
     now = 0.0
     clock = SimpleNamespace(perf_counter=lambda: now, process_time=lambda: now)
-    monkeypatch.setattr(stopwatch, "time", clock)
+    monkeypatch.setattr(callbacks, "time", clock)
 
     @contextlib.contextmanager
     def watch(trainer: TrainingLoop) -> Iterator[Look]:
@@ -70,7 +69,7 @@ def test_pauses_of_a_training_do_not_count(
         yield look
 
     reporter = Seconds()
-    train(tiny_scene, tmp_path / "run", settings=TrainSettings(20), reporter=reporter, watch=watch)
+    train_gaussians(tiny_scene, tmp_path / "run", settings=TrainSettings(20), reporter=reporter, watch=watch)
     assert reporter.seconds == {0: 0.0, 10: 20.0, 20: 40.0}
     assert [line for line in reporter.said if line.startswith("took 40 s")]
     assert RunLog(tmp_path / "run").elapsed()[0] == 40.0

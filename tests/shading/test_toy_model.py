@@ -28,8 +28,8 @@ from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.model import write_run_ply
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.result import LAYERS, RenderResult
-from polarguide.training.actions import reset_opacity
 from polarguide.training.angles.fits import gaussian_training
+from polarguide.training.callbacks import reset_opacity
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings

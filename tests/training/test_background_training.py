@@ -11,7 +11,7 @@ from polarguide.capture import Scene
 from polarguide.raster import Backend, rasterize_reference
 from polarguide.recipes import RECIPES
 from polarguide.shading.gbuffer import RenderRequest, render, splats
-from polarguide.training.actions import LEAST_PIXELS, touched_pixels
+from polarguide.training.callbacks import LEAST_PIXELS, touched_pixels
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.losses import Weights, coverage_loss
 from polarguide.training.recipe import Recipe
@@ -123,7 +123,7 @@ def test_what_no_view_sees_goes_when_the_density_control_ends(black_scene: Scene
     run(made, 21)
     assert len(made.state.gaussians) < count
     assert float(made.state.gaussians["means"].detach().abs().max()) < 100
-    assert len(made.state.statistics.mean()) == len(made.state.gaussians)
+    assert len(made.state.tensors()["statistics.gradient"]) == len(made.state.gaussians)
 
 
 def test_surroundings_keep_what_no_view_sees(black_scene: Scene) -> None:

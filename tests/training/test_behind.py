@@ -11,7 +11,7 @@ from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.interface import Rasterize
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.result import RenderResult
-from polarguide.training.behind import shares_before, turned_behind
+from polarguide.training.behind import fade_behind, shares_before
 
 CAMERA = Camera(
     32, 24, 40.0, 40.0, 16.0, 12.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
@@ -52,7 +52,7 @@ def gradients(
     of = gaussians(dtype)
     result = rendered(of, rasterize)
     if behind is not None:
-        result = turned_behind(result, *behind)
+        result = fade_behind(result, *behind)
     generator = torch.Generator().manual_seed(3)
     weight = torch.rand(24, 32, 4, generator=generator, dtype=torch.float64).to(dtype)
     weight[:, :17] = 0
@@ -96,7 +96,7 @@ def test_native_and_reference_agree_on_what_is_held() -> None:
 def test_pictures_are_the_same_to_the_bit() -> None:
     of = gaussians(torch.float32)
     result = rendered(of, rasterize_cpu)
-    turned = turned_behind(result, 3.0, 5.0)
+    turned = fade_behind(result, 3.0, 5.0)
     assert torch.equal(result.training["rotation_only_normal"], result.normal)
     assert torch.equal(turned.normal, result.normal)
     assert torch.equal(turned.depth, result.depth)

@@ -18,7 +18,7 @@ from polarguide.core.options import SessionOptions
 from polarguide.recipes import RECIPES
 from polarguide.runs.callbacks import TrainingStopped
 from polarguide.runs.folder import CHECKPOINT
-from polarguide.runs.train import train
+from polarguide.runs.train import train_gaussians
 from polarguide.training.callback import Callback
 from polarguide.training.recipe import Repeat
 
@@ -39,7 +39,7 @@ def example() -> ModuleType:
 
 def trained(scene: Scene, out: Path, *callbacks: Any, **more: Any) -> Path:
     given = {"recipe": "3dgs", "settings": SETTINGS, "session": SESSION, "callbacks": callbacks}
-    train(scene, out, **{**given, **more})
+    train_gaussians(scene, out, **{**given, **more})
     return out / CHECKPOINT
 
 

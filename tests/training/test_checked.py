@@ -35,7 +35,10 @@ def stepped(scene: Scene, recipe: Recipe) -> TrainingState:
             for values in trained.trained():
                 values.grad = torch.ones_like(values)
             trained.step()
-    state.frozen = state.gaussians.snapshot()
+    state.extra = {f"frozen.{name}": values for name, values in state.gaussians.snapshot().items()}
+    state.extra |= {
+        name: torch.zeros(len(state.gaussians)) for name in ("statistics.gradient", "statistics.seen")
+    }
     state.footprints = torch.ones(len(state.gaussians))
     return state
 

@@ -16,7 +16,7 @@ from polarguide.training import storage
 from polarguide.training.feed import (
     Feed,
     coarse_steps,
-    holds,
+    is_complete,
     pack_priors,
     unpack_priors,
 )
@@ -139,8 +139,8 @@ def test_terms_find_what_they_read_of_the_priors(tiny_scene: Scene) -> None:
     priors = view_priors(view, guide, recipe.priors, 1.5)
     fields = recipe.stages[1].weights.fields_read
     entry = pack_priors(priors, fields)
-    assert holds(entry, fields)
-    assert not holds(entry, Weights(normal=1.0).fields_read)
+    assert is_complete(entry, fields)
+    assert not is_complete(entry, Weights(normal=1.0).fields_read)
     found = unpack_priors(entry, view.camera, recipe.priors)
     for name in fields:
         expected, values = getattr(priors, name), getattr(found, name)

@@ -13,8 +13,7 @@ from polarguide.capture.view import FULL_CODE
 from polarguide.geometry.camera import Camera, look_at
 from polarguide.geometry.polarizer import ANGLES
 from polarguide.geometry.vectors import dot, unit
-from polarguide.training.flat import FlatRules, flat_surface, flat_surfaces
-from polarguide.training.priors import view_priors
+from polarguide.training.priors import FlatRules, flat_surface, flat_surfaces, view_priors
 from polarguide.training.recipe import Priors
 
 WIDTH, HEIGHT, INDEX = 80, 60, 1.5

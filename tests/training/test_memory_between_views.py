@@ -11,11 +11,11 @@ from metal_balls import gaussians_of_the_ball, views_of
 from polarguide.capture import View
 from polarguide.core.system import MemoryBound
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.training import flat
-from polarguide.training.actions import outward_directions
+from polarguide.training import priors
+from polarguide.training.callbacks import outward_directions
 from polarguide.training.metals.evidence import evidence
 from polarguide.training.metals.observations import contradicted, label_weights
-from polarguide.training.rules import MetalRules, MetalViews
+from polarguide.training.recipe import MetalRules, MetalViews
 
 RULES, LIMITS = MetalRules(), MetalViews()
 GAUSSIANS = gaussians_of_the_ball()
@@ -62,17 +62,17 @@ def of_sides(views: list[View], memory: Held) -> None:
 
 
 def of_flat_surfaces(views: list[View], memory: Held) -> None:
-    flat.flat_surfaces(memory.between(views), 1.5, flat.FlatRules())
+    priors.flat_surfaces(memory.between(views), 1.5, priors.FlatRules())
 
 
 @pytest.mark.parametrize("look", [of_metals, of_words, of_contradictions, of_sides, of_flat_surfaces])
 def test_between_any_two_views_memory_is_given_back(
     look: Callable[[list[View], Held], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    flat_surface, found = flat.flat_surface, []
+    flat_surface, found = priors.flat_surface, []
     for views in (VIEWS[:1], VIEWS):
         memory = Held()
-        monkeypatch.setattr(flat, "flat_surface", memory.works(flat_surface))
+        monkeypatch.setattr(priors, "flat_surface", memory.works(flat_surface))
         look(views, memory)
         found.append((memory.most, memory.held))
     one, all_of_them = found

@@ -26,11 +26,21 @@ from polarguide.runs.model import GaussianModel
 from polarguide.runs.reports import METALS_PICTURE, report_metals
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.loop import TrainingLoop
-from polarguide.training.metals.cut import INFINITE, Graph, decide, minimum_cut, surfaces, unary
 from polarguide.training.metals.evidence import GOLD, LEVELS, MetalEvidence, _tint_cost, errors, evidence
 from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights, shares
-from polarguide.training.metals.search import SOFT_PRIORS, MetalSearch, looks, warn_of_unused_materials
-from polarguide.training.rules import MetalRules, MetalViews
+from polarguide.training.metals.search import (
+    INFINITE,
+    SOFT_PRIORS,
+    Graph,
+    MetalSearch,
+    decide,
+    looks,
+    minimum_cut,
+    surfaces,
+    unary,
+    warn_of_unused_materials,
+)
+from polarguide.training.recipe import MetalRules, MetalViews
 from polarguide.training.settings import TrainSettings
 
 RULES, LIMITS = MetalRules(), MetalViews()
@@ -241,7 +251,7 @@ def test_training_makes_metals_of_what_the_user_says(tiny_scene: Scene, tmp_path
     run(whole)
     for until in (32, 45):
         resumed = trainer_of(scene, settings, heard)
-        resumed.state = load_checkpoint(tmp_path / str(until), RECIPE)
+        resumed.begin(resumed.current, load_checkpoint(tmp_path / str(until), RECIPE))
         run(resumed)
         assert different(whole.state.tensors(), resumed.state.tensors()) == [], until
 
@@ -362,7 +372,7 @@ def test_what_the_prior_alone_decides_is_undecided(
     assert undecided is not None
     torch.testing.assert_close(undecided, first)
     report_metals(tmp_path, tiny_scene, undecided, model, heard)
-    assert "undecided" in heard.said[0]
+    assert heard.said[0].startswith("metals: 0.0 %")
     assert (tmp_path / METALS_PICTURE).exists()
     labels = torch.zeros(len(first), 2)
     labels[:, 0] = 1.0

@@ -69,7 +69,9 @@ def measured(result: RenderResult, exposures: tuple[Exposure, ...], mount: Mount
 
 
 def terms(result: RenderResult, view: View, weights: Weights = WEIGHTS) -> tuple[Tensor, Tensor]:
-    total, picture = partial_terms(step(result, view), weights.photometric, weights.stokes)
+    total, picture = partial_terms(
+        step(result, view), PartialView.of(view, CPU), weights.photometric, weights.stokes
+    )
     return total, picture.loss
 
 

@@ -125,8 +125,8 @@ def test_what_was_measured_is_separated_with_the_index_of_each_pixel(run: polarg
     def separated(index: float, offset: float) -> torch.Tensor:
         settings = TrainSettings(60, background="scene", refractive_index=index)
         feed = Feed(context_of(run.scene, recipe, settings))
-        own = {**gaussians, "index_offset": torch.full_like(gaussians["index_offset"], offset)}
-        priors = feed.targets(59, view, stage.weights, own).priors
+        feed.guide = {**gaussians, "index_offset": torch.full_like(gaussians["index_offset"], offset)}
+        priors = feed.targets(59, view, stage.weights).priors
         return priors.diffuse[run.result(view.name).alpha > 0.99]
 
     as_said, as_of_all, other = separated(1.5, -0.17), separated(1.33, 0.0), separated(1.5, 0.0)

@@ -175,7 +175,7 @@ def test_every_epoch_visits_every_training_view_once(tiny_scene: Scene) -> None:
     names = sorted(view.name for view in tiny_scene.train_views)
     count = len(names)
     epochs = [
-        [trainer.view_at(step).name for step in range(begin, begin + count)]
+        [trainer.feed.view_at(step).name for step in range(begin, begin + count)]
         for begin in range(0, 8 * count, count)
     ]
     assert all(sorted(epoch) == names for epoch in epochs)
@@ -198,7 +198,7 @@ def test_the_first_state_has_one_gaussian_per_point_and_added_one(
     count = len(tiny_scene.points) + busy_recipe.initialization.shell
     assert len(state.gaussians) == count
     assert state.step == 0
-    assert state.statistics.seen.shape == (count,)
+    assert state.tensors()["statistics.seen"].shape == (count,)
     assert torch.equal(state.gaussians["means"][: len(tiny_scene.points)].detach(), tiny_scene.points)
 
 

@@ -94,7 +94,7 @@ def train(
     should_stop: Callable[[], bool] = lambda: False,
     callbacks: Sequence[AnyCallback] = (),
 ) -> Run:
-    """Train a recipe on a scene, into a run folder; see ``runs.train.train`` for all arguments.
+    """Train a recipe on a scene, into a run folder; see ``runs.train.train_gaussians`` for all arguments.
 
     Example:
         >>> run = polarguide.train("scenes/cup", "runs/cup", recipe="polarguide")    # doctest: +SKIP
@@ -113,7 +113,7 @@ def train(
         visitors=VisitorOptions(session.allow_host, session.allow_origin),
         reporter=reporter,
     )
-    opened = training.train(
+    opened = training.train_gaussians(
         scene,
         out,
         recipe=recipe,

@@ -18,7 +18,7 @@ from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import ColmapModel, read_model
 from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.formats.pictures import TRANSFERS, decode_picture, read_picture
-from polarguide.capture.layout import Layout, find_layout, select_views
+from polarguide.capture.layout import CaptureFiles, find_layout, select_views
 from polarguide.capture.metadata import (
     Origin,
     applied_calibration,
@@ -94,7 +94,7 @@ class Capture:
 
     root: Path
     name: str
-    layout: Layout
+    layout: CaptureFiles
     views: tuple[InspectedView, ...]
     model: ColmapModel | None
     refractive_index: float | None

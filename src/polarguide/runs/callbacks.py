@@ -1,29 +1,76 @@
-"""The callbacks of a run: progress with a log, checkpoints, viewer and a clean stop. They know no method."""
+"""Callbacks of a run for any method: progress with a log, checkpoints, viewer, memory and stop.
+
+Time that a piece of work takes, and whether other work ran beside it.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from polarguide.core.options import SessionOptions
 from polarguide.core.progress import Advance, Reporter
-from polarguide.core.system import MemoryBound
+from polarguide.core.system import MEBIBYTE, MemoryBound, machine_busy_seconds, peak_memory_mib
 from polarguide.runs.folder import RunLog, save_checkpoint
-from polarguide.runs.stopwatch import Stopwatch
-from polarguide.training.callback import Callback
-from polarguide.training.loop import Loop
+from polarguide.runs.memory_plan import in_gigabytes
+from polarguide.training.callback import Callback, Loop
 from polarguide.training.losses import refuse_diverged
 from polarguide.training.settings import StepReport
 
+# Share of one core that others may use before a time is no longer worth quoting.
+FOREIGN_SHARE = 0.10
+
+
+class Stopwatch:
+    """Adds up wall time, and compares the machine's busy time with this process's own.
+
+    Args:
+        seconds: time already spent (before a resume). alone: whether that was spent alone.
+    """
+
+    def __init__(self, seconds: float = 0.0, alone: bool = True) -> None:
+        self._before = seconds
+        self._alone = alone
+        self._pause = 0.0
+        self._start = time.perf_counter()
+        self._own = time.process_time()
+        self._machine = machine_busy_seconds()
+
+    @contextlib.contextmanager
+    def paused(self) -> Iterator[None]:
+        """Time inside does not count."""
+        begin = time.perf_counter()
+        yield
+        self._pause += time.perf_counter() - begin
+
+    def read(self) -> tuple[float, bool]:
+        """Seconds so far, and whether nothing else of weight ran beside."""
+        wall = time.perf_counter() - self._start
+        foreign = (machine_busy_seconds() - self._machine) - (time.process_time() - self._own)
+        alone = self._alone and foreign <= FOREIGN_SHARE * wall + 0.5
+        return self._before + wall - self._pause, alone
+
+
+def in_words(seconds: float) -> str:
+    """A time as 40 s, 12 min or 1 h 05 min."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
 LOG_EVERY = 10
-"""Steps from one line of the log to the next."""
+"""Number of steps between two lines of the log."""
 SMOOTHING = 0.98
-"""Weight of earlier steps in the shown loss and PSNR."""
+"""Weight of earlier steps in the displayed loss and PSNR."""
 Ends = Callable[[], bool]
-"""Returns true to end the training."""
+"""Returns True to end the training."""
 Look = Callable[[Ends], None]
 """Runs between two steps, such as a viewer; its argument tells when the training should end."""
 
@@ -41,9 +88,9 @@ class TrainingStopped(KeyboardInterrupt):
 
 
 class Progress(Callback[Loop]):
-    """Smooths the reports of steps for the display, and writes every tenth into the log.
+    """Progress with smoothed loss and PSNR, and the log with one of ten steps.
 
-    Reports are read ten at a time: on a GPU, reading waits for it.
+    Reports are read in batches of ten, because reading waits for a GPU.
 
     Args:
         advance: receives progress.
@@ -55,14 +102,13 @@ class Progress(Callback[Loop]):
         self._advance = advance
         self._log = log
         self._stopwatch = stopwatch
-        self._loss = math.nan
-        self._psnr = math.nan
+        self._smooth: Tensor | None = None
         self._began = stopwatch.read()[0]
         self._first = -1
         self._waiting: list[StepReport] = []
 
     def after_step(self, loop: Loop, report: StepReport) -> None:
-        """Take the report of a step."""
+        """Collect the report of a step."""
         if self._first < 0:
             self._first = report.done - 1
         elif report.step == 0 and self._log is not None:
@@ -85,7 +131,7 @@ class Progress(Callback[Loop]):
         )
 
     def read(self) -> tuple[float, float]:
-        """Read the waiting reports; return the loss and the PSNR of the last.
+        """Read the collected reports; return the loss and the PSNR of the last.
 
         Raises:
             PolarguideError: a loss that is not finite.
@@ -96,25 +142,29 @@ class Progress(Callback[Loop]):
         measured = torch.stack([report.measured for report in self._waiting]).cpu()
         self._waiting.clear()
         refuse_diverged(measured[:, 2])
-        for loss, psnr, _ in measured.tolist():
-            keep = 0.0 if math.isnan(self._loss) else SMOOTHING
-            self._loss = loss if keep == 0 else keep * self._loss + (1 - keep) * loss
-            self._psnr = psnr if keep == 0 else keep * self._psnr + (1 - keep) * psnr
+        values = measured[:, :2]
+        smooth = values[0] if self._smooth is None else self._smooth
+        for row in values:
+            smooth = SMOOTHING * smooth + (1 - SMOOTHING) * row
+        self._smooth = smooth
         seconds, _ = self._stopwatch.read()
         rate = (last.done - self._first) / max(1e-9, seconds - self._began)
         count = "" if last.gaussians is None else f"{last.gaussians:,} Gaussians  "
-        note = f"{last.stage}  loss {self._loss:.4f}  PSNR {self._psnr:.2f} dB  {count}{rate:.1f} it/s"
+        loss, psnr = smooth.tolist()
+        note = f"{last.stage}  loss {loss:.4f}  PSNR {psnr:.2f} dB  {count}{rate:.1f} it/s"
         self._advance(last.done, note=note, seconds=seconds)
+        loss, psnr = values[-1].tolist()
         return loss, psnr
 
 
 class Checkpoints(Callback[Loop]):
-    """Saves the state now and then. Rank 0 alone writes.
+    """Periodic checkpoints, written by rank 0.
 
     Args:
-        out: the run folder. session: number of steps between two checkpoints, and their contents.
+        out: the run folder.
+        session: number of steps between two checkpoints, and their contents.
         progress: read before a checkpoint, so that no state of a diverged training is saved.
-        stopwatch: stands still during a checkpoint.
+        stopwatch: paused during a checkpoint.
     """
 
     def __init__(self, out: Path, session: SessionOptions, progress: Progress, stopwatch: Stopwatch) -> None:
@@ -124,23 +174,28 @@ class Checkpoints(Callback[Loop]):
         self._stopwatch = stopwatch
 
     def after_step(self, loop: Loop, report: StepReport) -> None:
-        """Save a checkpoint if it is due; the state after the last step is saved at the end."""
+        """Save a checkpoint if one is due; ``at_end`` saves the last one."""
         step = loop.state.step
         if step % self._session.checkpoint_every == 0 and step < loop.settings.steps:
             with self._stopwatch.paused():
                 self._progress.read()
                 self.save(loop)
 
+    def at_end(self, loop: Loop) -> None:
+        """Save the last checkpoint."""
+        self._progress.read()
+        self.save(loop)
+
     def save(self, loop: Loop) -> None:
-        """Save the state, as all ranks have seen it. Every rank calls it."""
+        """Save the state with the sums of all ranks. Every rank calls it."""
         state = loop.saved_state()
         if loop.ranks.rank == 0:
-            goes_on = state.step < loop.settings.steps
-            save_checkpoint(self._out, state, optimizer=goes_on or self._session.keep_optimizer)
+            unfinished = state.step < loop.settings.steps
+            save_checkpoint(self._out, state, optimizer=unfinished or self._session.keep_optimizer)
 
 
 class Viewing(Callback[Loop]):
-    """Runs a viewer between steps, while the stopwatch stands still."""
+    """Viewer between steps, while the stopwatch is paused."""
 
     def __init__(self, look: Look, should_stop: Ends, stopwatch: Stopwatch) -> None:
         self._look = look
@@ -154,7 +209,7 @@ class Viewing(Callback[Loop]):
 
 
 class MemoryLimit(Callback[Loop]):
-    """Returns freed memory to the system between steps."""
+    """Return of freed memory to the system between steps."""
 
     def __init__(self, memory: MemoryBound) -> None:
         self._memory = memory
@@ -165,7 +220,7 @@ class MemoryLimit(Callback[Loop]):
 
 
 class Stop(Callback[Loop]):
-    """Ends the training on request, after the same step on all ranks."""
+    """End of the training on request, after the same step on all ranks."""
 
     def __init__(self, should_stop: Ends) -> None:
         self._should_stop = should_stop
@@ -177,10 +232,32 @@ class Stop(Callback[Loop]):
     def check(self, loop: Loop) -> None:
         """Raise TrainingStopped if the training should end before its last step."""
         step = loop.state.step
-        # Several ranks have to ask each other, which takes time.
+        # Ranks rarely exchange the request, because each exchange takes time.
         due = step < loop.settings.steps and (loop.ranks.world == 1 or step % LOG_EVERY == 0)
         if due and loop.ranks.any(self._should_stop()):
             raise TrainingStopped(step)
+
+
+class ResourceReport(Callback[Loop]):
+    """Report of the time and the memory of a finished training.
+
+    Args:
+        reporter: receives the report.
+        stopwatch: time of the training.
+        planned: planned bytes of memory.
+    """
+
+    def __init__(self, reporter: Reporter, stopwatch: Stopwatch, planned: int) -> None:
+        self._reporter = reporter
+        self._stopwatch = stopwatch
+        self._planned = planned
+
+    def at_end(self, loop: Loop) -> None:
+        """Report both."""
+        peak = peak_memory_mib()
+        memory = "" if peak is None else f" and {in_gigabytes(int(peak * MEBIBYTE))} of memory"
+        seconds = in_words(self._stopwatch.read()[0])
+        self._reporter.say(f"took {seconds}{memory} (planned: up to {in_gigabytes(self._planned)})")
 
 
 def run_to_the_end(
@@ -190,45 +267,45 @@ def run_to_the_end(
     reporter: Reporter,
     should_stop: Ends,
     look: Look | None,
-    memory: MemoryBound,
-) -> float:
+    planned: int,
+) -> None:
     """Train to the end with progress, checkpoints and a log. Rank 0 alone writes.
 
     Args:
-        loop: the loop; observed by the callbacks of this module.
-        out: the run folder. session: number of steps between two checkpoints.
-        reporter: receives progress. should_stop: returns true to end the training.
-        look: called between steps; None: nothing. memory: returns freed memory to the system.
-
-    Returns:
-        Seconds of the training.
+        loop: the loop. The callbacks of this module become its observers, before those that it has.
+        out: the run folder.
+        session: number of steps between two checkpoints.
+        reporter: receives progress.
+        should_stop: returns True to end the training.
+        look: called between steps; None: no viewer.
+        planned: bytes of memory that the process may hold.
 
     Raises:
-        TrainingStopped: ``should_stop`` returned true; the state is saved.
+        TrainingStopped: ``should_stop`` returned True; the state is saved.
     """
     log = RunLog(out) if loop.ranks.rank == 0 else None
     if log is not None:
         log.cut(loop.state.step)
     stopwatch = Stopwatch(*(log.elapsed() if log else (0.0, True)))
     stop = Stop(should_stop)
-    stopped: TrainingStopped | None = None
     with reporter.track("training", loop.total) as advance:
         progress = Progress(advance, log, stopwatch)
         checkpoints = Checkpoints(out, session, progress, stopwatch)
         viewing = [] if look is None else [Viewing(look, should_stop, stopwatch)]
-        loop.observers += [progress, MemoryLimit(memory), checkpoints, *viewing, stop]
+        memory = MemoryLimit(MemoryBound(planned))
+        resources = ResourceReport(reporter, stopwatch, planned)
+        loop.observers = [progress, memory, checkpoints, *viewing, stop, resources, *loop.observers]
         advance(loop.done, seconds=stopwatch.read()[0])
         try:
             stop.check(loop)
             loop.run()
-        except TrainingStopped as error:
-            stopped = error
+        except TrainingStopped:
+            progress.read()
+            checkpoints.save(loop)
+            raise
         except KeyboardInterrupt:
             if loop.ranks.world == 1 and loop.whole:
                 checkpoints.save(loop)
             raise
-        progress.read()
-    checkpoints.save(loop)
-    if stopped is not None:
-        raise stopped
-    return stopwatch.read()[0]
+    for observer in loop.observers:
+        observer.at_end(loop)

@@ -324,9 +324,10 @@ def most_gaussians(
     Args:
         pixels: pixels of the training views. asked, resumed: as for ``resolve``.
     """
-    recorded = {} if resumed is None else resumed.specified()
+    if settings.gaussians is not None:
+        return settings.gaussians
     by_size = min(int(pixels / method.densification.pixels_each), MOST_GAUSSIANS)
-    return recorded.get("gaussians", by_size) if settings.gaussians is None else settings.gaussians
+    return by_size if resumed is None else resumed.gaussians
 
 
 def resolve(
@@ -347,14 +348,14 @@ def resolve(
     Raises:
         PolarguideError: a setting that is out of range.
     """
-    recorded = {} if resumed is None else resumed.specified()
+    recorded = {} if resumed is None else {name: getattr(resumed, name) for name in OPEN}
     sizes = [view.camera.width * view.camera.height for view in scene.train_views]
     values: dict[str, Any] = {
         **vars(settings),
         "steps": _steps(sizes),
         "refractive_index": index_of(None, scene.refractive_index),
         "views_per_step": processes,
-        **{name: recorded[name] for name in OPEN if name in recorded},
+        **recorded,
         "gaussians": most_gaussians(sum(sizes), method, settings, resumed),
         **settings.specified(),
     }

@@ -1,7 +1,7 @@
 """Health of a finished training, from training views alone: ``health.json`` of the run folder.
 
-A training can end normally with a result that nobody should use. Each fact here is a way in which that happens, has a
-limit with a meaning in ``Limits``, and leads to a warning that names views and says what to do.
+A training can end normally with an unusable result. Each fact of this module describes one such fault. It has a limit
+with a meaning in ``Limits``, and leads to a warning that names views and a remedy.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from polarguide.capture import View
+from polarguide.capture.angle_evidence import TO_DEVIATION
 from polarguide.capture.exposures import analyzers
 from polarguide.capture.variants import BLACK, black_pixels
 from polarguide.capture.view import listed
@@ -31,7 +32,10 @@ from polarguide.core.text import command
 from polarguide.gaussians.densify import Densification, free_space
 from polarguide.optics.color import srgb_encode
 from polarguide.runs.model import GaussianModel
-from polarguide.training.angles.polarizers import Judgment
+from polarguide.training.angles.fits import AngleFits
+from polarguide.training.angles.polarizers import Judgment, predicts_filters
+from polarguide.training.callback import Callback
+from polarguide.training.loop import TrainingLoop
 from polarguide.training.photometric import behind_analyzer
 
 Word = Literal["measured", "fitted", "none"]
@@ -40,13 +44,14 @@ Count = Annotated[int, msgspec.Meta(ge=0)]
 
 @dataclass(frozen=True)
 class PolarizationSupport:
-    """How far the layers and normals of a run rest on polarization.
+    """Numbers of training views by the evidence of polarization behind their layers and normals.
 
     Attributes:
-        measured: training views whose pictures determine the Stokes vector of every pixel.
-        fitted: training views with pictures at too few angles for that: the model was fitted to them.
-        none: training views that tell the recipe nothing of polarization; there, layers and normals are its guess.
-        pictures: pictures of the fitted views that the training judged. doubtful: those whose angle is in doubt.
+        measured: views whose pictures determine the Stokes vector of every pixel.
+        fitted: views with polarized pictures at too few angles for that, to which the model was fitted.
+        none: views without polarization for the recipe; their layers and normals are a guess of the model.
+        pictures: judged pictures of the fitted views.
+        doubtful: judged pictures with a doubtful angle.
     """
 
     measured: Count
@@ -62,8 +67,10 @@ class PolarizationSupport:
         """Count the training views of a run.
 
         Args:
-            views: with what is believed of their pictures. judgments: what the training says of these.
-            measured, fitted: whether the recipe reads the polarization of views that determine it, and of others.
+            views: training views with the exposures that the training assumed.
+            judgments: judgments of the training on their pictures.
+            measured: the recipe reads the polarization of views that determine the Stokes vector.
+            fitted: the recipe reads the polarization of other views.
         """
         determined = {view.name for view in views if view.is_determined}
         single = [
@@ -78,53 +85,55 @@ class PolarizationSupport:
 
     @property
     def word(self) -> Word:
-        """The evidence of most training views; of two with equally many, the weaker one."""
+        """Evidence of most training views; the weaker one in a tie."""
         counts: dict[Word, int] = {"none": self.none, "fitted": self.fitted, "measured": self.measured}
         return max(counts, key=lambda word: counts[word])
 
     @property
     def text(self) -> str:
-        """The word, with the views that it does not hold for and the pictures that are in doubt."""
+        """Evidence of most training views, with the numbers of other views and of doubtful pictures."""
         doubts = f" ({self.doubtful} of {self.pictures} pictures doubtful)" if self.pictures else ""
         counts = {"measured": self.measured, "fitted": self.fitted, "none": self.none}
         more = {"measured": "", "fitted": doubts, "none": ""}
         total = sum(counts.values())
-        others = [w for w in counts if counts[w] and w != self.word]
+        others = [word for word in counts if counts[word] and word != self.word]
         if not others:
             guess = " (layers and normals are a guess of the model)" if self.word == "none" else ""
             return f"{self.word}{more[self.word]}{guess}"
         first = f"{self.word} in {counts[self.word]} of {total} views{more[self.word]}"
-        return ", ".join([first, *(f"{w} in {counts[w]}{more[w]}" for w in others)])
+        return ", ".join([first, *(f"{word} in {counts[word]}{more[word]}" for word in others)])
 
 
 HEALTH = "health.json"
+"""Name of the record in a run folder."""
 MOST_VIEWS = 64
+"""Largest number of examined views."""
 TIME_SHARE = 0.02
-"""Of a training's steps: what the check may take. Looking at a view takes no longer than a step."""
+"""Number of examined views over the number of steps. Examining a view takes at most the time of a step."""
 NEIGHBORS = 6
-"""Views that a view is compared with; with fewer, none can be told to be unlike the others."""
+"""Number of neighbors with which a view is compared; smaller captures have no comparison."""
 HIGHEST_PSNR = 100.0
-"""What a PSNR above it, and the infinite one of equal pictures, is recorded as."""
+"""Upper bound of recorded PSNR values in dB, which equal pictures exceed."""
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 @dataclass(frozen=True)
 class Limits:
-    """From where on a fact is worth a warning.
+    """Limits of the facts, beyond which a warning is given.
 
     Attributes:
-        far: dB under the median of the views nearest to it: 10 are ten times their squared error. Views of sound
-            scenes differ from those beside them by up to 6.
-        scattered: the same in robust standard deviations of such differences, for scenes where they differ by more.
-        brighter: times the brightest intensity that was measured anywhere. A filter hides more than half of the light
-            only where more than half of it is polarized, and then in every view.
-        burned: share of the pixels of a view that are brighter than that: a spot of 9 x 9 pixels of 320 x 240.
-        exposed: stops by which a view is brighter or darker than predicted, in any color, compared with other views:
-            half of the third of a stop by which cameras set exposures.
-        fog: mean share of the light of a view that comes from where no surface can be: what one sees in dark places.
-        bare: share of the pixels of a view that are holes: there is mostly nothing, and less than half of the light
-            that was measured, which no filter explains.
-        unseen: share of the Gaussians that no view sees: of the size of a file, and what one sees from elsewhere.
+        far: dB under the median PSNR of the nearest views. 10 dB are ten times the squared error; in sound scenes,
+            neighboring views differ by up to 6 dB.
+        scattered: the same in robust standard deviations of such differences, for scenes with larger differences.
+        brighter: factor over the brightest measured intensity. A filter hides more than half of the light only where
+            more than half of it is polarized, and then in every view.
+        burned: share of the pixels of a view beyond that factor: a spot of 9 x 9 pixels of 320 x 240.
+        exposed: stops between a view and its prediction, in any color, relative to other views. Cameras set exposures
+            in thirds of a stop; this is half of that.
+        fog: mean share of the light of a view from places without surfaces, as visible in dark regions.
+        bare: share of the pixels of a view that are holes. A hole is mostly transparent and has less than half of the
+            measured light, more than any filter explains.
+        unseen: share of the Gaussians outside all views. They enlarge files and appear in views from other sides.
     """
 
     far: float = 10.0
@@ -145,12 +154,12 @@ class ViewHealth:
     """Facts of one training view.
 
     Attributes:
-        psnr: PSNR of what was predicted of its pictures, as shown, in dB; None where no pixel counts.
-        beside: median of those of the views nearest to it; None where there are not enough.
-        burned: share of the pixels that are brighter than ``Limits.brighter`` times what was measured anywhere.
-        fog: mean share of the light that comes from where no surface can be; None where no points tell that.
+        psnr: PSNR of its predicted pictures as displayed, in dB; None without a valid pixel.
+        beside: median PSNR of the nearest views; None with too few views.
+        burned: share of the pixels that are brighter than ``Limits.brighter`` times the brightest measured intensity.
+        fog: mean share of the light from places in front of all surfaces; None if the view shows no SfM points.
         bare: share of the pixels that are holes, see ``Limits.bare``.
-        stops: median of measured over predicted light in R, G and B; None where no pixel counts.
+        stops: median of measured over predicted light in R, G and B, in stops; None without a valid pixel.
     """
 
     psnr: float | None
@@ -166,11 +175,11 @@ class Health:
     """Health of a training.
 
     Attributes:
-        polarization: what layers and normals rest on.
-        warnings: a few sentences each, for people: what is wrong, in which views, and what to do.
-        views: those that were looked at, by name. brightest: linear intensity that was measured in them.
-        unseen: share of the Gaussians that are outside all of these; None where there are none, or where the training
-            was too short to look at enough views.
+        polarization: evidence behind layers and normals.
+        warnings: texts with a fault, its views, and a remedy.
+        views: examined views by name.
+        brightest: brightest linear intensity that was measured in them.
+        unseen: share of the Gaussians outside all of them; None if a short training examined too few views.
     """
 
     polarization: PolarizationSupport
@@ -181,7 +190,7 @@ class Health:
 
     @property
     def summary(self) -> str:
-        """A sentence about a run that nothing is to be warned of, or of which nothing is known."""
+        """Number of examined views and the worst PSNR, in one sentence."""
         psnrs = {name: view.psnr for name, view in self.views.items() if view.psnr is not None}
         if not psnrs:
             return "health: no training view was looked at, the training was too short"
@@ -199,23 +208,48 @@ class Health:
 
     @classmethod
     def load(cls, run: Path) -> Health | None:
-        """Read ``health.json``; None where a training has not ended, or was one of a version without such a check.
+        """Read ``health.json``; None for an unfinished training, and for a version without this check.
 
         Raises:
             PolarguideError: the file cannot be read, or is not such a record.
         """
         if not os.path.lexists(run / HEALTH):
             return None
-        return read_record(run / HEALTH, cls, remedy="Remove it: nothing but warnings is lost.")
+        return read_record(run / HEALTH, cls, remedy="Remove it; it only holds warnings.")
+
+
+class RecordedWarnings(Reporter):
+    """Reporter that passes messages on and records the warnings.
+
+    Args:
+        reporter: receives the messages.
+
+    Attributes:
+        warnings: all warnings.
+    """
+
+    def __init__(self, reporter: Reporter) -> None:
+        self._reporter = reporter
+        self.warnings = list[str]()
+
+    def say(self, text: str) -> None:
+        """See ``Reporter``."""
+        self._reporter.say(text)
+
+    def warn(self, text: str) -> None:
+        """See ``Reporter``."""
+        self.warnings.append(text)
+        self._reporter.warn(text)
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingEvidence:
-    """The evidence by which a finished training is examined.
+    """Evidence by which a finished training is examined.
 
     Attributes:
-        views: all training views, with what is believed of their pictures. polarization: what it rests on.
-        filters: whether the recipe learns what is behind filters.
+        views: all training views, with the exposures that the training assumed.
+        polarization: evidence of polarization in them.
+        filters: the recipe learns from pictures behind filters.
     """
 
     views: Sequence[View]
@@ -223,7 +257,7 @@ class TrainingEvidence:
     filters: bool
 
     def chosen(self, steps: int) -> list[View]:
-        """Views to look at after a training of so many steps, spread evenly: see ``TIME_SHARE``."""
+        """Return evenly spread views to examine after a number of steps, see ``TIME_SHARE``."""
         count = min(MOST_VIEWS, len(self.views), int(TIME_SHARE * steps))
         places = torch.linspace(0, len(self.views) - 1, count).round().long().tolist() if count else []
         return [self.views[place] for place in places]
@@ -233,10 +267,13 @@ class TrainingEvidence:
 def examine(
     model: GaussianModel, evidence: TrainingEvidence, points: Tensor, steps: int, reporter: Reporter
 ) -> Health:
-    """Look at training views; changes nothing of the model.
+    """Examine training views.
 
     Args:
-        model: what was learned. evidence: of its training. points: of the scene, [M, 3]. steps: it took.
+        model: the trained model.
+        evidence: evidence of its training.
+        points: [M, 3] SfM points of the scene.
+        steps: number of steps of the training.
         reporter: receives progress.
     """
     views = evidence.chosen(steps)
@@ -245,42 +282,42 @@ def examine(
     brightest = max(map(_brightest, views))
     cameras = [view.camera for view in views]
     free = free_space(points, cameras, Densification.free_share, Densification.free_quantile)
-    nearest = free.radii.tolist()
     by_view = {}
-    visible = None
+    radii = []
     with reporter.track("checking the result", len(views)) as advance:
-        for view, near in zip(views, nearest, strict=True):
-            facts, radii = _look(model, view, LIMITS.brighter * brightest, near, evidence.filters)
+        for view, near in zip(views, free.radii.tolist(), strict=True):
+            facts, own_radii = _examine_view(model, view, LIMITS.brighter * brightest, near, evidence.filters)
             by_view[view.name] = facts
-            if radii is not None:
-                visible = radii > 0 if visible is None else visible | (radii > 0)
+            radii.append(own_radii)
             advance(len(by_view))
-    for name, psnr in _beside(views, {name: facts.psnr for name, facts in by_view.items()}).items():
+    for name, psnr in _neighbor_psnr(views, {name: facts.psnr for name, facts in by_view.items()}).items():
         by_view[name] = dataclasses.replace(by_view[name], beside=psnr)
-    enough = len(views) == min(MOST_VIEWS, len(evidence.views))  # others may see what a few do not
-    unseen = float((~visible).float().mean()) if visible is not None and enough else None
+    unseen = None
+    if len(views) == min(MOST_VIEWS, len(evidence.views)):  # a part of the views would miss visible Gaussians
+        unseen = float((torch.stack(radii).amax(dim=0) <= 0).float().mean())
     return Health(evidence.polarization, tuple(warnings_of(by_view, unseen)), by_view, brightest, unseen)
 
 
 def _counted(view: View) -> Tensor:
-    """Pixels [H, W] whose measurement counts."""
+    """Return the mask [H, W] of valid and unsaturated pixels."""
     return ~(view.invalid | view.saturated)
 
 
 def _brightest(view: View) -> float:
-    """The largest linear intensity that was measured in a view; 0 where no pixel counts."""
+    """Return the largest linear intensity that was measured in a view; 0 without a valid pixel."""
     measured = view.intensities().amax(dim=(0, 3))[_counted(view)]
     return float(measured.max()) if len(measured) else 0.0
 
 
-def _look(
+def _examine_view(
     model: GaussianModel, view: View, limit: float, near: float, filters: bool
-) -> tuple[ViewHealth, Tensor | None]:
-    """Facts of a view, and the radii of the Gaussians in it.
+) -> tuple[ViewHealth, Tensor]:
+    """Return the facts of a view, and the radii [N] of the Gaussians in it.
 
     Args:
-        limit: intensity above which a pixel is burned. near: depth up to which there can be no surface; 0: unknown.
-        filters: whether the model predicts what is behind them.
+        limit: intensity above which a pixel is burned.
+        near: depth in front of all surfaces; 0: unknown.
+        filters: the model predicts pictures behind filters.
     """
     local = view.to(model.device)
     camera = view.camera
@@ -302,11 +339,11 @@ def _look(
         depth = torch.full_like(result.alpha, near)
         fog = float((model.alpha_in_front(camera, depth) * result.alpha).mean().clamp(0, 1))
     stops = _stops(measured.mean(dim=0), predicted.mean(dim=0), counted)
-    return ViewHealth(psnr, None, _share(burned), fog, _share(bare), stops), result.training.get("radii")
+    return ViewHealth(psnr, None, _share(burned), fog, _share(bare), stops), result.training["radii"]
 
 
 def _stops(measured: Tensor, predicted: Tensor, counted: Tensor) -> tuple[float, float, float] | None:
-    """Medians of measured over predicted light [H, W, 3] by color, where neither is black; None where all is."""
+    """Return the medians of measured over predicted light [H, W, 3] by color, in stops; None if all is black."""
     lit = counted & (torch.minimum(measured, predicted).amin(dim=-1) > BLACK)
     if not bool(lit.any()):
         return None
@@ -315,9 +352,9 @@ def _stops(measured: Tensor, predicted: Tensor, counted: Tensor) -> tuple[float,
 
 
 def _compared(view: View, final: Tensor, stokes: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Measured and predicted pictures of a view: [K, H, W, 3] linear each.
+    """Return the measured and the predicted pictures of a view, [K, H, W, 3] linear each.
 
-    That is each picture behind its filter, where that is predicted, and else the photograph.
+    These are all pictures behind known filters if they are predicted, and the photograph otherwise.
     """
     indices = [k for k, exposure in enumerate(view.exposures) if exposure.known]
     if stokes is None or not indices:
@@ -328,8 +365,11 @@ def _compared(view: View, final: Tensor, stokes: Tensor | None) -> tuple[Tensor,
     return view.intensities()[indices], predicted
 
 
-def _beside(views: Sequence[View], psnr: Mapping[str, float | None]) -> dict[str, float]:
-    """For each view the median PSNR of those nearest to it, by where cameras stand and look; empty for few views."""
+def _neighbor_psnr(views: Sequence[View], psnr: Mapping[str, float | None]) -> dict[str, float]:
+    """Return the median PSNR of the nearest views of each view; empty with too few views.
+
+    Distances are those of camera centers, relative to their mean distance from the middle, and of viewing directions.
+    """
     scored = [view for view in views if psnr[view.name] is not None]
     if len(scored) <= NEIGHBORS:
         return {}
@@ -349,88 +389,121 @@ def _share(pixels: Tensor) -> float:
 
 
 def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: Limits = LIMITS) -> list[str]:
-    """Warnings, the gravest first.
+    """Return warnings, the most severe first.
 
     Args:
-        views: those that were looked at. unseen: as of ``Health``. limits: from where on.
+        views: examined views by name.
+        unseen: share of unseen Gaussians; None: unknown.
+        limits: limits of the facts.
     """
     warnings = []
     bare = {name: view.bare for name, view in views.items() if view.bare > limits.bare}
     burned = {name: view.burned for name, view in views.items() if view.burned > limits.burned}
     if burned:
         warnings.append(
-            f"the result has burned: {_worst(burned)} are over {limits.brighter:g} times as bright as anything that "
-            "was measured. Their pictures do not determine the light there: do not use this run; add pictures of "
+            f"the result has burned: {_worst(burned)} are over {limits.brighter:g} times as bright as the brightest "
+            "measured intensity. The pictures do not determine the light there. Do not use this run; add pictures of "
             "these views at other angles, or without a filter, and train again."
         )
-    exposed = {name: stops for name, stops in _exposed(views, limits).items() if name not in burned | bare}
+    exposed = {name: off for name, off in _exposed(views, limits).items() if name not in burned | bare}
     explained = burned | bare | exposed
     far = [name for name in _far_under(views, limits) if name not in explained]
     if far:
         worst = ", ".join(
-            f"{name} ({views[name].psnr:.1f} dB, beside {views[name].beside:.1f})" for name in far[:4]
+            f"{name} ({views[name].psnr:.1f} dB, neighbors {views[name].beside:.1f} dB)" for name in far[:4]
         )
         more = f" and {len(far) - 4} more" if len(far) > 4 else ""
         warnings.append(
-            f"training views far under those beside them: {worst}{more}. Pose, polarizer angle, exposure or focus of "
-            f"these photographs may be wrong: {command('render', 'RUN', '--views', ','.join(far[:4]))} compares them "
+            f"training views with a far lower PSNR than their neighbors: {worst}{more}. Pose, polarizer angle, "
+            "exposure or focus of these photographs may be wrong: "
+            f"{command('render', 'RUN', '--views', ','.join(far[:4]))} compares them "
             "with the run; correct them or leave them out."
         )
     if exposed:
-        told = listed([f"{name} {stops:+.2f}" for name, stops in exposed.items()])
+        stops = listed([f"{name} {off:+.2f}" for name, off in exposed.items()])
         warnings.append(
-            f"training views brighter or darker than the result predicts, or of other colors (stops: {told}): their "
+            f"training views brighter or darker than the result predicts, or of other colors (stops: {stops}): their "
             "exposure or white balance differs and was not corrected. Leave them out, or prepare with --gains auto."
         )
     fog = {name: view.fog for name, view in views.items() if view.fog is not None and view.fog > limits.fog}
     if fog:
         warnings.append(
-            f"fog hangs before the cameras of {_worst(fog, 'of the light')}, where no surface can be, and new "
-            "views near them show it: add views from there, or, if the subject stands alone, train with --background "
-            "black or masked."
+            f"fog in front of the cameras of {_worst(fog, 'of the light')}, where no surface can be. New views "
+            "near these cameras show it. Add views from there. For a subject without surroundings, train with "
+            "--background black or masked."
         )
     if bare:
         warnings.append(
-            f"the result has holes where the photographs show something: {_worst(bare)}. Add views or points there; "
-            "if surroundings are missing, train with --background scene."
+            f"the result has holes where the photographs show surfaces: {_worst(bare)}. Add views or points there. "
+            "If surroundings are missing, train with --background scene."
         )
     if unseen is not None and unseen > limits.unseen:
         warnings.append(
-            f"{100 * unseen:.0f} % of the Gaussians are outside all of the {len(views)} training views that were "
-            "looked at: nothing is known of them. Keep them out of exports with a crop box (polarguide present --crop)."
+            f"{100 * unseen:.0f} % of the Gaussians are outside all {len(views)} examined training views, which do not "
+            "determine them. Keep them out of exports with a crop box (polarguide present --crop)."
         )
     return warnings
 
 
 def _exposed(views: Mapping[str, ViewHealth], limits: Limits) -> dict[str, float]:
-    """Stops by which views are exposed otherwise than the others, the strongest first."""
+    """Return the deviations of views with another exposure from the other views, in stops, the largest first."""
     known = {name: torch.tensor(view.stops) for name, view in views.items() if view.stops is not None}
     if len(known) <= NEIGHBORS:
         return {}
     stops = torch.stack(list(known.values()))
     off = stops - stops.median(dim=0).values
-    least = max(limits.exposed, limits.scattered * 1.4826 * float(off.abs().median()))
+    least = max(limits.exposed, limits.scattered * TO_DEVIATION * float(off.abs().median()))
     strongest = {name: max(row.tolist(), key=abs) for name, row in zip(known, off, strict=True)}
     order = sorted(strongest, key=lambda name: -abs(strongest[name]))
     return {name: strongest[name] for name in order if abs(strongest[name]) > least}
 
 
 def _far_under(views: Mapping[str, ViewHealth], limits: Limits) -> list[str]:
-    """The views whose PSNR is far under that of the views beside them, the lowest first."""
+    """Return the views with a far lower PSNR than their neighbors, the lowest first."""
     drops = {
         name: view.beside - view.psnr
         for name, view in views.items()
         if view.psnr is not None and view.beside is not None
     }
-    if not drops:
-        return []
-    scatter = 1.4826 * median(abs(drop) for drop in drops.values())
+    scatter = TO_DEVIATION * median(map(abs, drops.values())) if drops else 0.0
     least = max(limits.far, limits.scattered * scatter)
     return sorted((name for name in drops if drops[name] > least), key=lambda name: -drops[name])
 
 
 def _worst(shares: Mapping[str, float], of: str = "of the pixels") -> str:
-    """Views by their shares, the largest first."""
-    names = sorted(shares, key=lambda name: -shares[name])
-    first, *rest = names
+    """Return a list of views by their shares, the largest first."""
+    first, *rest = sorted(shares, key=lambda name: -shares[name])
     return listed([f"{first} ({100 * shares[first]:.1f} % {of})", *rest])
+
+
+class HealthCheck(Callback[TrainingLoop]):
+    """Examination of a finished training: writes ``health.json`` and reports a summary.
+
+    Args:
+        out: the run folder.
+        fits: fits of polarizer angles of the training.
+        reports: reporter of the other reports of the training, whose warnings are recorded as well.
+    """
+
+    def __init__(self, out: Path, fits: AngleFits, reports: RecordedWarnings) -> None:
+        self._out = out
+        self._fits = fits
+        self._reports = reports
+
+    def at_end(self, loop: TrainingLoop) -> None:
+        """Examine the training views."""
+        context = loop.context
+        recipe = context.recipe
+        polarizers = self._fits.polarizers
+        views = [polarizers.believed(view) for view in context.views]
+        filters = predicts_filters(recipe)
+        priors = any(stage.weights.priors for stage in recipe.stages)
+        support = PolarizationSupport.of(views, polarizers.judgments(), measured=priors, fitted=filters)
+        evidence = TrainingEvidence(views, support, filters=filters)
+        model = GaussianModel.of(loop.state, recipe, context.settings, context.backend)
+        health = examine(model, evidence, context.scene.points, context.settings.steps, context.reporter)
+        for warning in health.warnings:
+            context.reporter.warn(warning)
+        health = dataclasses.replace(health, warnings=(*health.warnings, *self._reports.warnings))
+        health.save(self._out)
+        context.reporter.say(f"{health.summary}; polarization: {health.polarization.text}")

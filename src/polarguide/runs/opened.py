@@ -29,7 +29,7 @@ from polarguide.runs.health import Health
 from polarguide.runs.model import GaussianModel, Within
 from polarguide.shading.result import LAYERS, POLARIZED, RenderResult, polarized_layers
 from polarguide.training.recipe import Recipe
-from polarguide.training.settings import TrainSettings
+from polarguide.training.settings import ResolvedSettings, TrainSettings
 
 Opened = TypeVar("Opened", bound="OpenedRun")
 
@@ -408,7 +408,7 @@ def read_scene(
     return scene
 
 
-def trained_scene(scene: Scene, settings: TrainSettings) -> Scene:
+def trained_scene(scene: Scene, settings: TrainSettings | ResolvedSettings) -> Scene:
     """The scene with the exposures and the background that a training with these settings uses."""
     chosen = select_exposures(scene, settings.exposures)
     return mask_background(chosen) if settings.background == "masked" else chosen

@@ -8,12 +8,12 @@ from torch import Tensor
 from polarguide.shading.result import RenderResult
 
 
-def turned_behind(result: RenderResult, near: float, far: float) -> RenderResult:
-    """The same pictures, whose normal and depth move no Gaussian far away.
+def fade_behind(result: RenderResult, near: float, far: float) -> RenderResult:
+    """Return the same layers with gradients of normal and depth that move no far Gaussian.
 
-    Gradients of the normal and the depth reach everything up to ``near``; from there they fade, linearly in inverse
-    depth, and from ``far`` on the depth has none, and the normal one that turns Gaussians alone. A pixel is as far away
-    as the farthest of its 3 x 3 neighbors, since the normals of the depth look at these.
+    Up to ``near``, gradients of the normal and the depth reach all parameters. From there they fade linearly in inverse
+    depth. From ``far`` on, the depth has no gradient, and that of the normal only turns Gaussians. A pixel is as far
+    away as the farthest of its 3 x 3 neighbors, because normals of the depth are differences between these.
 
     Args:
         result: with ``normal``, ``rotation_only_normal`` and ``depth``.
@@ -21,14 +21,12 @@ def turned_behind(result: RenderResult, near: float, far: float) -> RenderResult
     """
     depth = result.depth.detach()
     share = shares_before(depth, near, far)
-    rotation_only = result.training["rotation_only_normal"]
-    return result.with_layers(
-        normal=rotation_only.lerp(result.normal, share[..., None]), depth=depth.lerp(result.depth, share)
-    )
+    normal = result.training["rotation_only_normal"].lerp(result.normal, share[..., None])
+    return result.with_layers(normal=normal, depth=depth.lerp(result.depth, share))
 
 
 def shares_before(depth: Tensor, near: float, far: float) -> Tensor:
-    """From 1 up to ``near`` to 0 from ``far`` on, of the farthest of the 3 x 3 neighbors; [H, W] like the depth."""
+    """Return the share [H, W] of the gradient that remains: 1 up to ``near``, 0 from ``far`` on."""
     farthest = _largest_of_three(_largest_of_three(depth).T).T.clamp(min=near)
     return ((1 / farthest - 1 / far) / (1 / near - 1 / far)).clamp(min=0)
 

@@ -1,29 +1,39 @@
-"""Base class of everything that happens between the steps of a training."""
+"""Callbacks, which run between the steps of a training, and the loop that calls them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
 from torch import Tensor
 
+from polarguide.core.errors import PolarguideError
+from polarguide.training.distributed import Ranks
 from polarguide.training.recipe import Position
-from polarguide.training.settings import StepReport
+from polarguide.training.settings import ResolvedSettings, StepReport
+from polarguide.training.state import SavedState
+from polarguide.training.targets import Step
 
 LoopKind = TypeVar("LoopKind", contravariant=True)
 """Kind of the loop whose steps a callback accompanies."""
 
 
 class Callback(Generic[LoopKind]):
-    """Does something between the steps of a training; every method of this class does nothing.
+    """Base class of callbacks; every method of this class does nothing.
 
     Attributes:
-        name: prefix of its tensors in a checkpoint, an identifier; unique among the callbacks that have a state.
+        name: name of its tensors in a checkpoint, an identifier; unique among the callbacks that have a state.
         action: name in ``Stage.on_enter``, ``Repeat`` and ``Rounds`` of a recipe that makes ``act`` due.
     """
 
     name = ""
     action = ""
+
+    @property
+    def prefix(self) -> str:
+        """Prefix of the names of its tensors in a checkpoint."""
+        return f"callback.{self.name}."
 
     def begin(self, loop: LoopKind) -> None:
         """Set up for the loop, before its first step and whenever it begins again."""
@@ -34,18 +44,127 @@ class Callback(Generic[LoopKind]):
     def act(self, loop: LoopKind) -> None:
         """Run where the recipe names ``action``. Callbacks of one action follow each other in their order."""
 
+    def after_backward(self, loop: LoopKind, step: Step, slot: int) -> None:
+        """Run after the gradients of one view of a step have been added; ``slot`` is the number of that view."""
+
     def after_step(self, loop: LoopKind, report: StepReport) -> None:
         """Run after a step; ``loop.state.step`` is the number of finished steps."""
 
     def at_end(self, loop: LoopKind) -> None:
         """Run after the last step."""
 
+    def before_checkpoint(self, loop: LoopKind) -> None:
+        """Run on every rank before the first rank writes a checkpoint."""
+
     def state_dict(self) -> dict[str, Tensor]:
         """Return the tensors that a resumed training needs."""
         return {}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what ``state_dict`` returned."""
+        """Restore the tensors that ``state_dict`` returned."""
 
 
 AnyCallback = Callback[Any]
+
+
+class Loop(ABC):
+    """Steps of a training, with callbacks between them.
+
+    Attributes:
+        settings: settings of the training.
+        ranks: processes that share the training.
+        callbacks: callbacks in the order of their calls.
+        observers: callbacks that run after the others, when the step is complete. They change nothing.
+        state: state between two steps.
+        whole: False while an exception would leave the state in the middle of a change.
+        total: number of steps in all. offset: number of steps before the current schedule began.
+    """
+
+    state: SavedState
+
+    def __init__(self, settings: ResolvedSettings, ranks: Ranks, callbacks: Sequence[AnyCallback]) -> None:
+        self.settings = settings
+        self.ranks = ranks
+        self.callbacks = list(callbacks)
+        self.observers: list[AnyCallback] = []
+        self.whole = True
+        self.total = settings.steps
+        self.offset = 0
+
+    @property
+    def done(self) -> int:
+        """Number of finished steps of ``total``."""
+        return self.offset + self.state.step
+
+    def run(self, until: int | None = None) -> None:
+        """Train up to the last step, or up to the step ``until``."""
+        while self.state.step < (self.settings.steps if until is None else until):
+            self.step()
+
+    def step(self) -> StepReport:
+        """Do one optimizer step, with the callbacks before and after it."""
+        self.prepare()
+        measured, stage, gaussians = self.optimize()
+        report = StepReport(self.state.step, stage, gaussians, measured, self.done + 1)
+        self.state.step += 1
+        for callback in self.callbacks:
+            callback.after_step(self, report)
+        if self.state.step == self.settings.steps:
+            for callback in self.callbacks:
+                callback.at_end(self)
+        self.whole = True
+        for observer in self.observers:
+            observer.after_step(self, report)
+        return report
+
+    def prepare(self) -> None:  # noqa: B027
+        """Do the work that is due before a step."""
+
+    @abstractmethod
+    def optimize(self) -> tuple[Tensor, str, int | None]:
+        """Change the parameters once.
+
+        Returns:
+            ``StepReport.measured``, the name of the stage, and the number of Gaussians.
+        """
+
+    def saved_state(self) -> SavedState:
+        """Return the state for a checkpoint, with the sums of all ranks. Every rank calls it."""
+        for callback in self.callbacks:
+            callback.before_checkpoint(self)
+        return self.state
+
+
+def stateful(callbacks: Iterable[AnyCallback]) -> list[AnyCallback]:
+    """Return the callbacks that have a state.
+
+    Raises:
+        PolarguideError: one of them has no name of its own for its tensors in a checkpoint.
+    """
+    holders = [each for each in callbacks if type(each).state_dict is not Callback.state_dict]
+    names = [each.name for each in holders]
+    for name in names:
+        if not name.isidentifier() or names.count(name) > 1:
+            raise PolarguideError(
+                "training",
+                expected="a name of its own for each callback that has state_dict, made of letters, digits and _",
+                found=repr(name),
+                remedy="Set the attribute name of the callback.",
+            )
+    return holders
+
+
+def check_known(kind: str, names: Iterable[str], known: set[str]) -> None:
+    """Check that the callbacks of a loop define all names of a kind.
+
+    Raises:
+        PolarguideError: one name is unknown.
+    """
+    unknown = sorted(set(names) - known)
+    if unknown:
+        raise PolarguideError(
+            "training",
+            expected=f"a {kind} among {', '.join(sorted(known - {''}))}",
+            found=unknown[0],
+            remedy="Correct the name, or pass the callback that has it.",
+        )

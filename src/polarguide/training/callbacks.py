@@ -1,26 +1,166 @@
-"""The callbacks of the training of Gaussians that belong to a method."""
+"""Callbacks of the training of Gaussians that belong to a method.
+
+Changes of Gaussians between steps: resets, normal propagation, outward directions, pixel counts.
+"""
 
 from __future__ import annotations
 
-from polarguide.gaussians.densify import densify, free_space
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from polarguide.capture import View
+from polarguide.gaussians.densify import DensityStatistics, densify, free_space
+from polarguide.geometry.camera import Camera, seen_at
+from polarguide.geometry.vectors import unit
+from polarguide.raster import Rasterize
 from polarguide.raster.magnification import footprints
-from polarguide.training.actions import (
-    exchange_statistics,
-    outward_directions,
-    propagate_normals,
-    reset_opacity,
-    touched_pixels,
-)
+from polarguide.shading.gbuffer import RenderRequest, render, splats
+from polarguide.shading.model import Parameters, ShadingModel
 from polarguide.training.callback import AnyCallback, Callback
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.metals.observations import index_offsets
 from polarguide.training.metals.search import MetalSearch
+from polarguide.training.recipe import Position, Propagation
 from polarguide.training.settings import StepReport
-from polarguide.training.state import seeded
+from polarguide.training.state import TrainingState, seeded
+from polarguide.training.targets import Step
+
+
+def _logit(value: float) -> float:
+    return float(torch.logit(torch.tensor(value, dtype=torch.float64)))
+
+
+@torch.no_grad()
+def reset_opacity(state: TrainingState, shading: ShadingModel, most: float) -> None:
+    """Lower opacities to at most ``most``, so that unneeded Gaussians stay transparent (Kerbl et al. 2023).
+
+    Parameters of the shading model rise to their minimum after a reset, if they have one.
+    """
+    gaussians = state.gaussians
+    gaussians.overwrite("opacity_logits", gaussians["opacity_logits"].clamp(max=_logit(most)))
+    for name, parameter in shading.parameters.items():
+        if parameter.reset_minimum is not None:
+            gaussians.overwrite(name, gaussians[name].clamp(min=parameter.reset_minimum))
+
+
+@torch.no_grad()
+def propagate_normals(
+    state: TrainingState,
+    shading: ShadingModel,
+    settings: Propagation,
+    generator: torch.Generator,
+    steps: int,
+) -> None:
+    """Let Gaussians with a right normal take over their neighborhood (Ye et al. 2024, Sec. 3.3).
+
+    Opacities rise. Matte Gaussians get noise on their color, which hides the light that they explain by color alone.
+    Glossy Gaussians grow along their surface.
+    """
+    gaussians = state.gaussians
+    strength = shading.strength(gaussians)
+    gaussians.overwrite("opacity_logits", gaussians["opacity_logits"].clamp(min=_logit(settings.opacity)))
+    # Drawn on the CPU: the noise is the same on every device.
+    noise = (torch.rand(gaussians["sh_dc"].shape, generator=generator) * 2 - 1) * settings.color_noise
+    noise = noise.to(gaussians["sh_dc"].device)
+    matte = (strength <= settings.matte)[:, None]
+    # As in the release, the noise is added to the SH coefficient itself.
+    gaussians.overwrite("sh_dc", gaussians["sh_dc"] + torch.where(matte, noise, torch.zeros_like(noise)))
+    scales = gaussians["log_scales"]
+    longer = torch.ones_like(scales).scatter(1, scales.argmin(dim=1, keepdim=True), 0.0)
+    grow = (strength >= settings.glossy)[:, None] * longer * torch.log(torch.tensor(settings.widen))
+    gaussians.overwrite("log_scales", scales + grow)
+    state.opacity_frozen_until = state.step + min(settings.rest, steps // settings.rest_part)
+
+
+DEPTH_SLACK = 0.02
+"""Largest distance of a visible Gaussian behind the rendered surface, relative to its depth."""
+LEAST_PIXELS = 0.05
+"""Least sum of the blending weights of a Gaussian that contributes to a picture."""
+DEPTH_ALONE = RenderRequest(sh_degree=0, normals=False, depth=True)
+
+
+@torch.no_grad()
+def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: Rasterize) -> Tensor:
+    """Return the sum of the unit directions to the cameras that see each Gaussian.
+
+    A camera sees a Gaussian if its center is inside the picture and not behind the rendered depth.
+
+    Args:
+        gaussians: the Gaussians.
+        views: views with the cameras.
+        rasterize: rasterizer of the backend.
+
+    Returns:
+        [N, 3]; zero for Gaussians that no camera sees.
+    """
+    means = gaussians["means"]
+    total = torch.zeros_like(means)
+    for view in views:
+        camera = view.camera
+        depth = render(gaussians, camera, rasterize, DEPTH_ALONE).depth
+        center = camera.pose(means.dtype, means.device).center
+        pixel, z, inside = seen_at(means - center, camera)
+        visible = inside & (z < depth[pixel] * (1 + DEPTH_SLACK))
+        total += visible[:, None] * unit(center - means)
+    return total
+
+
+class PixelCounts(NamedTuple):
+    """Pixels of each Gaussian in training pictures.
+
+    Attributes:
+        views: [N] float32, number of pictures in which the sum of its blending weights is at least ``LEAST_PIXELS``.
+        most: [N] largest sum of its blending weights in a picture, in pixels.
+    """
+
+    views: Tensor
+    most: Tensor
+
+
+def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: Rasterize) -> PixelCounts:
+    """Count the pixels of each Gaussian in pictures.
+
+    Args:
+        gaussians: the Gaussians.
+        cameras: cameras of the pictures.
+        rasterize: rasterizer of the backend.
+    """
+    splatted = splats(gaussians)
+    views = torch.zeros(len(splatted.means), device=splatted.means.device)
+    most = torch.zeros_like(views)
+    for camera in cameras:
+        # The gradient of the summed weights with respect to a feature is the sum of its Gaussian's weights.
+        with torch.enable_grad():
+            features = torch.ones_like(splatted.features).requires_grad_()
+            fixed = type(splatted)(*(tensor.detach() for tensor in splatted))
+            total = rasterize(fixed._replace(features=features), camera).features.sum()
+            pixels = torch.autograd.grad(total, features)[0][:, 0]
+        views += (pixels >= LEAST_PIXELS).float()
+        most = torch.maximum(most, pixels)
+    return PixelCounts(views, most)
+
+
+class LargeBatch(Callback[TrainingLoop]):
+    """Decay and rates of Adam for several views a step; see ``TrainSettings``."""
+
+    def begin(self, loop: TrainingLoop) -> None:
+        views = loop.settings.views_per_step
+        if views == 1:
+            return
+        for optimized in loop.state.optimized:
+            optimized.set_betas((0.9**views, 0.999**views))
+        if loop.state.environment is not None:
+            for name, rate in loop.current.recipe.light_rates.items():
+                loop.state.environment.set_rate(name, rate * math.sqrt(views))
 
 
 class OpacityReset(Callback[TrainingLoop]):
-    """Lowers opacities."""
+    """Reset of the opacities to a small value."""
 
     action = "reset_opacity"
 
@@ -30,34 +170,41 @@ class OpacityReset(Callback[TrainingLoop]):
 
 
 class NormalPropagation(Callback[TrainingLoop]):
-    """Lets Gaussians with a right normal take over their neighborhood."""
+    """Spread of Gaussians with a right normal over their neighborhood."""
 
     action = "propagate_normals"
+
+    def before_step(self, loop: TrainingLoop, position: Position) -> None:
+        self._hold_opacities(loop)
 
     def act(self, loop: TrainingLoop) -> None:
         context = loop.current
         generator = seeded(context.settings.seed, 3, loop.state.step)
         steps = context.settings.steps
         propagate_normals(loop.state, context.shading, context.recipe.propagation, generator, steps)
+        self._hold_opacities(loop)
+
+    def _hold_opacities(self, loop: TrainingLoop) -> None:
+        if loop.state.step < loop.state.opacity_frozen_until:
+            loop.rates["opacity_logits"] = 0.0
 
 
 class NormalOrientation(Callback[TrainingLoop]):
-    """Finds the side from which the training views see each Gaussian."""
+    """Search for the side of each Gaussian that training views see."""
 
     action = "orient_normals"
 
     def act(self, loop: TrainingLoop) -> None:
         context = loop.current
         gaussians = loop.state.gaussians
-        outward = outward_directions(
-            gaussians, context.memory.between(context.views), context.backend.rasterize
-        )
+        views = context.memory.between(context.views)
+        outward = outward_directions(gaussians, views, context.backend.rasterize)
         loop.ranks.broadcast(outward)
         gaussians.overwrite("outward", outward)
 
 
 class Metals(Callback[TrainingLoop]):
-    """Finds metals at the refreshes of the priors."""
+    """Search for metals at refreshes of the priors."""
 
     action = "refresh_priors"
 
@@ -66,12 +213,12 @@ class Metals(Callback[TrainingLoop]):
 
     def act(self, loop: TrainingLoop) -> None:
         if self._search.is_due(loop.state.step):
-            loop.feed.refresh_priors()  # their memory is needed for looks at all views
+            loop.feed.refresh_priors()  # the search needs their memory
             self._search.look(loop.state)
 
 
 class IndexOffsets(Callback[TrainingLoop]):
-    """Gives Gaussians the refractive indices that the user specified for materials."""
+    """Assignment of the refractive indices that the user specified for materials."""
 
     action = "refresh_priors"
 
@@ -95,17 +242,41 @@ class IndexOffsets(Callback[TrainingLoop]):
 
 
 class PriorRefresh(Callback[TrainingLoop]):
-    """Drops the priors of all views, and lets the present Gaussians guide the next ones."""
+    """Recomputation of the priors of all views with the normals of a copy of the Gaussians, the guide."""
 
     action = "refresh_priors"
+    name = "prior_refresh"
+    prefix = "frozen."
+
+    def begin(self, loop: TrainingLoop) -> None:
+        self._guide = dict[str, Tensor]()
+
+    def before_step(self, loop: TrainingLoop, position: Position) -> None:
+        """Request a refresh if the step needs priors and none has been made."""
+        loop.feed.guide = self._guide
+        if self._guide or not position.stage.weights.priors or self.action in position.actions:
+            return
+        slots = range(loop.settings.views_per_step)
+        if any(loop.feed.view_at(loop.state.step, slot).is_determined for slot in slots):
+            loop.position = replace(position, actions=(*position.actions, self.action))
 
     def act(self, loop: TrainingLoop) -> None:
+        self._guide = loop.state.gaussians.snapshot()
         loop.feed.refresh_priors()
-        loop.state.frozen = loop.state.gaussians.snapshot()
+        loop.feed.guide = self._guide
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return self._guide
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        self._guide = dict(tensors)
 
 
 class DensityControl(Callback[TrainingLoop]):
-    """Adds and removes Gaussians by what all ranks have seen, in stages with density control."""
+    """Addition and removal of Gaussians in stages with density control, by the statistics of all ranks."""
+
+    prefix = "statistics."
+    name = "density_control"
 
     def begin(self, loop: TrainingLoop) -> None:
         context = loop.current
@@ -115,6 +286,16 @@ class DensityControl(Callback[TrainingLoop]):
         self._middle = context.centers.mean(dim=0).float().to(device)
         empty = free_space(context.scene.points, cameras, density.free_share, density.free_quantile)
         self._empty = empty.to(device)
+        means = loop.state.gaussians["means"]
+        self._statistics = DensityStatistics(len(means), context.settings.views_per_step, means.device)
+
+    def after_backward(self, loop: TrainingLoop, step: Step, slot: int) -> None:
+        if step.statistic is None or step.statistic.gradient is None:
+            return
+        loop.whole = False
+        camera = step.targets.camera
+        radii = step.result.training["radii"]
+        self._statistics.add(step.statistic.gradient, radii, camera.width, camera.height, slot)
 
     def after_step(self, loop: TrainingLoop, report: StepReport) -> None:
         if not loop.position.stage.densify:
@@ -124,10 +305,10 @@ class DensityControl(Callback[TrainingLoop]):
         density = context.recipe.densification
         state = loop.state
         if state.step % density.every == 0:
-            exchange_statistics(state, loop.ranks)
+            self.before_checkpoint(loop)
             densify(
                 state.gaussians,
-                state.statistics,
+                self._statistics,
                 density,
                 extent=context.extent,
                 middle=self._middle,
@@ -139,19 +320,30 @@ class DensityControl(Callback[TrainingLoop]):
         if state.step >= settings.steps or not loop.schedule.at(state.step).stage.densify:
             self._prune_untouched(loop)
 
-    def _prune_untouched(self, loop: TrainingLoop) -> None:
-        """Remove Gaussians that show too little.
+    def before_checkpoint(self, loop: TrainingLoop) -> None:
+        """Exchange the sums since the last densification among the ranks."""
+        for sums in self.state_dict().values():
+            loop.ranks.exchange_slots(sums if sums.ndim == 2 else sums[None])
 
-        Where nothing is behind the subject: those in too few training views, which are fog in new views. Also those
-        that are faint in all training views, as faint as the recipe specifies.
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"gradient": self._statistics.gradient, "seen": self._statistics.seen}
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        self._statistics = DensityStatistics.of(tensors["gradient"], tensors["seen"])
+
+    def _prune_untouched(self, loop: TrainingLoop) -> None:
+        """Remove Gaussians that contribute too little to the training views.
+
+        Without a background, Gaussians in too few training views are removed, because they are fog in new views.
+        Gaussians that are fainter in all training views than the recipe's limit are removed as well.
         """
         context = loop.current
         density = context.recipe.densification
-        state = loop.state
+        gaussians = loop.state.gaussians
         if not (context.black or density.faint_pixels):
             return
         cameras = context.memory.between(view.camera for view in context.views)
-        touched = touched_pixels(state.gaussians, cameras, context.backend.rasterize)
+        touched = touched_pixels(gaussians, cameras, context.backend.rasterize)
         for values in touched:
             loop.ranks.broadcast(values)
         keep = touched.most >= density.faint_pixels
@@ -159,12 +351,12 @@ class DensityControl(Callback[TrainingLoop]):
             enough = len(context.views) >= density.enough_views
             keep &= touched.views >= (2 if enough else 1)
         if bool(keep.any()):
-            state.gaussians.keep(keep)
-            state.statistics.clear(len(state.gaussians))
+            gaussians.keep(keep)
+            self._statistics.clear(len(gaussians))
 
 
 class Footprints(Callback[TrainingLoop]):
-    """Measures the size of a training pixel at each Gaussian after the last step."""
+    """Measurement of the size of a training pixel at each Gaussian after the last step."""
 
     def at_end(self, loop: TrainingLoop) -> None:
         cameras = (view.camera for view in loop.current.views)
@@ -174,6 +366,7 @@ class Footprints(Callback[TrainingLoop]):
 def method_callbacks() -> list[AnyCallback]:
     """Return the callbacks of a training of Gaussians, in their order."""
     return [
+        LargeBatch(),
         OpacityReset(),
         NormalPropagation(),
         NormalOrientation(),

@@ -1,7 +1,7 @@
-"""Checks of a checkpoint: every tensor is checked here before anything computes with it.
+"""Checks of a checkpoint: every tensor is checked before a computation reads it.
 
-The kernels and the fused optimizer read and write as far as the shapes say, so a tensor of another shape would be read
-beyond its end. A value that is not finite would show as an empty picture.
+The kernels and the fused optimizer trust the shapes, so that a tensor of another shape would be read beyond its end. A
+value that is not finite would lead to an empty picture.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from polarguide.gaussians.adam import MOMENTS
 from polarguide.training.recipe import Recipe
 from polarguide.training.state import ANGLE_COLUMNS
 
@@ -29,7 +28,7 @@ MOST_STEPS = 1 << 50
 
 @dataclass(frozen=True)
 class TensorRule:
-    """Shape, type and range of a tensor; values have to be finite."""
+    """Shape, type and range of a tensor; values must be finite."""
 
     shape: tuple[int, ...]
     low: float = -sys.float_info.max
@@ -55,13 +54,13 @@ def check_tensors(tensors: Mapping[str, Tensor], rules: Mapping[str, TensorRule]
     """Check that tensors are those of the rules, and no others.
 
     Raises:
-        ValueError: one is missing, is not known, or has another shape, type or range; the message names it.
+        ValueError: one is missing, is unknown, or has another shape, type or range; the message names it.
     """
     for name, rule in rules.items():
         rule.check(name, _tensor(tensors, name))
-    strangers = sorted(tensors.keys() - rules.keys())
-    if strangers:
-        raise ValueError(f"{strangers[0][:80]}, which is not known")
+    unknown = sorted(tensors.keys() - rules.keys())
+    if unknown:
+        raise ValueError(f"unknown {unknown[0][:80]}")
 
 
 def moment_rules(tensors: Mapping[str, Tensor], prefix: str, shape: tuple[int, ...]) -> dict[str, TensorRule]:
@@ -71,19 +70,18 @@ def moment_rules(tensors: Mapping[str, Tensor], prefix: str, shape: tuple[int, .
         "exp_avg": TensorRule(shape),
         "exp_avg_sq": TensorRule(shape, 0.0),
     }
-    assert rules.keys() == {*MOMENTS}
     named = {prefix + key: rule for key, rule in rules.items()}
     return {} if tensors.keys().isdisjoint(named) else named
 
 
 def refuse_foreign(tensors: Mapping[str, Tensor], recipe: Recipe) -> None:
-    """Check that tensors are what a training of the recipe leaves.
+    """Check that tensors belong to a training of the recipe.
 
-    Shapes are those that the recipe and its shading model state. The copy from which priors are computed may have
-    another number of Gaussians. Tensors of further callbacks are theirs to check.
+    Shapes are those of the recipe and its shading model. The copy from which priors are computed may have another
+    number of Gaussians. Callbacks of the user check their own tensors.
 
     Raises:
-        ValueError: one is missing, is not known, or has another shape, type or range; the message names it.
+        ValueError: one is missing, is unknown, or has another shape, type or range; the message names it.
     """
     count = _count(tensors, "gaussians.means")
     light = {name: parameter.shape for name, parameter in recipe.shading.light_parameters.items()}
@@ -127,7 +125,7 @@ def _tensor(tensors: Mapping[str, Tensor], name: str) -> Tensor:
 
 def _count(tensors: Mapping[str, Tensor], name: str) -> int:
     means = _tensor(tensors, name)
-    if means.ndim != 2 or not len(means):  # densification always leaves one
+    if means.ndim != 2 or not len(means):  # densification leaves at least one
         raise ValueError(f"{name} of shape {list(means.shape)}, not [N, 3] with N > 0")
     return len(means)
 

@@ -1,4 +1,4 @@
-"""The context of a training: all that stays the same from the first step to the last."""
+"""Context of a training: inputs and services that stay the same in all steps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from polarguide.capture import Scene, View
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import UNBOUNDED, MemoryBound
-from polarguide.gaussians.initialize import scene_extent
+from polarguide.gaussians.initialize import camera_reach, scene_extent
 from polarguide.raster import Backend
 from polarguide.shading.model import ShadingModel
 from polarguide.training.distributed import ALONE, Ranks
@@ -57,8 +57,13 @@ class TrainingContext:
 
     @cached_property
     def extent(self) -> float:
-        """Extent of the scene, to which distances are relative."""
+        """Extent of the scene, the unit of distances."""
         return scene_extent(self.centers)
+
+    @cached_property
+    def reach(self) -> float:
+        """Distance of the cameras from the middle of the points; nine tenths are nearer."""
+        return camera_reach(self.scene.points.double().numpy(), self.centers.double().numpy())[1]
 
     @cached_property
     def shading(self) -> ShadingModel:

@@ -1,9 +1,9 @@
-"""The processes that torchrun started for one training: who takes which views, how their results become one, and how
-all end when one is lost.
+"""Processes that torchrun started for one training: their shares of views, sums of their results, and loss of a
+process.
 
-A step looks at B views, its slots 0 to B - 1. Each rank takes a run of them. Sums over slots are made in the order of
-the ranks, whatever the backend of the communication does, so two processes of one view each give the bits of one
-process of two.
+A step renders B views in its slots 0 to B - 1. Each rank takes a range of them. Sums over slots are computed in the
+order of the ranks, for every communication backend, so that two processes of one view each give the bits of one process
+of two.
 """
 
 from __future__ import annotations
@@ -29,15 +29,17 @@ from polarguide.core.system import process_count, process_is_alive
 from polarguide.raster import Backend, choose_backend
 
 if dist.is_available():
-    # Its functions have the default group for a default value. Imported once there is a group, as torch's optimizers
-    # import it, it would keep that for good, and the group's threads could abort the interpreter as it ends.
+    # Imported here, before a process group exists. Its functions have the default group as default values: a later
+    # import, such as by torch's optimizers, keeps the group alive, and its threads may abort the exiting interpreter.
     import torch.distributed.nn
 
 
 POLL_SECONDS = 1.0
-# A rank whose collective has failed waits this long for the monitor to find out which process was lost.
+"""Seconds between two checks of the other processes."""
 PATIENCE_SECONDS = 15.0
+"""Seconds that a rank with a failed collective waits for the monitor to find the lost process."""
 TIMEOUT = timedelta(minutes=30)
+"""Timeout of a collective."""
 
 
 class LostRank(Exception):
@@ -46,7 +48,7 @@ class LostRank(Exception):
 
 @contextlib.contextmanager
 def _collective() -> Iterator[None]:
-    """Turns a failed collective into LostRank; every backend raises another exception."""
+    """Convert a failed collective to LostRank; every backend raises another exception."""
     try:
         yield
     except RuntimeError as error:
@@ -54,23 +56,24 @@ def _collective() -> Iterator[None]:
 
 
 def _gather(into: Tensor, own: Tensor) -> None:
-    """Everybody's ``own`` one after the other; newer versions of torch have a new name for it."""
+    """Gather the tensors ``own`` of all ranks; newer versions of torch have a new name for it."""
     gather = getattr(dist, "all_gather_single", None) or dist.all_gather_into_tensor
     gather(into, own)
 
 
 class Ranks:
-    """One process alone; ``SeveralRanks`` overrides what needs the others.
+    """One process alone; ``SeveralRanks`` overrides the methods that involve other processes.
 
     Attributes:
-        rank: number of this process. world: how many there are.
+        rank: number of this process.
+        world: number of processes.
     """
 
     rank = 0
     world = 1
 
     def slots(self, views: int, rank: int | None = None) -> range:
-        """The slots of a step's ``views`` that a rank takes; the first ranks take one more where it does not divide."""
+        """Return the slots of a step's ``views`` of a rank; the first ranks take the remainder."""
         rank = self.rank if rank is None else rank
         base, more = divmod(views, self.world)
         begin = rank * base + min(rank, more)
@@ -79,29 +82,39 @@ class Ranks:
     def all_reduce(self, tensors: Sequence[Tensor]) -> None:
         """Replace each tensor by its sum over the ranks, in their order."""
 
+    def average(self, gradients: list[Tensor], views: int) -> None:
+        """Replace sums over the views of this rank by the mean over all ``views`` of a step."""
+        if views == 1 and self.world == 1:
+            return
+        if not self.slots(views):
+            torch._foreach_zero_(gradients)
+        self.all_reduce(gradients)
+        if views > 1:
+            torch._foreach_div_(gradients, float(views))
+
     def exchange_slots(self, sums: Tensor) -> None:
-        """Fill in the rows of [S, ...] that other ranks own."""
+        """Fill in the rows of [S, ...] of other ranks."""
 
     def broadcast(self, tensor: Tensor) -> None:
         """Replace a tensor by that of rank 0."""
 
     def any(self, flag: bool) -> bool:
-        """Whether the flag is up on any rank."""
+        """Return True if the flag is True on any rank."""
         return flag
 
     def barrier(self) -> None:
-        """Until all ranks are here."""
+        """Wait for all ranks."""
 
 
 class SeveralRanks(Ranks):
-    """The ranks of the default process group, which has a backend for CPU tensors (and one for the device's)."""
+    """Ranks of the default process group, which has a backend for CPU tensors and may have one for a GPU."""
 
     def __init__(self) -> None:
         self.rank = dist.get_rank()
         self.world = dist.get_world_size()
 
     def all_reduce(self, tensors: Sequence[Tensor]) -> None:
-        """Each rank gets one part of everything from all, adds it up in the order of ranks, and gives it to all."""
+        """Sum one part of all tensors on each rank in the order of ranks, and distribute the sums."""
         if not tensors:
             return
         flat = torch.cat([t.reshape(-1) for t in tensors])
@@ -123,14 +136,14 @@ class SeveralRanks(Ranks):
     def exchange_slots(self, sums: Tensor) -> None:
         most = len(self.slots(len(sums), 0))
         own = sums.new_zeros(most, *sums.shape[1:])
-        mine = self.slots(len(sums))
-        own[: len(mine)] = sums[mine.start : mine.stop]
+        slots = self.slots(len(sums))
+        own[: len(slots)] = sums[slots.start : slots.stop]
         gathered = sums.new_empty(self.world * most, *sums.shape[1:])
         with _collective():
             _gather(gathered, own)
         for rank in range(self.world):
-            theirs = self.slots(len(sums), rank)
-            sums[theirs.start : theirs.stop] = gathered[rank * most : rank * most + len(theirs)]
+            slots = self.slots(len(sums), rank)
+            sums[slots.start : slots.stop] = gathered[rank * most : rank * most + len(slots)]
 
     def broadcast(self, tensor: Tensor) -> None:
         with _collective():
@@ -151,13 +164,14 @@ ALONE = Ranks()
 
 @contextlib.contextmanager
 def process_group(device: DeviceName, out: Path) -> Iterator[Ranks]:
-    """Join the process group that torchrun started, if it did, and leave it together.
+    """Join the process group of torchrun, if there is one, and leave it together.
 
-    When a process is lost, whatever the others do, each of this machine ends within seconds with status 1, and the
-    first of them says so on stderr.
+    If a process is lost, the other processes of its machine end within seconds with status 1, and the first of them
+    reports it on stderr.
 
     Args:
-        device: what to compute on. out: the run's folder, named in that line.
+        device: device of the computation.
+        out: the run folder, for that message.
 
     Raises:
         PolarguideError: a process is lost on another machine.
@@ -173,16 +187,16 @@ def process_group(device: DeviceName, out: Path) -> Iterator[Ranks]:
         yield ranks
         ranks.barrier()
     except LostRank as error:
-        # The monitor ends this process before that, if the lost one was of this machine.
+        # The monitor ends this process earlier if the lost one was on this machine.
         time.sleep(PATIENCE_SECONDS)
-        raise _loss("one of them does not answer", ranks.world, out) from error
+        raise _loss("one that does not respond", ranks.world, out) from error
     finally:
         monitor.stop()
     dist.destroy_process_group()
 
 
 def backend_of(ranks: Ranks, device: DeviceName, reporter: Reporter = SILENT) -> Backend:
-    """The backend of this rank; the first rank of a machine compiles kernels while the others wait."""
+    """Return the backend of this rank; the first rank of a machine compiles kernels while the others wait."""
     local = int(os.environ.get("LOCAL_RANK", "0")) if ranks.world > 1 else 0
     chosen = choose_backend(device, say=reporter.say) if local == 0 else None
     ranks.barrier()
@@ -194,14 +208,14 @@ def _loss(found: str, world: int, out: Path) -> PolarguideError:
         "training",
         expected=f"{world} processes",
         found=found,
-        remedy=f"The last checkpoint in {out} is complete; go on with --resume, on any number of processes.",
+        remedy=f"Continue with --resume, on any number of processes; the last checkpoint in {out} is complete.",
     )
 
 
 class _Monitor:
-    """A thread that checks whether this machine's ranks are alive, and ends this process when one is not.
+    """Thread that checks the ranks of this machine, and ends this process when one is lost.
 
-    A rank that waits for a lost one inside a collective cannot be reached by a signal handler, so a thread does it.
+    A rank that waits for a lost one inside a collective cannot run signal handlers, so that a thread is needed.
     """
 
     def __init__(self, ranks: SeveralRanks, out: Path) -> None:
@@ -219,13 +233,13 @@ class _Monitor:
             lost = {rank: pid for rank, pid in self._pids.items() if not process_is_alive(pid)}
             if lost and not self._stop.is_set():
                 if self._ranks.rank == min(set(self._pids) - set(lost)):
-                    who = " and ".join(f"rank {rank} (process {pid})" for rank, pid in lost.items())
-                    loss = _loss(f"that {who} was lost", self._ranks.world, self._out)
+                    names = " and ".join(f"rank {rank} (process {pid})" for rank, pid in lost.items())
+                    loss = _loss(f"that {names} was lost", self._ranks.world, self._out)
                     sys.stderr.write(f"error: {loss}\n")
                     sys.stderr.flush()
-                time.sleep(0.5)  # so that the others find the same loss, and not this process's end
+                time.sleep(0.5)  # the others detect the same loss before they detect the end of this process
                 os._exit(1)
 
     def stop(self) -> None:
-        """From now on others may end."""
+        """Stop the checks, so that processes may end."""
         self._stop.set()

@@ -1,7 +1,11 @@
-"""The loss of one step: its terms, what each of them reads, and their weighted sum.
+"""Loss of one step: its terms, their inputs, and their weighted sum.
 
-A new term is a field of ``Weights``, which says what has to be rendered and which targets are read, and a function in
+A new term is a field of ``Weights``, with the rendered layers and the targets that it reads, and a function in
 ``TERMS``.
+
+Native pass over the terms that compare normals, layers and depth per pixel, with its gradient.
+
+It takes float32 on the CPU. The functions in ``polarguide.training.losses`` are the reference implementation.
 """
 
 from __future__ import annotations
@@ -22,26 +26,178 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
-from polarguide.training.native_terms import (
-    S1_AND_S2,
-    Consistency,
-    Directions,
-    PolarizationTerm,
-    Terms,
-    pixel_terms,
-)
 from polarguide.training.photometric import partial_terms, photometric_loss, photometric_terms
 from polarguide.training.targets import Step, ViewPriors
 
+S1_AND_S2 = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+"""Analyzers of S1 and S2 themselves."""
+
+
+class PolarizationTerm(NamedTuple):
+    """``factor * sum(weight * |a . S - measured|)`` over K measurements, pixels and colors.
+
+    S is the Stokes vector of the rendered layers on a smooth dielectric (``optics.predicted_stokes``).
+
+    Attributes:
+        measured: [K, H, W, 3] on the scale of Stokes vectors.
+        analyzers: K vectors a: ``S1_AND_S2``, or (1, cos 2t, sin 2t) / 2 of a polarizer at angle t.
+        weight: [H, W] weights of the pixels.
+        factor: factor on the sum.
+        refractive_index: refractive index of the surfaces, more than 1.
+        indices: [H, W] refractive indices of the pixels; None: the same everywhere.
+    """
+
+    measured: Tensor
+    analyzers: Sequence[Sequence[float]]
+    weight: Tensor
+    factor: float
+    refractive_index: float
+    indices: Tensor | None = None
+
+
+class Directions(NamedTuple):
+    """``factor * sum(weight * (1 - n . d))``, with ``plane`` of ``|n . d|``, n the normal at unit length.
+
+    Attributes:
+        directions: [H, W, 3] unit, world axes.
+        weight: [H, W] weights of the pixels.
+        factor: factor on the sum.
+        plane: d is the normal of a plane that contains n.
+    """
+
+    directions: Tensor
+    weight: Tensor
+    factor: float
+    plane: bool
+
+
+class Consistency(NamedTuple):
+    """``factor * sum(weight * (alpha - n . n_depth))`` over all pixels except the border, with the blended normal n.
+
+    Attributes:
+        weight: [H, W] weights of the pixels; None: 1.
+        factor: factor on the sum.
+    """
+
+    weight: Tensor | None
+    factor: float
+
+
+class Terms(NamedTuple):
+    """The terms of a step; at least one.
+
+    Attributes:
+        polarization: term that needs both layers.
+        directions: any number of terms.
+        consistency: term that needs the depth.
+    """
+
+    polarization: PolarizationTerm | None
+    directions: Sequence[Directions]
+    consistency: Consistency | None
+
+
+class _PixelTerms(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, camera: Camera, terms: Terms, alpha: Tensor, metal: Tensor | None, *inputs: Tensor
+    ) -> Tensor:
+        tensors = [t.detach().contiguous() for t in inputs]
+        gradients = [torch.zeros_like(t) for t in tensors]
+        to_metal = None if metal is None else torch.zeros_like(metal)
+        # The native code takes rows of pixels, and the depth as a map.
+        *colors, depth = tensors
+        *to_colors, to_depth = gradients
+        normal, specular, diffuse = (t.view(-1, 3) for t in colors)
+        to_normal, to_specular, to_diffuse = (t.view(-1, 3) for t in to_colors)
+        frame = camera.rays().view(-1, 3), camera.pose(torch.float32, alpha.device).rotation
+        total = 0.0
+        if (p := terms.polarization) is not None:
+            total += _native.polarization(
+                normal,
+                *frame,
+                specular,
+                diffuse,
+                None if metal is None else metal.detach().contiguous(),
+                p.measured.flatten(1, 2),
+                torch.tensor(p.analyzers),
+                p.weight.reshape(-1),
+                p.factor,
+                p.refractive_index,
+                None if p.indices is None else p.indices.reshape(-1).contiguous(),
+                to_normal,
+                to_specular,
+                to_diffuse,
+                to_metal,
+            )
+        for d in terms.directions:
+            directions = d.directions.reshape(-1, 3)
+            total += _native.direction(normal, directions, d.weight.reshape(-1), d.factor, d.plane, to_normal)
+        if (c := terms.consistency) is not None:
+            depths = depth, alpha.detach().contiguous()
+            weight = None if c.weight is None else c.weight.reshape(-1)
+            total += _native.consistency(normal, *frame, *depths, weight, c.factor, to_normal, to_depth)
+        ctx.save_for_backward(to_metal, *gradients)
+        return alpha.new_tensor(total)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        return (None, None, None, *(None if t is None else scaled(t, grad) for t in ctx.saved_tensors))
+
+
+def scaled(gradient: Tensor, factor: Tensor) -> Tensor:
+    """Multiply a gradient by the incoming scalar, which is mostly 1."""
+    return gradient if factor.device.type == "cpu" and float(factor) == 1 else gradient * factor
+
+
+def pixel_terms(result: RenderResult, camera: Camera, terms: Terms) -> Tensor:
+    """Return the sum of terms as a scalar, differentiable in the normal, both layers and the depth, not in alpha.
+
+    Values and gradients are finite for normals of any length, including zero. The bits do not depend on the number of
+    threads.
+
+    Args:
+        result: rendered layers of the terms; float32 on the CPU.
+        camera: camera of the view.
+        terms: the terms, float32 on the CPU.
+
+    Raises:
+        ValueError: a shape differs, or a picture with a consistency term is smaller than 3 x 3.
+    """
+    polarized = terms.polarization is not None
+    unused = result.alpha.new_empty(0, 3)
+    total: Tensor = _PixelTerms.apply(
+        camera,
+        terms,
+        result.alpha,
+        _field(result) if polarized else None,
+        result.normal,
+        result.layers["specular"] if polarized else unused,
+        result.layers["diffuse"] if polarized else unused,
+        unused if terms.consistency is None else result.depth,
+    )
+    return total
+
+
+def _field(result: RenderResult) -> Tensor | None:
+    """Return the metals' part of the specular layer and of its polarization over ``sin^2(zenith)``, [P, 6]; None: no
+    metal.
+    """
+    if (metal := result.metal) is None:
+        return None
+    both = torch.cat((metal.specular, metal.slope * metal.specular), dim=1)
+    return both.new_zeros(result.alpha.numel(), 6).index_copy(0, metal.pixels, both)
+
 
 def term(*priors: str, rendered: tuple[str, ...] = (), optional: bool = False, default: float = 0.0) -> float:
-    """A weight, with what its term reads.
+    """Define a weight with the inputs of its term.
 
     Args:
         priors: fields of ``ViewPriors``; a view without them is not compared.
         rendered: "normal", "depth" or "layers", if the term reads these.
         optional: the term also counts in views without ``priors``.
-        default: weight of stages that do not give one.
+        default: weight of stages that do not specify one.
     """
     reads = {"priors": frozenset(priors), "rendered": rendered, "optional": optional}
     weight: float = field(default=default, metadata=reads)
@@ -54,16 +210,16 @@ class Weights:
 
     Attributes:
         photometric: final picture against S0/2.
-        specular, diffuse: the two contributions, after the blend with the reflection strength, against the separated
+        specular, diffuse: both contributions after the blend with the reflection strength, against the separated
             pictures.
-        reflection, base: the mirrored light and the base color, before that blend, against the same pictures.
+        reflection, base: mirrored light and base color before that blend, against the same pictures.
         normal: 1 - cosine with the disambiguated polarization normal (azimuth and zenith).
-        azimuth: distance of the normal from the plane of incidence that the AoLP gives (azimuth alone).
+        azimuth: distance of the normal from the plane of incidence of the AoLP (azimuth alone).
         chromatic: 1 - cosine with the normal from color differences, where these decide one.
-        stokes: S1 and S2 that the layers and the normal predict against the measured ones.
+        stokes: S1 and S2 predicted from layers and normal against the measured ones.
         flatness: shortest scale of the Gaussians, in percent of the scene's extent.
         consistency: alpha - cosine of the blended normal with that of the rendered depth.
-        coverage: alpha of the pixels that show nothing, where nothing is behind the subject.
+        coverage: alpha of the empty pixels, for subjects without a background.
     """
 
     photometric: float = term(default=1.0)
@@ -81,38 +237,39 @@ class Weights:
 
     @property
     def priors(self) -> bool:
-        """Whether a term needs the priors of a view."""
+        """True if a term needs the priors of a view."""
         return any(use.metadata["priors"] and not use.metadata["optional"] for use in self._used())
 
     @property
     def normals(self) -> bool:
-        """Whether a term reads the rendered normals."""
+        """True if a term reads the rendered normals."""
         return self._read("normal")
 
     def own_terms(self) -> Sequence[Callable[[Step, Any], Tensor | None]]:
-        """Terms that only a subclass of another package has, for the weights that it adds; each gives its weighted
-        loss, or None where there is nothing to compare.
+        """Return the terms of the weights that a subclass of another package adds.
+
+        Each term returns its weighted loss, or None without data to compare.
         """
         return ()
 
     @property
     def depth(self) -> bool:
-        """Whether a term reads the rendered depth."""
+        """True if a term reads the rendered depth."""
         return self._read("depth")
 
     @property
     def layers(self) -> bool:
-        """Whether a term reads the rendered layers one by one."""
+        """True if a term reads single rendered layers."""
         return self._read("layers")
 
     @property
     def fields_read(self) -> frozenset[str]:
-        """The fields of ``ViewPriors`` that the terms read."""
+        """Fields of ``ViewPriors`` that the terms read."""
         return frozenset().union(*(use.metadata["priors"] for use in self._used()))
 
     @classmethod
     def known_priors(cls) -> frozenset[str]:
-        """The fields of ``ViewPriors`` that any term reads."""
+        """Return the fields of ``ViewPriors`` that any term reads."""
         return frozenset().union(*(weight.metadata["priors"] for weight in fields(cls)))
 
     def _used(self) -> list[Field[Any]]:
@@ -123,18 +280,18 @@ class Weights:
 
 
 def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
-    """Unit normals of a depth picture by central differences, facing the camera.
+    """Compute unit normals of a depth map by central differences, facing the camera.
 
     Args:
         depth: [H, W] camera depth, positive.
         camera: camera of the picture.
 
     Returns:
-        [H, W, 3] in world axes, differentiable; zero on the border and where three points lie on a line.
+        [H, W, 3] in world axes, differentiable; zero on the border and for three collinear points.
     """
     rays = camera.rays(dtype=depth.dtype, device=depth.device)
     points = rays / rays[..., 2:] * depth[..., None]
-    # In units of the depth, so that the length that ``unit`` takes for zero means the same near and far.
+    # In units of the depth, so that the threshold of ``unit`` for zero length has the same meaning near and far.
     scale = 1 / depth.detach().clamp(min=1e-6)[1:-1, 1:-1, None]
     across = (points[1:-1, 2:] - points[1:-1, :-2]) * scale
     down = (points[2:, 1:-1] - points[:-2, 1:-1]) * scale
@@ -142,14 +299,14 @@ def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
 
 
 def consistency_loss(result: RenderResult, camera: Camera, weight: Tensor | None = None) -> Tensor:
-    """Mean of ``alpha - n . n_depth``: 0 where blended normals agree with each other and with the depth.
+    """Return the mean of ``alpha - n . n_depth``: 0 if blended normals agree with each other and with the depth.
 
     A picture without an inner pixel has no depth normals, and no loss.
 
     Args:
         result: with the blended normal ``n`` (unit normals times weights that add up to alpha) and the depth.
         camera: camera of the view.
-        weight: [H, W] where it counts; None: everywhere.
+        weight: [H, W] weights of the pixels; None: 1.
     """
     if min(result.alpha.shape) < 3:
         return result.alpha.new_zeros(())
@@ -159,11 +316,13 @@ def consistency_loss(result: RenderResult, camera: Camera, weight: Tensor | None
 
 
 def nearest_target(normal: Tensor, priors: ViewPriors) -> Tensor:
-    """Targets of the normal term, [H, W, 3]: of a view with candidates the one nearest to the normals just
-    rendered, otherwise what the frozen Gaussians have chosen.
+    """Return the targets [H, W, 3] of the normal term.
+
+    These are the candidates nearest to the rendered normals, or the choice of the frozen Gaussians.
 
     Args:
         normal: [H, W, 3] blended normals, world axes, any length; gets no gradient.
+        priors: priors of the view.
     """
     if priors.candidates is None:
         return priors.normal
@@ -172,44 +331,49 @@ def nearest_target(normal: Tensor, priors: ViewPriors) -> Tensor:
 
 
 def normal_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
-    """Mean of 1 - cos(normal, target) over the weighted pixels (the normal term of Shan et al. 2026).
+    """Return the mean of 1 - cos(normal, target) over the weighted pixels (the normal term of Shan et al. 2026).
 
     The target is ``nearest_target``.
 
     Args:
         normal: [H, W, 3] blended normals, world axes, any length.
+        priors: priors of the view.
     """
     cosine = dot(unit(normal, 1e-2), nearest_target(normal, priors))
     return ((1 - cosine) * priors.weight).sum() / priors.total
 
 
 def azimuth_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
-    """Mean distance of the normal from the plane of incidence that the AoLP gives, |n . e|.
+    """Return the mean distance |n . e| of the normal from the plane of incidence of the AoLP.
 
-    Unlike the zenith of a pure-lobe inversion, the plane does not depend on the refractive index or on how lobes mix.
+    Unlike the zenith of a pure-lobe inversion, the plane does not depend on the refractive index or on the mixture of
+    lobes.
     """
     distance = dot(unit(normal, 1e-2), priors.plane).abs()
     return (distance * priors.weight).sum() / priors.total
 
 
 def chromatic_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
-    """Mean of 1 - cos(normal, normal from color differences) over the pixels that these decide.
+    """Return the mean of 1 - cos(normal, normal from color differences) over the pixels with such a normal.
 
     Args:
         normal: [H, W, 3] blended normals, world axes, any length.
+        priors: priors of the view.
     """
     cosine = dot(unit(normal, 1e-2), priors.chromatic)
     return ((1 - cosine) * priors.chromatic_weight).sum() / priors.chromatic_total
 
 
 def stokes_loss(result: RenderResult, priors: ViewPriors, shading: ShadingModel) -> Tensor:
-    """Mean distance of the predicted S1 and S2 from the measured ones, over the square root of S0.
+    """Return the mean distance of the predicted S1 and S2 from the measured ones, over the square root of S0.
 
-    The shading model predicts from the rendered layers and the rendered normal, so that one explanation of
-    geometry and layers has to fit the polarization of all views. See ``ViewPriors.stokes_weight`` for the root.
+    The shading model predicts them from the rendered layers and the rendered normal, so that one explanation of
+    geometry and layers has to fit the polarization of all views. ``targets.stokes_weight`` explains the root.
 
     Args:
-        result: with both layers and the normal. shading: shading of the recipe, for the run's refractive index.
+        result: with both layers and the normal.
+        priors: priors of the view.
+        shading: shading of the recipe, for the refractive index of the run.
     """
     predicted = shading.predicted_stokes(result, priors.camera)
     distance = (predicted[1:] - priors.stokes[1:]).abs().mean(dim=(0, -1))
@@ -217,7 +381,7 @@ def stokes_loss(result: RenderResult, priors: ViewPriors, shading: ShadingModel)
 
 
 def flatness_loss_reference(log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
-    """The reference implementation of ``flatness_loss``: plain torch, any dtype and device."""
+    """Compute ``flatness_loss`` in plain torch: the reference implementation, for any dtype and device."""
     visible = (radii > 0).to(log_scales)
     total = (log_scales.min(dim=1).values.exp() * visible).sum()
     return 100 / extent * total / visible.sum().clamp(min=1)
@@ -242,12 +406,14 @@ class _Flatness(torch.autograd.Function):
 
 
 def flatness_loss(log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
-    """Mean shortest scale of the visible Gaussians in percent of the scene's extent.
+    """Return the mean shortest scale of the visible Gaussians in percent of the scene's extent.
 
     On the CPU in float32 it is a native pass; ``flatness_loss_reference`` is the reference implementation.
 
     Args:
-        log_scales: [N, 3]. radii: [N], 0 where not visible. extent: extent of the scene.
+        log_scales: [N, 3] logarithms of the scales.
+        radii: [N], 0 for invisible Gaussians.
+        extent: extent of the scene.
     """
     if not fits(log_scales, radii):
         return flatness_loss_reference(log_scales, radii, extent)
@@ -256,43 +422,53 @@ def flatness_loss(log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
 
 
 def coverage_loss(alpha: Tensor, empty: Tensor) -> Tensor:
-    """Mean alpha of the pixels that show nothing.
+    """Return the mean alpha of the empty pixels.
 
     Args:
-        alpha: [H, W]. empty: [H, W] 1 where the picture shows nothing.
+        alpha: [H, W] rendered alpha.
+        empty: [H, W] 1 for empty pixels.
     """
     return (alpha * empty).sum() / empty.sum().clamp(min=1)
 
 
 class StepLoss(NamedTuple):
-    """The loss of a step, and its report.
+    """Loss of a step, and values for its report.
 
     Attributes:
-        total: the weighted sum of a stage's terms. photometric: that term alone, for the display.
-        error: mean squared difference of picture and photograph as shown, where the photograph counts; no gradient.
+        total: weighted sum of the terms of a stage.
+        photometric: the photometric term alone.
+        error: mean squared difference of picture and photograph as displayed, over valid pixels; no gradient.
     """
 
     total: Tensor
     photometric: Tensor
     error: Tensor
 
+    def measured(self) -> Tensor:
+        """Return ``StepReport.measured``."""
+        psnr = -10 * torch.log10(self.error.clamp(min=1e-10))
+        return torch.stack((self.photometric.detach(), psnr, self.total.detach()))
+
 
 def refuse_diverged(total: Tensor) -> None:
-    """Raise PolarguideError unless all of ``total`` is finite.
+    """Check that all losses are finite.
 
-    On a GPU this waits for the device, so the loop asks for many steps at once.
+    On a GPU this waits for the device, so that the loop checks many steps at once.
+
+    Raises:
+        PolarguideError: a loss is not finite.
     """
     if not bool(torch.isfinite(total).all()):
         raise PolarguideError(
             "training",
             expected="a finite loss",
             found=str(float(total.sum())),
-            remedy="Look at the pictures and poses (polarguide inspect); with a recipe of yours, lower its rates.",
+            remedy="Check the pictures and poses (polarguide inspect). For your own recipe, lower its rates.",
         )
 
 
 def layer_terms(step: Step, weights: Weights) -> Tensor | None:
-    """The weighted sum of the terms that compare layers with the separated pictures."""
+    """Return the weighted sum of the terms that compare layers with the separated pictures."""
     result = step.result
     priors = step.targets.priors
     if priors is None or not (weights.specular or weights.diffuse or weights.reflection or weights.base):
@@ -306,37 +482,33 @@ def layer_terms(step: Step, weights: Weights) -> Tensor | None:
         (weights.base, "base", priors.diffuse),
     ):
         if weight and layer in result.layers:
-            # Over all pixels like the picture's own term, so that before nothing it does not outweigh it.
-            share = weight * separated_share
-            total = total + share * photometric_loss(
-                result.layers[layer], target, priors.separated, step.ssim_weight
-            )
+            # The mean is over all pixels, as in the photometric term, which it must not outweigh in front of nothing.
+            loss = photometric_loss(result.layers[layer], target, priors.separated, step.ssim_weight)
+            total = total + weight * separated_share * loss
     return total
 
 
 def flatness_term(step: Step, weights: Weights) -> Tensor | None:
-    """The weighted flatness of the Gaussians that are visible."""
+    """Return the weighted flatness of the visible Gaussians."""
     if not weights.flatness:
         return None
     return weights.flatness * flatness_loss(step.log_scales, step.result.training["radii"], step.extent)
 
 
 def coverage_term(step: Step, weights: Weights) -> Tensor | None:
-    """The weighted alpha of the pixels that show nothing."""
+    """Return the weighted alpha of the empty pixels."""
     empty = step.targets.empty
-    return (
-        None
-        if empty is None or not weights.coverage
-        else weights.coverage * coverage_loss(step.result.alpha, empty)
-    )
+    if empty is None or not weights.coverage:
+        return None
+    return weights.coverage * coverage_loss(step.result.alpha, empty)
 
 
 def normal_terms(step: Step, weights: Weights) -> Tensor:
-    """The weighted sum of the terms that read the rendered normal.
+    """Return the weighted sum of the terms that read the rendered normal.
 
-    On the CPU in float32 they are one native pass, but for the Stokes term of a shading model with a prediction of its
-    own. ``normal_terms_reference`` is the reference implementation. A view without priors has the
-    consistency term alone.
+    On the CPU in float32 they are one native pass, except for the Stokes term of a shading model with its own
+    prediction. ``normal_terms_reference`` is the reference implementation. A view without priors has the consistency
+    term alone.
     """
     result = step.result
     priors = step.targets.priors
@@ -346,7 +518,7 @@ def normal_terms(step: Step, weights: Weights) -> Tensor:
     stokes = None
     directions = []
     consistency = None
-    beside = result.alpha.new_zeros(())
+    further = result.alpha.new_zeros(())
     if priors is not None:
         directions = [
             Directions(target, weight, factor / float(total), plane)
@@ -364,29 +536,33 @@ def normal_terms(step: Step, weights: Weights) -> Tensor:
             if factor
         ]
         if weights.stokes and shading.reflects and not shading.smooth_dielectric:
-            beside = weights.stokes * stokes_loss(result, priors, shading)
+            further = weights.stokes * stokes_loss(result, priors, shading)
         elif weights.stokes and shading.reflects:
             measured = priors.stokes[1:]
-            index = shading.refractive_index
-            factor = weights.stokes / measured.numel()
-            index_layer = result.layers.get("index")
-            stokes = PolarizationTerm(measured, S1_AND_S2, priors.stokes_weight, factor, index, index_layer)
+            stokes = PolarizationTerm(
+                measured,
+                S1_AND_S2,
+                priors.stokes_weight,
+                weights.stokes / measured.numel(),
+                shading.refractive_index,
+                result.layers.get("index"),
+            )
     if weights.consistency:
         factor = weights.consistency / ((result.alpha.shape[0] - 2) * (result.alpha.shape[1] - 2))
         consistency = Consistency(None if priors is None else priors.surface, factor)
     terms = Terms(stokes, directions, consistency)
-    return beside + pixel_terms(result, step.targets.camera, terms) if any(terms) else beside
+    return further + pixel_terms(result, step.targets.camera, terms) if any(terms) else further
 
 
 def _native_fits(result: RenderResult, priors: ViewPriors | None) -> bool:
-    """Whether the native pass takes these pictures."""
+    """Return True if the native pass supports these pictures."""
     rendered = [result.layers.get(name) for name in ("normal", "specular", "diffuse", "depth", "alpha")]
     compared = () if priors is None else (priors.stokes, priors.weight, priors.plane, priors.chromatic)
     return "normal" in result.layers and min(result.alpha.shape) >= 3 and fits(*rendered, *compared)
 
 
 def normal_terms_reference(step: Step, weights: Weights) -> Tensor:
-    """The reference implementation of ``normal_terms``: plain torch, any dtype and device."""
+    """Compute ``normal_terms`` in plain torch: the reference implementation, for any dtype and device."""
     result = step.result
     priors = step.targets.priors
     shading = step.shading
@@ -409,16 +585,19 @@ def normal_terms_reference(step: Step, weights: Weights) -> Tensor:
 
 Term = Callable[[Step, Weights], Tensor | None]
 TERMS: tuple[Term, ...] = (layer_terms, flatness_term, normal_terms, coverage_term)
-"""The terms beside the photometric one, in the order in which they are added; each gives its weighted loss, or None
-where it has nothing to compare. One may stand for several weights that share a pass over the pixels.
+"""All terms except the photometric one, in the order of their addition.
+
+Each returns its weighted loss, or None without data to compare. A term may stand for several weights that share a pass
+over the pixels.
 """
 
 
 def step_loss(step: Step, weights: Weights) -> StepLoss:
-    """The weighted sum of a stage's terms, and how far the picture is from the photograph.
+    """Return the weighted sum of a stage's terms, and the difference of the picture from the photograph.
 
     Args:
-        step: what the terms read; priors are needed where a weight asks for them. weights: weights of the stage.
+        step: data of the step, with priors if a weight needs them.
+        weights: weights of the stage.
 
     Raises:
         PolarguideError: the loss is not finite (on the CPU; see ``refuse_diverged``).
@@ -432,7 +611,7 @@ def step_loss(step: Step, weights: Weights) -> StepLoss:
         picture = photometric_terms(result.final, targets.picture, targets.valid, step.ssim_weight)
         total = weights.photometric * picture.loss
     else:
-        total, picture = partial_terms(step, weights.photometric, weights.stokes)
+        total, picture = partial_terms(step, targets.partial, weights.photometric, weights.stokes)
     for each in (*TERMS, *weights.own_terms()):
         if (loss := each(step, weights)) is not None:
             total = total + loss

@@ -1,12 +1,12 @@
-"""The photometric loss of Gaussian splatting on shown pictures: (1 - l) L1 + l (1 - SSIM).
+"""Photometric loss of Gaussian splatting on displayed pictures: (1 - l) L1 + l (1 - SSIM).
 
 On the CPU in float32 a native kernel computes the loss and its gradient in one call. Elsewhere the same gradient is
-written out in plain torch, which blurs nine planes each way where autograd would blur fifteen and keep what lies
-between. ``photometric_loss_reference`` is the reference implementation.
+written out in plain torch, which blurs nine planes each way, where autograd would blur fifteen and store intermediate
+results. ``photometric_terms_reference`` is the reference implementation.
 
 ``partial_terms`` is the loss of views whose pictures do not determine the Stokes vector: one polarizer angle, two, or
-none. The rendered layers predict S0, S1 and S2, and with them the intensity behind any analyzer, ``(S0 + S1 c + S2 s)
-/ 2``. So the prediction can be compared with whatever was measured.
+none. The rendered layers predict S0, S1 and S2, and with them the intensity behind any analyzer, ``(S0 + S1 c + S2 s) /
+2``. The prediction is compared with the measured intensities.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ from torch.nn.functional import conv2d
 from polarguide import _native
 from polarguide.core.native import fits
 from polarguide.optics.color import srgb_encode
-from polarguide.training.targets import Step
+from polarguide.training.targets import PartialView, Step
 
 SSIM_WINDOW = 11
+"""Side of SSIM's window, in pixels."""
 _SIGMA = 1.5
 _C1 = 0.01**2
 _C2 = 0.03**2
 
 
 class Photometric(NamedTuple):
-    """How far a picture is from a photograph.
+    """Difference of a picture from a photograph.
 
     Attributes:
-        loss: as of ``photometric_loss``.
-        error: mean squared difference as shown, over the same pixels and colors; without a gradient.
+        loss: see ``photometric_loss``.
+        error: mean squared difference as displayed, over the same pixels and colors; without a gradient.
     """
 
     loss: Tensor
@@ -43,7 +44,7 @@ class Photometric(NamedTuple):
 
 
 class _Clip(torch.autograd.Function):
-    """Clips to [0, 1]; outside, a gradient passes only if it brings the value back."""
+    """Clipping to [0, 1]; outside, a gradient passes only if it brings the value back."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:
@@ -59,14 +60,16 @@ class _Clip(torch.autograd.Function):
 
 @lru_cache(maxsize=4)
 def gaussian_window(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Weights [11] of SSIM's Gaussian window along one axis, which add up to 1."""
+    """Return the weights [11] of SSIM's Gaussian window along one axis, which add up to 1."""
     offsets = torch.arange(SSIM_WINDOW, dtype=dtype, device=device) - SSIM_WINDOW // 2
     window = torch.exp(-(offsets**2) / (2 * _SIGMA**2))
     return window / window.sum()
 
 
 def structural_similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> Tensor:
-    """SSIM [...] of two pictures in [0, 1] (Wang et al. 2004, Eq. 13), K1 = 0.01, K2 = 0.03, population covariance.
+    """Return the SSIM [...] of two pictures in [0, 1] (Wang et al. 2004, Eq. 13).
+
+    K1 = 0.01, K2 = 0.03, population covariance.
 
     Args:
         x, y, xx, yy, xy: [...] means under the window of both pictures, their squares and their product.
@@ -76,7 +79,7 @@ def structural_similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tens
 
 
 def _blur(planes: Tensor) -> Tensor:
-    """Gaussian window over planes [K, H, W], zero beyond the border."""
+    """Blur planes [K, H, W] with the Gaussian window, with zeros beyond the border."""
     window = gaussian_window(planes.dtype, planes.device)
     stack = conv2d(planes[:, None], window[None, None, None], padding=(0, SSIM_WINDOW // 2))
     return conv2d(stack, window[None, None, :, None], padding=(SSIM_WINDOW // 2, 0))[:, 0]
@@ -85,7 +88,7 @@ def _blur(planes: Tensor) -> Tensor:
 def photometric_terms_reference(
     prediction: Tensor, target: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
 ) -> Photometric:
-    """The reference implementation of ``photometric_terms``: plain torch, any dtype and device."""
+    """Compute ``photometric_terms`` in plain torch: the reference implementation, for any dtype and device."""
     encoded = srgb_encode(_Clip.apply(prediction))
     weight = (torch.ones_like(prediction[..., 0]) if weight is None else weight)[..., None]
     x = encoded.permute(2, 0, 1)
@@ -102,7 +105,7 @@ def photometric_terms_reference(
 def photometric_loss_reference(
     prediction: Tensor, target: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
 ) -> Tensor:
-    """The loss alone of ``photometric_terms_reference``."""
+    """Return the loss of ``photometric_terms_reference``."""
     return photometric_terms_reference(prediction, target, weight, ssim_weight).loss
 
 
@@ -177,6 +180,7 @@ class ExplicitPhotometric(_Photometric):
 
 
 def _check(prediction: Tensor, target: Tensor, weight: Tensor | None) -> None:
+    """Check the shapes of the arguments of ``photometric_loss``."""
     if prediction.ndim != 3 or prediction.shape[-1] != 3:
         raise ValueError(f"prediction: expected shape [H, W, 3], found {list(prediction.shape)}")
     if target.shape != prediction.shape:
@@ -188,27 +192,27 @@ def _check(prediction: Tensor, target: Tensor, weight: Tensor | None) -> None:
 def photometric_loss(
     prediction: Tensor, target_shown: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
 ) -> Tensor:
-    """Mean over valid pixels and colors of ``(1 - l) |x - y| + l (1 - SSIM(x, y))``.
+    """Return the mean over valid pixels and colors of ``(1 - l) |x - y| + l (1 - SSIM(x, y))``.
 
-    Here ``x`` is sRGB of the clipped prediction and ``y`` the target (Kerbl et al. 2023, Eq. 7, on shown
-    pictures). SSIM has an 11 x 11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, and zeros beyond the
-    border, so within five pixels of it the values differ from those of metrics that mirror the picture.
-    Pixels that are left out still lie in their neighbors' windows.
+    Here ``x`` is sRGB of the clipped prediction and ``y`` the target (Kerbl et al. 2023, Eq. 7, on displayed pictures).
+    SSIM has an 11 x 11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, and zeros beyond the border. Within five
+    pixels of the border, values differ from those of metrics that mirror the picture. Pixels without weight still lie
+    in the windows of their neighbors.
 
-    A value outside [0, 1] gets the gradient that the boundary would have, where a step against it leads back
-    in, else zero: saturated pixels are not stuck. Not a number anywhere makes the loss not a number.
+    A value outside [0, 1] gets the gradient at the boundary if a step against it leads back into the interval, else
+    zero, so that saturated pixels are not stuck. One NaN makes the loss NaN.
 
     Args:
         prediction: [H, W, 3] linear radiance, any size.
-        target_shown: [H, W, 3] picture as shown, in [0, 1]; gets no gradient.
-        weight: [H, W] 1 where a pixel counts, 0 where not (at least 0); None: everywhere. Gets no gradient.
+        target_shown: [H, W, 3] picture as displayed, in [0, 1]; gets no gradient.
+        weight: [H, W] nonnegative weights, 1 for pixels that count; None: all pixels. Gets no gradient.
         ssim_weight: l in [0, 1].
 
     Returns:
-        The scalar loss, differentiable in the prediction; 0 where no pixel counts.
+        The scalar loss, differentiable in the prediction; 0 if no pixel counts.
 
     Raises:
-        ValueError: if a shape is not as above.
+        ValueError: a shape differs.
     """
     return photometric_terms(prediction, target_shown, weight, ssim_weight).loss
 
@@ -216,7 +220,7 @@ def photometric_loss(
 def photometric_terms(
     prediction: Tensor, target_shown: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
 ) -> Photometric:
-    """``photometric_loss``, and the mean squared difference as shown, which costs next to nothing beside it."""
+    """Compute ``photometric_loss`` and, at almost no cost, the mean squared difference as displayed."""
     _check(prediction, target_shown, weight)
     target_shown = target_shown.detach().to(prediction)
     weight = None if weight is None else weight.detach().to(prediction)
@@ -228,35 +232,37 @@ def photometric_terms(
 
 
 def behind_analyzer(stokes: Tensor, analyzer: Tensor) -> Tensor:
-    """``(S1 c + S2 s) / 2``, what an analyzer adds to S0/2: [H, W, 3].
+    """Return ``(S1 c + S2 s) / 2``, the difference [H, W, 3] of the intensity behind an analyzer from S0/2.
 
     Args:
-        stokes: [3, H, W, 3]. analyzer: [2], or [2, H, W].
+        stokes: [3, H, W, 3] Stokes vectors.
+        analyzer: [2], or [2, H, W].
     """
     cosine, sine = analyzer.to(stokes)[..., None].unbind(0)
     return (stokes[1] * cosine + stokes[2] * sine) / 2
 
 
-def partial_terms(step: Step, photometric: float, polarization: float) -> tuple[Tensor, Photometric]:
-    """The weighted photometric and polarization terms of a view with ``StepTargets.partial``, and the photometric one.
+def partial_terms(
+    step: Step, view: PartialView, photometric: float, polarization: float
+) -> tuple[Tensor, Photometric]:
+    """Return the weighted photometric and polarization terms of a partial view, and the photometric one.
 
-    The photometric term compares what was measured with what the layers predict of it: S0/2 where that is measured,
-    else the mean M of the intensities behind the analyzers. Beside it, in place of the Stokes term and with its weight,
-    there is what the single intensities add to that: the mean of
-    ``2 |(I - M) - (S1 c + S2 s) / 2| / sqrt(2 M + 0.01)``, with c and s of the analyzer less those of M. Both sides are
-    differences, so that S0 takes no part. A view with one picture has none: all that it tells is in the photometric
-    term. (With the rendered S0/2, held, in place of M, a rendering that is too bright would be explained by more light
-    that its analyzer blocks, which makes it brighter.)
+    The photometric term compares the measured picture with its prediction: S0/2 if that is measured, else the mean M of
+    the intensities behind the analyzers. The polarization term takes the place and the weight of the Stokes term. It is
+    the mean of ``2 |(I - M) - (S1 c + S2 s) / 2| / sqrt(2 M + 0.01)``, with c and s of the analyzer minus those of M.
+    Both sides are differences, so that S0 cancels. A view with one picture has no such term, because its information is
+    in the photometric term. With the rendered S0/2 in place of M, a rendering that is too bright would be explained by
+    more light that its analyzer blocks, which makes it brighter.
 
-    Without a weight of the polarization, or without layers to predict from, the picture counts as a photograph.
+    Without a weight of the polarization, or without layers for a prediction, the picture counts as a photograph.
 
     Args:
-        step: what the terms read. photometric, polarization: weights of the stage.
+        step: data of the step.
+        view: measurements of its view.
+        photometric, polarization: weights of the stage.
     """
     result = step.result
     shading = step.shading
-    view = step.targets.partial
-    assert view is not None
 
     def compared(rendered: Tensor) -> Photometric:
         return photometric_terms(rendered, view.shown, step.targets.valid, step.ssim_weight)

@@ -1,12 +1,24 @@
 """Polarization priors of a view, from its Stokes vectors and the normals of frozen Gaussians.
 
-This is the coupling of PolarGuide-GSDR (Shan et al. 2026): the Gaussians' normals resolve the ambiguity of the
-polarization normals and the separation, and what comes out supervises the Gaussians until the next refresh.
+This is the coupling of PolarGuide-GSDR (Shan et al. 2026). The normals of the Gaussians resolve the ambiguity of the
+polarization normals and of the separation. The resulting priors supervise the Gaussians until the next refresh.
+
+Flat mirroring surfaces: large parts of a view whose polarization one normal explains.
+
+Light that a dielectric or a metal mirrors is polarized across the plane of incidence. The AoLP of a pixel therefore
+gives a direction perpendicular to its normal, for any mirrored light at any apparent depth. All pixels of a plane have
+one normal, and the directions of many pixels determine it up to its sign, which follows from the camera. Neither the
+ambiguity of pi nor that of pi/2 remains. Still water, which shows the depth of the mirrored scene, has no other cue.
+
+The planes of incidence of a sphere also meet in one line, the ray through its center. There Fresnel's equations allow
+almost no polarization, so that the measurement contradicts this normal.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -17,20 +29,124 @@ from polarguide.capture import View
 from polarguide.capture.exposures import FOUR
 from polarguide.geometry.vectors import dot, unit
 from polarguide.optics.color import srgb_encode
-from polarguide.training.flat import Flat
-from polarguide.training.recipe import Candidates, Priors
+from polarguide.training.recipe import Candidates, FlatRules, Priors
 from polarguide.training.targets import ViewPriors, stokes_weight, surface_weight
 
 
-class Unguided(NamedTuple):
-    """The part of a view's priors that does not depend on the guide: it stays the same from refresh to refresh.
+@dataclass(frozen=True, eq=False)
+class Flat:
+    """A flat surface in a view.
 
     Attributes:
-        usable: [H, W] bool, where the polarization is above the threshold and its noise.
-        degree: [H, W] DoLP, where the settings look at its noise without what that adds to it.
-        zenith, azimuth: [H, W] radians, of the normals of the color differences; None where these are not requested.
-        certainty: [H, W] weight of these normals, in [0, 1], 0 where color decides nothing; None likewise.
-        colorful: [H, W] from 0 where the body is gray to 1 where it has a color; None likewise.
+        normal: [3] unit, world axes, towards the camera.
+        where: [H, W] bool, the pixels that it explains.
+    """
+
+    normal: Tensor
+    where: Tensor
+
+    def to(self, device: torch.device) -> Flat:
+        """Return the surface on a device."""
+        return Flat(self.normal.to(device), self.where.to(device))
+
+
+@torch.no_grad()
+def flat_surface(view: View, refractive_index: float, rules: FlatRules) -> Flat | None:
+    """Find the flat surface that explains most of a view; None: no surface explains enough.
+
+    The pictures of the view have to determine the Stokes vector. Random pairs of pixels propose normals. The proposal
+    with the most agreeing pixels is refined on these by least squares.
+    """
+    luminance = optics.luminance(view.stokes())
+    rays = view.camera.rays()
+    degree = optics.dolp(luminance)
+    good = (degree > rules.faint) & ~view.invalid & ~view.saturated
+    x_ref, up_ref = optics.lens_frame(rays)
+    angle = 0.5 * torch.atan2(luminance[2], luminance[1])[..., None]
+    across = x_ref * angle.cos() + up_ref * angle.sin()
+
+    pixels = good.numel()
+    step = max(1, round((pixels / rules.samples) ** 0.5))
+    some = torch.zeros_like(good)
+    some[::step, ::step] = good[::step, ::step]
+    e = across[some]
+    d = rays[some]
+    dolp = degree[some]
+    least = rules.least * pixels / step**2
+    if len(e) < max(2.0, least):
+        return None
+    pairs = torch.randint(len(e), (2, rules.tries), generator=torch.Generator().manual_seed(0))
+    proposed = torch.linalg.cross(e[pairs[0]], e[pairs[1]])
+    proposed = unit(proposed[proposed.norm(dim=-1) > rules.apart])
+    if not len(proposed):
+        return None
+    proposed = torch.cat((proposed, -proposed))
+    fits = _agrees(proposed @ e.T, -(proposed @ d.T), dolp, refractive_index, rules)
+    best = fits.sum(dim=1).argmax()
+    normal = proposed[best]
+    inside = fits[best]
+    for _ in range(3):
+        _, vectors = torch.linalg.eigh(e[inside].T @ e[inside])
+        normal = vectors[:, 0] * torch.sign(vectors[:, 0] @ normal)
+        inside = _agrees(e @ normal, -(d @ normal), dolp, refractive_index, rules)
+    if float(inside.sum()) < least:
+        return None
+    everywhere = normal.expand_as(rays)
+    where = good & _agrees(dot(across, everywhere), -dot(rays, everywhere), degree, refractive_index, rules)
+    around = torch.nn.functional.avg_pool2d(where[None].float(), rules.window, 1, rules.window // 2)[0]
+    return Flat(view.camera.to_world(normal), where & (around > rules.most))
+
+
+def _agrees(off: Tensor, cosine: Tensor, dolp: Tensor, refractive_index: float, rules: FlatRules) -> Tensor:
+    """Return a mask of pixels that agree with normals.
+
+    Args:
+        off: cosine between the normal and the direction of the pixel.
+        cosine: cosine between the normal and the reversed ray.
+        dolp: DoLP of the pixel.
+        refractive_index: refractive index of the surface.
+        rules: tolerances.
+    """
+    allowed = (
+        optics.specular_dolp(cosine.clamp(0, 1).acos(), refractive_index) * rules.slack[0] + rules.slack[1]
+    )
+    return (off.abs() < rules.close) & (cosine > rules.grazing) & (dolp < allowed)
+
+
+def flat_surfaces(views: Iterable[View], refractive_index: float, rules: FlatRules) -> dict[str, Flat]:
+    """Find flat surfaces with similar normals in enough views; return them by view, with the mean normal.
+
+    Views that do not determine the Stokes vector are left out.
+    """
+    surfaces = dict[str, Flat]()
+    determined = 0
+    for view in views:  # one by one, as they come
+        if view.is_determined:
+            determined += 1
+            if (flat := flat_surface(view, refractive_index, rules)) is not None:
+                surfaces[view.name] = flat
+    if not surfaces:
+        return {}
+    normals = torch.stack([flat.normal for flat in surfaces.values()])
+    sizes = torch.stack([flat.where.sum() for flat in surfaces.values()]).to(normals)
+    alike = normals @ normals.T > torch.cos(torch.deg2rad(normals.new_tensor(rules.alike)))
+    enough = max(rules.fewest, rules.share * determined)
+    agreed = {}
+    for (name, flat), others in zip(surfaces.items(), alike, strict=True):
+        if int(others.sum()) >= enough:
+            agreed[name] = replace(flat, normal=unit((normals * (others * sizes)[:, None]).sum(dim=0)))
+    return agreed
+
+
+class Unguided(NamedTuple):
+    """Part of a view's priors that does not depend on the guide and is the same at all refreshes.
+
+    Attributes:
+        usable: [H, W] bool, pixels whose polarization exceeds the threshold and its noise.
+        degree: [H, W] DoLP, without the bias of noise if the settings test it against the noise.
+        zenith, azimuth: [H, W] radians, of the normals of the color differences; None if they are not requested.
+        certainty: [H, W] weight of these normals, in [0, 1], 0 where color decides nothing; None like the angles.
+        colorful: [H, W] from 0 for a gray body to 1 for a colored one; None like the angles.
     """
 
     usable: Tensor
@@ -43,10 +159,12 @@ class Unguided(NamedTuple):
 
 @torch.no_grad()
 def unguided(view: View, settings: Priors, refractive_index: float) -> Unguided:
-    """The part of a view's priors that needs no Gaussians.
+    """Compute the part of a view's priors that needs no Gaussians.
 
     Args:
-        view: the capture; its device does the work. settings: of the priors. refractive_index: of all surfaces.
+        view: the capture; the computation runs on its device.
+        settings: settings of the priors.
+        refractive_index: refractive index of all surfaces.
     """
     stokes = view.stokes()
     luminance = optics.luminance(stokes)
@@ -67,10 +185,11 @@ def unguided(view: View, settings: Priors, refractive_index: float) -> Unguided:
 
 
 def debiased_dolp(luminance: Tensor, noise: Tensor | float) -> Tensor:
-    """DoLP [H, W] without what noise adds to it on average.
+    """Return the DoLP [H, W] without the bias of noise.
 
     Args:
-        luminance: [3, H, W] Stokes vectors. noise: [H, W] standard deviation of one of the four intensities; 0: none.
+        luminance: [3, H, W] Stokes vectors.
+        noise: [H, W] standard deviation of one of the four intensities; 0: no noise.
     """
     if not isinstance(noise, Tensor):
         return optics.dolp(luminance)
@@ -78,11 +197,11 @@ def debiased_dolp(luminance: Tensor, noise: Tensor | float) -> Tensor:
 
 
 def guide_normals(normal: Tensor, rays: Tensor, least: float) -> tuple[Tensor, Tensor]:
-    """Unit normals [H, W, 3] that face the camera, and a mask [H, W] of the reliable ones.
+    """Return unit normals [H, W, 3] that face the camera, and a mask [H, W] of the reliable ones.
 
     Args:
-        normal: [H, W, 3] normals, blended over the Gaussians of each pixel. One that points away from the camera is
-            turned until it is perpendicular to the ray.
+        normal: [H, W, 3] blended normals. A normal that faces away from the camera is turned until it is perpendicular
+            to the ray.
         rays: [H, W, 3] unit directions from the camera.
         least: length above which a blended normal is reliable.
     """
@@ -106,12 +225,13 @@ def view_priors(
 
     Args:
         view: the capture; its pictures have to determine the Stokes vector.
-        normal: [H, W, 3] normals rendered from the frozen Gaussians, world axes, any length; its device does the work.
-        settings: which candidates and which separation.
+        normal: [H, W, 3] normals rendered from the frozen Gaussians, world axes, any length. The computation runs on
+            its device.
+        settings: candidates, separation and other settings of the priors.
         refractive_index: refractive index of all surfaces, or [H, W] of each pixel.
-        precomputed: ``unguided`` of the view, where it is at hand; needed with the index of each pixel.
-        metal: [H, W] share of metals, where what holds for dielectrics alone does not count; None: no metal.
-        flat: a flat surface, whose normal replaces the guide and the color differences where the guide is far from it.
+        precomputed: ``unguided`` of the view; None: computed here, with one refractive index for all surfaces.
+        metal: [H, W] share of metals, on which the rules for dielectrics do not hold; None: no metal.
+        flat: a flat surface, whose normal replaces the guide and the color differences far from the guide.
     """
     view, rays = view.to(normal.device), view.camera.rays(device=normal.device)
     if precomputed is None:
@@ -161,11 +281,18 @@ def view_priors(
 
 
 def _plane(chosen: Tensor, by_color: tuple[Tensor, Tensor] | None, faint: Tensor, rays: Tensor) -> Tensor:
-    """Normals [H, W, 3] of the planes of incidence, camera axes. faint: [H, W] bool, nearly unpolarized pixels."""
+    """Return normals [H, W, 3] of the planes of incidence, camera axes.
+
+    Args:
+        chosen: [H, W, 3] chosen candidates.
+        by_color: see ``_by_color``.
+        faint: [H, W] bool, nearly unpolarized pixels.
+        rays: [H, W, 3] unit directions from the camera.
+    """
     plane = unit(torch.linalg.cross(rays, chosen))
     if by_color is None:
         return plane
-    # Nearly unpolarized light has no reliable AoLP; the slope among its colors may still have one.
+    # Nearly unpolarized light has no reliable AoLP, but the slope among its colors may have one.
     better = (by_color[1] > 0) & faint
     return torch.where(better[..., None], unit(torch.linalg.cross(rays, by_color[0])), plane)
 
@@ -173,20 +300,26 @@ def _plane(chosen: Tensor, by_color: tuple[Tensor, Tensor] | None, faint: Tensor
 def _without_metal(
     metal: Tensor, luminance: Tensor, normal: Tensor, rays: Tensor, shares: tuple[float, float]
 ) -> tuple[Tensor, Tensor]:
-    """Weights [H, W] of what holds for dielectrics alone, and of what is predicted of both, beside shares of metals.
+    """Return two weights [H, W] next to metals: of rules for dielectrics alone, and of predictions for both materials.
 
     Args:
-        shares: of metal, between which a pixel goes over from a dielectric to a metal.
+        shares: metal shares between which a pixel changes from dielectric to metal.
     """
     none, whole = shares
     body = 1 - ((metal - none) / (whole - none)).clamp(0, 1)
-    # Light that is polarized in the plane of incidence was so before it fell on a metal: nothing here predicts it.
+    # Light from a metal that is polarized in the plane of incidence was polarized before the reflection. The model does
+    # not predict it.
     return body, 1 - (1 - body) * (_across(luminance, normal, rays) < 0)
 
 
 class _Guide(NamedTuple):
-    """Normals [H, W, 3] of the guide, camera axes, and where they are known [H, W]; ``astray``, where those of a flat
-    surface, ``on_plane``, took their place.
+    """Normals of the guide in camera axes.
+
+    Attributes:
+        normal: [H, W, 3] normals.
+        shown: [H, W] bool, pixels with a known normal.
+        on_plane: [H, W, 3] normals of the flat surface.
+        astray: [H, W] bool, pixels where these replace the normals of the Gaussians.
     """
 
     normal: Tensor
@@ -207,7 +340,7 @@ def _guide(view: View, normal: Tensor, flat: Flat | None, rays: Tensor, settings
 def _by_color(
     precomputed: Unguided, guide: _Guide, settings: Priors, rays: Tensor
 ) -> tuple[Tensor, Tensor] | None:
-    """Normals [H, W, 3] of the color differences or of a flat surface, and their weight; None: not wanted."""
+    """Return the normals [H, W, 3] of color differences or of a flat surface, and their weight; None: not requested."""
     _, _, zenith, azimuth, certainty, colorful = precomputed
     if zenith is None or azimuth is None or certainty is None or colorful is None:
         return None
@@ -223,7 +356,7 @@ def _by_color(
 def _separated(
     stokes: Tensor, guide: _Guide, settings: Priors, refractive_index: float | Tensor, rays: Tensor
 ) -> optics.Separation:
-    """The layers as the recipe separates them, ``conditioned`` where the guide is known."""
+    """Return the separated layers of the recipe, ``conditioned`` where the guide is known."""
     if settings.separation == "paper":
         zenith = optics.diffuse_zenith(optics.dolp(optics.luminance(stokes)), refractive_index)
         return optics.paper_separation(stokes, zenith, refractive_index)
@@ -232,10 +365,11 @@ def _separated(
 
 
 def _across(luminance: Tensor, normal: Tensor, rays: Tensor) -> Tensor:
-    """Polarization [H, W] across the plane of incidence times ``sin^2(zenith)``; negative: in it.
+    """Return the polarization [H, W] across the plane of incidence times ``sin^2(zenith)``; negative in the plane.
 
     Args:
-        luminance: [3, H, W]. normal, rays: [H, W, 3] camera axes.
+        luminance: [3, H, W] Stokes vectors.
+        normal, rays: [H, W, 3] camera axes.
     """
     x_ref, up_ref = optics.lens_frame(rays)
     x = dot(normal, x_ref)
@@ -244,14 +378,17 @@ def _across(luminance: Tensor, normal: Tensor, rays: Tensor) -> Tensor:
 
 
 def _within(normal: Tensor, guide: Tensor, full: float, none: float) -> Tensor:
-    """1 up to ``full`` degrees between unit normals [H, W, 3], 0 from ``none`` on; [H, W]."""
+    """Return a weight [H, W] that falls from 1 at ``full`` degrees between unit normals [H, W, 3] to 0 at ``none``
+    degrees.
+    """
     off = torch.linalg.cross(normal, guide).norm(dim=-1).atan2(dot(normal, guide)).rad2deg()
     return ((none - off) / (none - full)).clamp(0, 1)
 
 
 def _noise(view: View) -> Tensor | float:
-    """Standard deviation [H, W] of the noise of one of the four intensities; 0 for other pictures: three leave nothing
-    to read it from.
+    """Return the standard deviation [H, W] of the noise of one of the four intensities; 0 for fewer pictures.
+
+    Three pictures have no redundancy to estimate noise from.
     """
     return optics.intensity_noise(view.intensities().mean(dim=-1)) if view.exposures == FOUR else 0.0
 
@@ -259,7 +396,7 @@ def _noise(view: View) -> Tensor | float:
 def _candidates(
     kind: Candidates, luminance: Tensor, rays: Tensor, refractive_index: float | Tensor
 ) -> optics.Candidates | optics.PhysicalCandidates | Tensor:
-    """The candidate normals of a recipe, camera axes. luminance: [3, H, W]. rays: [H, W, 3]."""
+    """Return the candidate normals [H, W, K, 3] of a recipe, or the record that holds them, in camera axes."""
     if kind == "physical":
         return optics.physical_candidates(luminance, rays, refractive_index)
     paper = optics.paper_candidates(luminance, rays, refractive_index)
@@ -272,15 +409,16 @@ def _candidates(
 
 
 def _normals(candidates: optics.Candidates | optics.PhysicalCandidates | Tensor) -> Tensor:
-    """The candidates' normals [H, W, K, 3]."""
+    """Return the normals [H, W, K, 3] of candidates."""
     return candidates if isinstance(candidates, Tensor) else candidates.normals
 
 
 def facing(zenith: Tensor, azimuth: Tensor, guide: Tensor, rays: Tensor) -> Tensor:
-    """Normals [H, W, 3] of an azimuth that is known up to half a turn, on the guide's side of each ray.
+    """Return normals [H, W, 3] of an azimuth that is known up to half a turn, on the guide's side of each ray.
 
     Args:
-        zenith, azimuth: [H, W] radians. guide, rays: [H, W, 3] camera axes.
+        zenith, azimuth: [H, W] radians.
+        guide, rays: [H, W, 3] camera axes.
     """
     normal = optics.normal_from_angles(zenith, azimuth, rays)
     mirrored = optics.normal_from_angles(zenith, azimuth + torch.pi, rays)
@@ -295,10 +433,13 @@ def facing_chromatic(
     good: Tensor,
     settings: Priors,
 ) -> tuple[Tensor, Tensor]:
-    """Normals of the color differences on the guide's side of each ray, and their weights.
+    """Return normals of the color differences on the guide's side of each ray, and their weights.
 
     Args:
-        stokes: [3, H, W, 3]. guide: [H, W, 3] camera axes. rays: [H, W, 3]. refractive_index: of all surfaces.
+        stokes: [3, H, W, 3] Stokes vectors.
+        guide: [H, W, 3] camera axes.
+        rays: [H, W, 3] unit directions from the camera.
+        refractive_index: refractive index of all surfaces.
         good: [H, W] bool, pixels whose measurement counts.
 
     Returns:
@@ -311,8 +452,9 @@ def facing_chromatic(
 def _chromatic_angles(
     stokes: Tensor, refractive_index: float, good: Tensor, settings: Priors
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Zenith, azimuth and weight in [0, 1] of the normals of the color differences, and how colorful the body is, each
-    [H, W].
+    """Return zenith, azimuth and weight of the normals of the color differences, and the colorfulness of the body.
+
+    All are [H, W], the last two in [0, 1].
     """
     chromatic = optics.chromatic_normals(stokes, refractive_index)
     gray, color = settings.gray

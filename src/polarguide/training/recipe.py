@@ -1,7 +1,9 @@
-"""Recipes are data: a list of stages, each saying what is rendered, what is compared, and what happens when.
+"""Recipes as data: stages with their rendering, losses and actions.
 
-Nothing in the loop compares a step with a constant: boundaries are fractions of the total number of steps.
-``Schedule`` lays the stages over the steps of a training.
+Stage boundaries are fractions of the number of steps, so that the loop compares no step with a constant. ``Schedule``
+maps the stages of a recipe to the steps of a training.
+
+Constants of the detection of metals and flat surfaces, and of the fit of polarizer angles, as data of a recipe.
 """
 
 from __future__ import annotations
@@ -19,7 +21,147 @@ from polarguide.gaussians.gaussians import CORE_SHAPES, ORIENTED_SHAPES
 from polarguide.gaussians.initialize import Initialization
 from polarguide.shading.model import PLAIN, ShadingModel
 from polarguide.training.losses import Weights as Weights
-from polarguide.training.rules import AngleRules, FlatRules, MetalRules, MetalViews
+
+
+@dataclass(frozen=True)
+class MetalRules:
+    """Constants of the energy whose minimum decides on metals (``training.metals.cut``).
+
+    Attributes:
+        prior: log likelihood ratio per view, in nats, by which a metal must be likelier than a dielectric.
+        trust: upper bound of the evidence of a single Gaussian, in nats: one of 20 may be wrong at any evidence.
+        likeness: cost, in nats, of two similar neighbors of which one is a metal and the other a dielectric.
+        tint: standard deviation of the logarithm of a surface's tint relative to the mean light of the scene. Metals
+            are hardly more deeply colored than gold.
+        surface: least gain of a connected metal surface, in nats.
+    """
+
+    prior: float = 0.45
+    trust: float = 3.0
+    likeness: float = 8.0
+    tint: float = 0.3
+    surface: float = 40.0
+
+
+@dataclass(frozen=True)
+class MetalViews:
+    """Constants of the measurements for the search for metals, and of the light gain from the first metals.
+
+    Attributes:
+        most_views: largest number of examined views, evenly spread.
+        least_share: a view counts if a Gaussian has at least this share of its largest blending weight in it.
+        least_normal: length of a blended normal above which a pixel counts; shorter ones mix surfaces.
+        cosines: cosines of the zenith angle between which a view counts. Light is unpolarized at normal incidence, and
+            normals and reflectances are uncertain at grazing angles.
+        dark: radiance (full scale is 1) that is added to the reference of relative errors.
+        reach: share of the cameras' distance from the middle of the points within which metals are searched. Gaussians
+            farther away are behind the subject in views from the other side.
+        contradicted: share of the labels of a view above which contradictions by other views lead to a warning.
+        gain_views: number of views for the gain of the light.
+        gain_share: metal share above which a pixel counts for the gain.
+        gain_pixels: least share of counted pixels.
+        most_gain: largest gain.
+    """
+
+    most_views: int = 32
+    least_share: float = 0.3
+    least_normal: float = 0.3
+    cosines: tuple[float, float] = (0.25, 0.97)
+    dark: float = 0.02
+    reach: float = 0.5
+    contradicted: float = 0.15
+    gain_views: int = 10
+    gain_share: float = 0.6
+    gain_pixels: float = 0.003
+    most_gain: float = 4.0
+
+
+@dataclass(frozen=True)
+class AngleRules:
+    """Constants of the search for unknown polarizer angles, and of the check of known ones.
+
+    Attributes:
+        search_steps: steps of the schedule of a search before the training. More steps are not better: mirroring flat
+            surfaces, such as water, bend to explain their reflections without polarization.
+        search_size: largest number of pixels of the longer side of its pictures.
+        first, every, last: shares of these steps at which angles are fitted; their mean counts. Earlier fits would
+            confirm the initial guess, and later ones the errors that the model has absorbed by then.
+        again: shares of the fits of a second search, which begins with the angles of the first. Most of these are right
+            and improve the prediction for the others. A third search found no more on two scenes.
+        checks: shares of all steps at which known angles are compared with the pictures. Early, the model predicts
+            little; late, colors and surfaces have adapted to wrong angles. At half size and 1,500 steps, six of 63
+            angles were wrong by 45 or 90 degrees: one, three and five of them contradict, five in all, and no right
+            one.
+        least_spread: spread in degrees below which a fit gains no more weight.
+        weak: modulation below which an angle is unreliable. Wrong predictions reduce the modulation: pictures through a
+            filter seldom have all of it, and half is usual at the first fits.
+        vague: spread in degrees above which a picture does not determine its angle.
+        lost: spread in degrees above which an angle is no best guess. Guesses with up to 30 degrees of error are better
+            than a photograph without a filter; spreads of 20 to 60 degrees mostly had errors under 20.
+        disagree: scatter in degrees above which the fits of a picture disagree.
+        contradicts: degrees between specified and fitted angle above which they contradict each other, if that also
+            exceeds three times the spread and three standard deviations of the deviations of all pictures. Angles are
+            read from rings to a few degrees.
+        locked: standard deviation of the logarithms of fitted gains up to which exposures count as equal: 0.03 to 0.07
+            for equal exposures at the first fit, and 0.13 for automatic exposure within 0.3 stops.
+        fewest: number of pictures that determine a spread of gains.
+        poor: ``Judgment.unexplained`` above which a picture may be at another angle. On four test scenes and two seeds,
+            every picture with an error over 45 degrees exceeded it, and at most five others of 63. It was chosen with
+            one of these seeds.
+    """
+
+    search_steps: int = 900
+    search_size: int = 160
+    first: float = 0.5
+    every: float = 0.05
+    last: float = 0.65
+    again: tuple[float, ...] = (0.5, 0.65, 0.8, 0.95)
+    checks: tuple[float, ...] = (0.2, 0.3, 0.5)
+    least_spread: float = 1.0
+    weak: float = 0.22
+    vague: float = 15.0
+    lost: float = 45.0
+    disagree: float = 10.0
+    contradicts: float = 20.0
+    locked: float = 0.1
+    fewest: int = 4
+    poor: float = 0.95
+
+
+@dataclass(frozen=True)
+class FlatRules:
+    """Constants of the search for flat surfaces.
+
+    Attributes:
+        tries: number of pixel pairs that propose a normal.
+        samples: approximate number of pixels that judge them.
+        close: sine of the angle between the plane of incidence of a pixel and the normal up to which they agree.
+        apart: sine of the angle between the directions of two pixels below which they propose no normal.
+        least: least share of a view that a flat surface covers. One normal explains up to a sixth of a curved surface
+            by chance.
+        faint: DoLP above which a pixel counts.
+        slack: factor on Fresnel's DoLP, and addition to it, beyond which a pixel contradicts.
+        grazing: cosine between normal and ray below which a surface is not visible.
+        window: side in pixels of the square around a pixel for ``most``.
+        most: least share of that square that agrees.
+        alike: degrees up to which flat surfaces of different views are the same.
+        fewest, share: least number and least share of the views that show the surface.
+    """
+
+    tries: int = 400
+    samples: int = 12_000
+    close: float = 0.03
+    apart: float = 0.03
+    least: float = 0.25
+    faint: float = 0.05
+    slack: tuple[float, float] = (1.1, 0.02)
+    grazing: float = 0.05
+    window: int = 9
+    most: float = 0.7
+    alike: float = 5.0
+    fewest: int = 3
+    share: float = 1 / 3
+
 
 Action = str
 """Name of an action: the ``action`` of a callback, see ``training.callback``."""
@@ -30,12 +172,12 @@ _REMEDY = "Correct the recipe."
 
 @dataclass(frozen=True)
 class Repeat:
-    """Something that happens every so often.
+    """An action that repeats at a fixed distance.
 
     Attributes:
-        action: what.
-        fraction: fraction of all steps, the distance between two of them.
-        minimum: never closer than this many steps.
+        action: name of the action.
+        fraction: distance between two occurrences, as a fraction of all steps.
+        minimum: least distance in steps.
     """
 
     action: Action
@@ -45,15 +187,15 @@ class Repeat:
 
 @dataclass(frozen=True)
 class Rounds:
-    """Things that take turns, evenly spread over a stage in as many whole rounds as fit, one at least.
+    """Actions in turn, evenly spread over a stage in as many whole rounds as fit, at least one.
 
-    So two of them never fall on each other, however many steps there are. The last turn of the last round falls on
-    the end of the stage and is left out: it belongs to what follows (``on_enter`` of the next stage).
+    Two actions never coincide, for any number of steps. The last turn of the last round falls on the end of the stage
+    and is left out; it belongs to ``on_enter`` of the next stage.
 
     Attributes:
-        actions: what, in turn.
-        fraction: fraction of all steps, the least distance between two turns.
-        minimum: nor closer than this many steps. A stage too short for one such round has one all the same.
+        actions: the actions in their order.
+        fraction: least distance between two turns, as a fraction of all steps.
+        minimum: least distance in steps. A stage that is too short for one such round still has one.
     """
 
     actions: tuple[Action, ...]
@@ -61,7 +203,7 @@ class Rounds:
     minimum: int = 1
 
     def turns(self, length: int, steps: int) -> dict[int, Action]:
-        """The due actions by step, counted from the beginning of a stage of ``length`` of ``steps`` steps."""
+        """Return the due actions by step, counted from the beginning of a stage of ``length`` of ``steps`` steps."""
         apart = max(1, self.minimum, round(self.fraction * steps))
         count = len(self.actions) * max(1, length // (apart * len(self.actions)))
         places = (round(turn * length / count) for turn in range(1, count))
@@ -73,22 +215,22 @@ class Stage:
     """One phase of training.
 
     Attributes:
-        name: shown while it runs.
-        fraction: its share of all steps.
-        reflection: whether the picture is shaded with deferred reflection.
+        name: displayed name.
+        fraction: share of all steps.
+        reflection: shade the picture with deferred reflection.
         weights: weights of the losses.
-        densify: whether the density control runs.
-        repeats: what happens every so often in it.
-        rounds: what happens in turns in it.
-        on_enter: what happens at its first step.
-        rate_factors: on the recipe's learning rates while it lasts, by name; 1 where not named.
-        hold_normals: whether the terms on the layers reach the normals through Fresnel's equations alone, and not
-            through what the layers mirror at them: the separated pictures are made with the normals of before, so that
-            normals which follow them confirm their own errors.
-        behind: where, in shares of the distance of the cameras from the middle of the points (nine tenths are nearer),
-            terms on normals and depth begin to fade as movers of Gaussians, and from where on they only turn them
-            (``training.behind``): behind the subject, surfaces that agree with their normals in place of the pictures
-            have grown from there. None: they move everything.
+        densify: run the density control.
+        repeats: actions that repeat within the stage.
+        rounds: actions in turn within the stage.
+        on_enter: actions at the first step.
+        rate_factors: factors on the learning rates of the recipe by name; 1 for other names.
+        hold_normals: the terms on the layers reach the normals through Fresnel's equations only, and not through the
+            mirrored light. The separated pictures depend on earlier normals, so that normals that follow them would
+            confirm their own errors.
+        behind: begin and end of a fading of terms on normals and depth, as shares of the distance of the cameras from
+            the middle of the points, which nine tenths of the cameras do not exceed. Beyond the end these terms only
+            rotate Gaussians (``training.behind``). Without fading, surfaces grow behind the subject that agree with
+            their normals and not with the pictures. None: no fading.
     """
 
     name: str
@@ -106,35 +248,37 @@ class Stage:
 
 @dataclass(frozen=True)
 class Priors:
-    """How polarization priors are computed from the frozen Gaussians.
+    """Settings of the polarization priors, which are computed from the frozen Gaussians.
 
     Attributes:
-        candidates: which polarization normals are considered: PolarGuide-GSDR's n, -n, R n, -R n ("paper"), the same
-            with -n read as the opposite azimuth ("azimuths"), or the six that physics allows.
-        live: whether each step chooses the candidate nearest to the normals that it renders, wherever the DoLP is over
-            the threshold; otherwise the frozen Gaussians have chosen, and count only where they have a normal.
-        separation: which separation supervises the layers.
-        threshold: DoLP above which a pixel's normal is used.
-        full_dolp: DoLP from which on a pixel's normal counts fully; below, in proportion.
-        azimuth_weight: in [0, 1], how much the choice among candidates trusts azimuth over zenith.
-        snr: ratio of the DoLP to its noise above which a pixel's normal is used; 0 switches the test off.
-        chromatic: whether the polarization of color differences gives the plane where it is decided.
-        chromatic_within: degrees from the Gaussians' normal up to which that of the color differences of a gray body
-            counts fully, and from where on not at all: under colored light it is the light that differs, and it points
-            anywhere. None: it counts wherever it is.
-        azimuth_share, chromatic_share: of the pixels, the least that the terms on directions are averaged over, so that
-            a view whose few pixels are polarized does not pull as hard as one that is polarized all over.
-        bright: S0/2 from which on consistency counts fully whatever the DoLP, and below in proportion: where a surface
-            shows something, its depth is known. 0: by the DoLP alone.
-        flat: whether large flat surfaces are looked for, whose normal one view tells. flat_rules: how.
-        astray: degrees between the Gaussians' normal and that of a flat surface from which on the latter replaces the
-            former, which may know of ripples below.
-        minimum_normal: length of a blended normal above which it guides: shorter ones mix surfaces.
-        chromatic_plane_dolp: DoLP under which the plane of incidence of the color differences replaces the AoLP's.
-        full_certainty: certainty (``optics.chromatic_normals``) from which on the normal of the color differences
-            counts fully.
-        gray: contrasts among the colors between which a body goes over from gray to colorful.
-        metal_share: shares of metals between which a pixel goes over from a dielectric to a metal.
+        candidates: considered polarization normals: n, -n, R n, -R n of PolarGuide-GSDR ("paper"), the same with the
+            opposite azimuth in place of -n ("azimuths"), or the six that physics allows ("physical").
+        live: each step chooses the candidate nearest to the rendered normals, wherever the DoLP exceeds the threshold.
+            Otherwise, the frozen Gaussians choose, and pixels count only where they have a normal.
+        separation: separation that supervises the layers.
+        threshold: DoLP above which the normal of a pixel is used.
+        full_dolp: DoLP above which the normal of a pixel counts fully; below, in proportion.
+        azimuth_weight: weight in [0, 1] of the azimuth, relative to the zenith, in the choice among candidates.
+        snr: ratio of the DoLP to its noise above which the normal of a pixel is used; 0: no test.
+        chromatic: use the polarization of color differences for the plane of incidence where it is decided.
+        chromatic_within: angles in degrees to the normal of the Gaussians between which the weight of normals of gray
+            bodies from color differences falls from 1 to 0. Under colored light, these normals have random directions.
+            None: no limit.
+        azimuth_share, chromatic_share: least share of the pixels over which the terms on directions are averaged, so
+            that a view with few polarized pixels has less influence than a fully polarized view.
+        bright: S0/2 above which consistency counts fully for any DoLP, and below in proportion, because depth is known
+            on bright surfaces. 0: the DoLP alone counts.
+        flat: search for large flat surfaces, whose normal a single view determines.
+        flat_rules: constants of that search.
+        astray: degrees between the normal of the Gaussians and that of a flat surface above which the latter is used.
+            Smaller differences may be ripples.
+        minimum_normal: length of a blended normal above which it guides; shorter ones mix surfaces.
+        chromatic_plane_dolp: DoLP below which the plane of incidence of the color differences replaces that of the
+            AoLP.
+        full_certainty: certainty (``optics.chromatic_normals``) above which the normal of the color differences counts
+            fully.
+        gray: color contrasts between which a body changes from gray to colorful.
+        metal_share: metal shares between which a pixel changes from dielectric to metal.
     """
 
     candidates: Candidates = "physical"
@@ -164,11 +308,12 @@ class Propagation:
     """Normal propagation of 3DGS-DR (Ye et al. 2024, Sec. 3.3).
 
     Attributes:
-        opacity: opacities are raised to at least this.
-        color_noise: half-width of the noise on the base color where strength is at most ``matte``.
-        matte, glossy: strengths that bound the two kinds of Gaussian.
-        widen: factor on the two longer scales where strength is at least ``glossy``.
-        rest: steps for which opacities do not train afterwards (release); at most all steps over ``rest_part``.
+        opacity: lower bound of the opacities after it.
+        color_noise: half-width of the noise on the base color of matte Gaussians.
+        matte: largest strength of a matte Gaussian.
+        glossy: smallest strength of a glossy Gaussian.
+        widen: factor on the two longer scales of glossy Gaussians.
+        rest: steps without training of opacities afterwards (release), at most all steps over ``rest_part``.
     """
 
     opacity: float = 0.9
@@ -182,11 +327,12 @@ class Propagation:
 
 @dataclass(frozen=True)
 class Coarse:
-    """Smaller pictures for the first steps, in which large ones show nothing that the Gaussians could take up yet.
+    """Smaller pictures in the first steps, in which Gaussians are too large for details.
 
     Attributes:
-        share: share of all steps. factor: side of the boxes of pixels that are averaged.
-        pixels: pixels of the largest training view, from which on there are such steps.
+        share: share of all steps.
+        factor: side of the averaged pixel boxes.
+        pixels: pixels of the largest training view above which there are such steps.
     """
 
     share: float = 0.5
@@ -196,25 +342,26 @@ class Coarse:
 
 @dataclass(frozen=True)
 class Recipe:
-    """All that distinguishes one method from another.
+    """All properties of a method.
 
     Attributes:
-        name: as given to ``--recipe``.
+        name: value of ``--recipe``.
         about: one line.
-        stages: in order; their fractions add up to 1.
-        rates: learning rates of what every recipe trains; that of the means is times the scene's extent.
-        shading: how Gaussians and learned light make the picture in stages with reflection.
-        means_decay: factor on the means' rate at the last step (exponential in between).
-        oriented: whether normals keep the side from which training views see them ("orient_normals" finds it).
-        metals: share of all steps between which refreshes look for metals, where the shading knows them.
-        metal_rules: how. metal_views: from which measurements.
-        angle_rules: how polarizer angles are fitted and judged.
-        coarse: which steps look at smaller pictures.
+        stages: stages in order; their fractions add up to 1.
+        rates: learning rates of the parameters of every recipe; that of the means is relative to the scene's extent.
+        shading: computation of the picture from Gaussians and learned light in stages with reflection.
+        means_decay: factor on the rate of the means at the last step, exponential in between.
+        oriented: normals keep the side from which training views see them (action "orient_normals").
+        metals: shares of all steps between which refreshes search for metals, if the shading model has metals.
+        metal_rules: constants of the decision on metals.
+        metal_views: constants of the measurements for that decision.
+        angle_rules: constants of the fits of polarizer angles and of their judgments.
+        coarse: steps with smaller pictures.
         sh_fractions: shares of all steps at which SH degrees 1, 2 and 3 begin.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
 
     Raises:
-        PolarguideError: stages that do not add up, or rates that are missing or name nothing that is learned.
+        PolarguideError: stages do not add up, or rates are missing or belong to no learned parameter.
     """
 
     name: str
@@ -266,24 +413,24 @@ class Recipe:
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Every per-Gaussian tensor, with the shape of one Gaussian's values."""
+        """Shape of one Gaussian's values for each tensor."""
         own = {name: parameter.shape for name, parameter in self.shading.parameters.items()}
         return {**CORE_SHAPES, **(ORIENTED_SHAPES if self.oriented else {}), **own}
 
     @property
     def learning_rates(self) -> dict[str, float]:
-        """Learning rates of the per-Gaussian tensors that learn, the shading model's included."""
+        """Learning rates of the trained per-Gaussian tensors, with those of the shading model."""
         own = {name: parameter.rate for name, parameter in self.shading.parameters.items() if parameter.rate}
         return {**self.rates, **own}
 
     @property
     def light_rates(self) -> dict[str, float]:
-        """Learning rates of the learned light's parameters."""
+        """Learning rates of the parameters of the learned light."""
         return {name: parameter.rate for name, parameter in self.shading.light_parameters.items()}
 
     @property
     def actions(self) -> set[Action]:
-        """Names of all actions that are due at some step."""
+        """Names of all actions of the stages."""
         names = set[Action]()
         for stage in self.stages:
             names.update(stage.on_enter, (repeat.action for repeat in stage.repeats))
@@ -291,19 +438,19 @@ class Recipe:
         return names
 
     def data(self) -> dict[str, Any]:
-        """All values as plain JSON types, for a run's folder."""
+        """Return all values as plain JSON types, for a run folder."""
         plain: dict[str, Any] = json.loads(json.dumps({**asdict(self), "shading": self.shading.data()}))
         return plain
 
     def differs(self, data: Mapping[str, Any]) -> bool:
-        """True where a value differs from the one that a run's folder records; see ``values_differ``."""
+        """Return True if a value differs from the one in a run folder; see ``values_differ``."""
         return values_differ(self.data(), data)
 
 
 def values_differ(own: Mapping[str, Any], recorded: Mapping[str, Any]) -> bool:
-    """True where a value of a recipe differs from a recorded one.
+    """Return True if a value of a recipe differs from a recorded one.
 
-    Values that the record lacks count as equal, and the description is no value.
+    Missing recorded values count as equal. The description is not compared.
     """
     return _differs(own, {key: value for key, value in recorded.items() if key != "about"})
 
@@ -313,13 +460,14 @@ def _is_rate(value: object) -> bool:
 
 
 def check_recipe(recipe: Recipe, where: str) -> None:
-    """Check all values of a recipe that another program has made, before anything is trained.
+    """Check all values of a recipe of another package before a training.
 
     Args:
-        recipe: the recipe. where: for messages.
+        recipe: the recipe.
+        where: place for messages.
 
     Raises:
-        PolarguideError: a value has another type, is not finite, or cannot be noted in a run's folder.
+        PolarguideError: a value has another type, is not finite, or cannot be written to a run folder.
     """
     for name in ("name", "about"):
         text = getattr(recipe, name)
@@ -338,7 +486,7 @@ def check_recipe(recipe: Recipe, where: str) -> None:
 
 
 def _check_values(part: Any, where: str, path: str) -> None:
-    """Check the fields of a dataclass and of those in it against their types; a shading model checks its own."""
+    """Check the fields of a dataclass and of nested dataclasses against their types; a shading model checks its own."""
     kinds = get_type_hints(type(part))
     for item in fields(part):
         value = getattr(part, item.name)
@@ -354,7 +502,7 @@ def _check_values(part: Any, where: str, path: str) -> None:
 
 
 def _differs(now: Any, then: Any) -> bool:
-    """Whether one of the values of ``then``, plain JSON, is another now; what it does not have counts for nothing."""
+    """Return True if a value differs from plain JSON; keys that the JSON lacks count as equal."""
     if isinstance(then, dict):
         return not isinstance(now, dict) or any(_differs(now.get(key), value) for key, value in then.items())
     if isinstance(then, list) and isinstance(now, list) and len(now) == len(then):
@@ -364,11 +512,11 @@ def _differs(now: Any, then: Any) -> bool:
 
 @dataclass(frozen=True)
 class Position:
-    """Where a step lies: its stage, and which actions are due before it.
+    """Position of a step in a schedule.
 
     Attributes:
         stage: the stage.
-        actions: due now, in order.
+        actions: actions due before the step, in order.
     """
 
     stage: Stage
@@ -376,9 +524,9 @@ class Position:
 
 
 class Schedule:
-    """The stages of a recipe laid over a number of steps.
+    """Stages of a recipe, mapped to a number of steps.
 
-    In a training so short that a stage has no step, its ``on_enter`` happens with that of the next one; the last stage
+    In a training so short that a stage has no step, its ``on_enter`` runs with that of the next stage. The last stage
     always has a step.
     """
 
@@ -397,7 +545,7 @@ class Schedule:
         ]
 
     def at(self, step: int) -> Position:
-        """The stage of a step (0-based) and the actions due before it."""
+        """Return the stage of a step (0-based) and the actions due before it."""
         index = max(i for i, start in enumerate(self._starts) if start <= step)
         stage = self.recipe.stages[index]
         since = step - self._starts[index]
@@ -410,15 +558,15 @@ class Schedule:
         return Position(stage, (turn, *due) if turn else tuple(due))
 
     def period(self, repeat: Repeat) -> int:
-        """Steps between two occurrences."""
+        """Return the number of steps between two occurrences."""
         return max(repeat.minimum, round(repeat.fraction * self.steps))
 
     def sh_degree(self, step: int) -> int:
-        """SH degree in use at a step."""
+        """Return the SH degree of a step."""
         return sum(step >= f * self.steps for f in self.recipe.sh_fractions)
 
     def rates(self, step: int) -> dict[str, float]:
-        """Learning rates at a step by name; that of the means is before the scene's extent."""
+        """Return the learning rates of a step by name; that of the means is relative to the scene's extent."""
         factors = self.at(step).stage.rate_factors
         rates = {name: rate * factors.get(name, 1.0) for name, rate in self.recipe.learning_rates.items()}
         rates["means"] *= self.recipe.means_decay ** (step / max(1, self.steps - 1))

@@ -1,21 +1,24 @@
-"""Settings that decide a training's result, and the report of a step. Nothing here imports torch."""
+"""Settings of a training, and the report of a step. This module does not import torch."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import EXPOSURES, MOST, Exposures, check_choice, check_count
 
 MOST_VIEWS = 4096
+"""Largest number of views per step."""
 MOST_SEEDS = 2**63 - 1
+"""Largest seed."""
 STEPS = 5000
-"""Steps of a training of Gaussians, at least, and of every run of a comparison."""
+"""Least number of steps of a training of Gaussians, and number of steps of every run of a comparison."""
 Background = Literal["auto", "scene", "black", "masked"]
 Materials = Literal["auto", "dielectric"]
-MATERIALS: tuple[Materials, ...] = ("auto", "dielectric")
-BACKGROUNDS: tuple[Background, ...] = ("auto", "scene", "black", "masked")
+MATERIALS: tuple[Materials, ...] = get_args(Materials)
+BACKGROUNDS: tuple[Background, ...] = get_args(Background)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -23,33 +26,33 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Settings that decide a training's result, besides the scene and the recipe.
+    """Settings that determine the result of a training, together with the scene and the recipe.
 
     None means not specified: the value is that of the run to resume or, in a new run, the one named below. run.json
     records the value.
 
-    A step's gradient is the mean over its views; learning rates are those of the recipe times the square root of their
-    number B, and Adam's decays are taken to the power of B, so that its memory spans as many views (Zhao et al. 2024,
-    "On scaling up 3D Gaussian splatting training").
+    The gradient of a step is the mean over its views. With B views, learning rates are those of the recipe times the
+    square root of B. Adam's decays are taken to the power of B, so that its memory spans the same number of views (Zhao
+    et al. 2024, "On scaling up 3D Gaussian splatting training").
 
     Attributes:
-        steps: Optimizer steps in all. 3,000 show the scene, 5,000 and more settle it. None: 5,000, 60 visits to each
-            view where that is more, and twice as many for pictures over a megapixel; the recipe's number for a field.
+        steps: Number of optimizer steps. 3,000 show the scene, 5,000 and more settle it. None: 5,000 or, if larger, 60
+            visits to each view; twice as many for pictures over a megapixel; the number of the recipe for a field.
         seed: Seed of every random draw.
-        refractive_index: Of the surfaces: 1.5 for glass, plastic and glaze, 1.33 for water. None: that of
-            scene.json, and 1.5 where it has none.
-        views_per_step: Views whose mean gradient makes a step. Learning rates grow with its square root; steps are
-            steps, so more views are looked at. None: one for each process.
-        background: What is behind the subject. scene: surroundings, which are reconstructed. black: nothing, the
-            pictures are black there. masked: nothing, pixels outside masks/ are set to black. auto: black where the
+        refractive_index: Refractive index of the surfaces: 1.5 for glass, plastic and glaze, 1.33 for water. None: the
+            value in scene.json, or 1.5.
+        views_per_step: Number of views whose mean gradient makes a step. Learning rates grow with its square root. The
+            number of steps stays the same, so that more views are rendered. None: one for each process.
+        background: Background of the subject. scene: surroundings, which are reconstructed. black: no background, the
+            pictures are black there. masked: no background, pixels outside masks/ are set to black. auto: black if the
             edges of the pictures are black, else scene.
-        gaussians: Most Gaussians that there may be, each of which takes 4 kB. None: one for 20 pixels of all
-            training views, 400,000 at most.
-        exposures: Which pictures of a scene with four to train on, as if no others had been taken: captured, all that
-            there are. See compare.
-        begin_again: Where angles are unknown, find them in a short training on small pictures, and begin again
-            with them; otherwise they are fitted during the training itself.
-        materials: What surfaces are made of: auto detects metals, and reads the labels in materials/ if there are any;
+        gaussians: Largest number of Gaussians, each of which takes 4 kB. None: one for 20 pixels of all training views,
+            at most 400,000.
+        exposures: Pictures to train on in a scene with four per view, as if no others had been taken: captured, all
+            pictures. See compare.
+        begin_again: Find unknown angles in a short training on small pictures, and begin again with them; otherwise
+            they are fitted during the training itself.
+        materials: Materials of the surfaces: auto detects metals, and reads the labels in materials/ if there are any;
             dielectric assumes that there is no metal.
     """
 
@@ -63,69 +66,81 @@ class TrainSettings:
     begin_again: bool = True
     materials: Materials = "auto"
 
-    _LEAST_GAUSSIANS: ClassVar[int] = 1
-
     def __post_init__(self) -> None:
-        for name, least, most in (
-            ("steps", 1, MOST),
-            ("gaussians", self._LEAST_GAUSSIANS, MOST),
-            ("views_per_step", 1, MOST_VIEWS),
-            ("seed", 0, MOST_SEEDS),
-        ):
-            if getattr(self, name) is not None:
-                check_count(name, getattr(self, name), least, most)
-        check_choice("background", self.background, BACKGROUNDS)
-        check_choice("exposures", self.exposures, EXPOSURES)
-        check_choice("materials", self.materials, MATERIALS)
-        if self.refractive_index is not None and not 1.0 < self.refractive_index < 4.0:
-            raise PolarguideError(
-                "refractive_index",
-                expected="between 1 and 4",
-                found=f"{self.refractive_index:g}",
-                remedy="1.5 suits most; without it, that of scene.json is taken.",
-            )
+        _check_ranges(vars(self), least_gaussians=1)
 
     def specified(self) -> dict[str, Any]:
-        """The specified settings by name."""
-        open_values = (("background", "auto"), *((name, None) for name in vars(self)))
-        return {name: value for name, value in vars(self).items() if (name, value) not in open_values}
+        """Return the specified settings by name."""
+        values = {name: value for name, value in vars(self).items() if value is not None}
+        if self.background == "auto":
+            del values["background"]
+        return values
 
 
-@dataclass(frozen=True)
-class ResolvedSettings(TrainSettings):
-    """``TrainSettings`` in which nothing is left open: what a training reads and ``run.json`` records.
+@dataclass(frozen=True, kw_only=True)
+class ResolvedSettings:
+    """Complete settings of a training, as ``run.json`` records them.
 
-    ``runs.folder.resolve`` makes them; ``gaussians`` is 0 of a field, which has none.
+    ``runs.folder.resolve`` creates them from ``TrainSettings``, which explains the fields. ``gaussians`` is 0 for a
+    field, which has no Gaussians.
     """
 
-    steps: int = field(kw_only=True)
-    refractive_index: float = field(kw_only=True)
-    views_per_step: int = field(default=1, kw_only=True)
-    gaussians: int = field(default=0, kw_only=True)
-
-    _LEAST_GAUSSIANS: ClassVar[int] = 0
+    steps: int
+    seed: int = 0
+    refractive_index: float
+    views_per_step: int = 1
+    background: Background = "auto"
+    gaussians: int = 0
+    exposures: Exposures = "captured"
+    begin_again: bool = True
+    materials: Materials = "auto"
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("steps", "refractive_index"):  # a record without them gets the None of the class above
-            if getattr(self, name) is None:
-                remedy = "Restore the file, or train again into a new folder."
-                raise PolarguideError(name, expected="a number", found="nothing", remedy=remedy)
+        _check_ranges(vars(self), least_gaussians=0)
 
     def fit(self, settings: TrainSettings) -> bool:
-        """Whether they agree with the specified settings; open ones agree with any value."""
+        """Return True if all specified settings have the same values."""
         return settings.specified().items() <= vars(self).items()
+
+
+def _check_ranges(values: Mapping[str, Any], *, least_gaussians: int) -> None:
+    """Check settings by name; None is not specified.
+
+    Raises:
+        PolarguideError: a value is out of range.
+    """
+    for name, least, most in (
+        ("steps", 1, MOST),
+        ("gaussians", least_gaussians, MOST),
+        ("views_per_step", 1, MOST_VIEWS),
+        ("seed", 0, MOST_SEEDS),
+    ):
+        if values[name] is not None:
+            check_count(name, values[name], least, most)
+    check_choice("background", values["background"], BACKGROUNDS)
+    check_choice("exposures", values["exposures"], EXPOSURES)
+    check_choice("materials", values["materials"], MATERIALS)
+    index = values["refractive_index"]
+    if index is not None and not 1.0 < index < 4.0:
+        raise PolarguideError(
+            "refractive_index",
+            expected="between 1 and 4",
+            found=f"{index:g}",
+            remedy="Use 1.5 for most surfaces; without it, the value in scene.json is used.",
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class StepReport:
-    """A step's report to the progress display.
+    """Report of a step.
 
     Attributes:
-        step, stage, gaussians: plain values; None of what has no Gaussians. done: steps so far, with those before the
-            training began again.
-        measured: [3] photometric loss, PSNR and whole loss of this rank's views (their mean), on the device. Reading
+        step: number of the step, 0-based.
+        stage: name of the stage.
+        gaussians: number of Gaussians; None for a method without Gaussians.
+        measured: [3] photometric loss, PSNR and total loss, means over the views of this rank, on the device. Reading
             them waits for the device.
+        done: number of finished steps, with those before the training began again.
     """
 
     step: int

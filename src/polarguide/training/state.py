@@ -1,4 +1,4 @@
-"""Everything that training changes, and how it is put into a checkpoint."""
+"""State of a training, and its tensors in a checkpoint."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from polarguide.core.errors import PolarguideError
-from polarguide.gaussians.densify import DensityStatistics
 from polarguide.gaussians.gaussians import ORIENTED_SHAPES, Gaussians, Trained
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.initialize import far_away, initial_parameters
@@ -19,19 +18,21 @@ from polarguide.shading.model import Parameter, ShadingModel
 from polarguide.training.context import TrainingContext
 from polarguide.training.recipe import Recipe
 
+HOLDERS = ("callback.", "frozen.", "statistics.")
+"""Prefixes of the names of tensors that callbacks hold."""
 ANGLE_COLUMNS = 8
-"""Values of a fitted polarizer angle, see ``angles.fit.FittedAngle``, and whether there was anything to fit."""
+"""Number of values of a fitted polarizer angle: those of ``angles.fit.FittedAngle``, and 1 for a successful fit."""
 
 
 class Environment(Trained):
     """The learned light: named parameters with their own Adam state.
 
     Args:
-        parameters: by name; a cubemap's raw texels are ``texels``.
-        rates: learning rate of each.
+        parameters: tensors by name; ``texels`` are the raw texels of a cubemap.
+        rates: learning rate of each parameter.
 
     Raises:
-        KeyError: a parameter without a rate.
+        KeyError: a parameter has no rate.
     """
 
     kind = "environment"
@@ -46,12 +47,12 @@ class Environment(Trained):
 
     @staticmethod
     def _moments(name: str) -> str:
-        """The texels' had the prefix to themselves in the first checkpoints."""
+        """Return the prefix of a tensor's moments; the first checkpoints had the moments of the texels alone."""
         return "environment.adam." if name == "texels" else f"environment.adam.{name}."
 
 
 class SavedState(Protocol):
-    """The state of a training as far as a checkpoint holds it.
+    """State of a training as a checkpoint holds it.
 
     Attributes:
         step: number of finished steps.
@@ -60,7 +61,24 @@ class SavedState(Protocol):
     step: int
 
     def tensors(self) -> dict[str, Tensor]:
-        """All tensors by name."""
+        """Return all tensors by name."""
+
+
+class StateHolder(Protocol):
+    """Holder of tensors that a resumed training needs, such as a callback.
+
+    Attributes:
+        prefix: prefix of their names in a checkpoint.
+    """
+
+    @property
+    def prefix(self) -> str: ...
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the tensors by name, without the prefix."""
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore the tensors that ``state_dict`` returned."""
 
 
 @dataclass
@@ -71,73 +89,86 @@ class TrainingState:
         step: the next step, 0-based.
         gaussians: the Gaussians.
         environment: the learned light; None if the shading model has none.
-        statistics: sums over steps from which the density control decides.
-        frozen: copy of the Gaussians from which the present priors were computed; None before the first refresh.
         opacity_frozen_until: first step at which opacities train again after surface normals were propagated.
         angles: [F, P, ``ANGLE_COLUMNS``] float64, polarizers of P pictures in F successive fits, see
             ``angles.polarizers``; None before the first fit.
         footprints: [N] size of a training pixel at each Gaussian, see ``raster.magnification``; None before the end of
             the training.
-        extra: tensors of further callbacks, named ``callback.NAME.KEY``.
+        extra: tensors of holders that are not attached, by their names in a checkpoint.
+        holders: attached holders by prefix.
     """
 
     step: int
     gaussians: Gaussians
     environment: Environment | None
-    statistics: DensityStatistics
-    frozen: dict[str, Tensor] | None = None
     opacity_frozen_until: int = 0
     angles: Tensor | None = None
     footprints: Tensor | None = None
     extra: dict[str, Tensor] = field(default_factory=dict)
+    holders: dict[str, StateHolder] = field(default_factory=dict)
 
     @property
     def light(self) -> dict[str, Tensor]:
-        """The learned light's parameters by name; empty for a shading model without."""
+        """Parameters of the learned light by name; empty for a shading model without light."""
         return self.environment.parameters if self.environment else {}
 
+    @property
+    def optimized(self) -> list[Trained]:
+        """All optimized parameters: the Gaussians and the learned light."""
+        return [self.gaussians, *([self.environment] if self.environment else [])]
+
+    def attach(self, holder: StateHolder) -> None:
+        """Let a holder take over its tensors."""
+        prefix = holder.prefix
+        own = {name: values for name, values in self._held().items() if name.startswith(prefix)}
+        if own:
+            holder.load_state_dict({name.removeprefix(prefix): values for name, values in own.items()})
+        self.extra = {name: values for name, values in self.extra.items() if name not in own}
+        self.holders[prefix] = holder
+
+    def further_callbacks(self) -> set[str]:
+        """Return the names of callbacks of the user that have tensors in a checkpoint."""
+        return {name.split(".")[1] for name in self._held() if name.startswith("callback.")}
+
+    def drop(self, prefix: str) -> None:
+        """Drop the tensors of a holder that is not attached."""
+        self.extra = {name: values for name, values in self.extra.items() if not name.startswith(prefix)}
+
+    def _held(self) -> dict[str, Tensor]:
+        """Return the tensors of all holders by their names in a checkpoint."""
+        attached = {
+            f"{prefix}{key}": values
+            for prefix, holder in self.holders.items()
+            for key, values in holder.state_dict().items()
+        }
+        return self.extra | attached
+
     def tensors(self) -> dict[str, Tensor]:
-        """All tensors by name, for a checkpoint."""
-        out = self.gaussians.state()
-        if self.environment is not None:
-            out.update(self.environment.state())
-        out["statistics.gradient"] = self.statistics.gradient
-        out["statistics.seen"] = self.statistics.seen
-        if self.frozen is not None:
-            out.update({f"frozen.{name}": t for name, t in self.frozen.items()})
-        if self.angles is not None:
-            out["angles"] = self.angles
-        if self.footprints is not None:
-            out["footprints"] = self.footprints
-        out.update(self.extra)
-        out["scalars"] = torch.tensor([self.step, self.opacity_frozen_until], dtype=torch.int64)
-        return out
+        """Return all tensors by name, for a checkpoint."""
+        own = {"angles": self.angles, "footprints": self.footprints}
+        state = {name: values for trained in self.optimized for name, values in trained.state().items()}
+        state |= {name: values for name, values in own.items() if values is not None}
+        scalars = torch.tensor([self.step, self.opacity_frozen_until], dtype=torch.int64)
+        return {**state, **self._held(), "scalars": scalars}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], recipe: Recipe) -> TrainingState:
-        """The inverse of ``tensors``; what comes from a file is for ``refuse_foreign`` to check first."""
-        gaussians = Gaussians.from_state(tensors, recipe.learning_rates)
+        """Return the state of ``tensors``; ``refuse_foreign`` checks tensors of a file first."""
         rates = recipe.light_rates
-        environment = Environment.from_state(tensors, rates) if rates else None
-        statistics = DensityStatistics.of(tensors["statistics.gradient"], tensors["statistics.seen"])
-        frozen = {key[7:]: value for key, value in tensors.items() if key.startswith("frozen.")}
-        step, frozen_until = (int(x) for x in tensors["scalars"])
-        angles = tensors["angles"].cpu() if "angles" in tensors else None
+        step, frozen_until = (int(value) for value in tensors["scalars"])
         return cls(
             step,
-            gaussians,
-            environment,
-            statistics,
-            frozen or None,
+            Gaussians.from_state(tensors, recipe.learning_rates),
+            Environment.from_state(tensors, rates) if rates else None,
             frozen_until,
-            angles,
+            tensors["angles"].cpu() if "angles" in tensors else None,
             tensors.get("footprints"),
-            {name: values for name, values in tensors.items() if name.startswith("callback.")},
+            {name: values for name, values in tensors.items() if name.startswith(HOLDERS)},
         )
 
 
 def seeded(*numbers: int) -> torch.Generator:
-    """A generator that depends on all the numbers: draws do not depend on what was drawn before."""
+    """Return a generator seeded with all the numbers: draws do not depend on earlier draws."""
     value = 0
     for number in numbers:
         value = (value * 1_000_003 + number + 1) % (2**63 - 1)
@@ -150,7 +181,11 @@ def _check_first_values(
     first: Mapping[str, Tensor],
     leading: tuple[int, ...],
 ) -> None:
-    """Refuse first values of a shading model that differ from the parameters that it declares."""
+    """Check first values of a shading model against the shapes of its declared parameters.
+
+    Raises:
+        PolarguideError: values are missing or have another shape.
+    """
     for name, parameter in declared.items():
         shape = (*leading, *parameter.shape)
         if name not in first or tuple(first[name].shape) != shape:
@@ -163,32 +198,32 @@ def _check_first_values(
 
 
 def first_state(context: TrainingContext) -> TrainingState:
-    """The state before the first step; drawn on the CPU, so that every device begins with the same.
+    """Return the state before the first step, without the tensors of callbacks.
 
-    Far Gaussians are added unless nothing is behind the subject.
+    Values are drawn on the CPU, so that every device begins with the same. Far Gaussians are added unless nothing is
+    behind the subject.
+
+    Raises:
+        PolarguideError: first values of the shading model differ from its declared parameters.
     """
     scene = context.scene
     recipe = context.recipe
-    settings = context.settings
+    seed = context.settings.seed
     device = context.backend.device
     initialization = replace(recipe.initialization, shell=0) if context.black else recipe.initialization
     colors = srgb_decode(scene.point_colors.float() / 255)
     centers = context.centers
-    tensors = initial_parameters(scene.points, colors, centers, initialization, seed=settings.seed)
+    tensors = initial_parameters(scene.points, colors, centers, initialization, seed=seed)
     count = tensors["means"].shape[0]
     if recipe.oriented:
         tensors |= {name: torch.zeros(count, *shape) for name, shape in ORIENTED_SHAPES.items()}
-    generator = seeded(settings.seed, recipe.shading.stream)
+    generator = seeded(seed, recipe.shading.stream)
     far = far_away(tensors["means"], scene.points, centers)
     own, first_light = recipe.shading.initialize(tensors["sh_dc"] * SH_C0 + 0.5, far, generator)
     tensors |= own
     light = {name: t.to(device) for name, t in first_light.items()}
-    for declared, first, leading in (
-        (recipe.shading.parameters, tensors, (count,)),
-        (recipe.shading.light_parameters, light, ()),
-    ):
-        _check_first_values(recipe.shading, declared, first, leading)
+    _check_first_values(recipe.shading, recipe.shading.parameters, tensors, (count,))
+    _check_first_values(recipe.shading, recipe.shading.light_parameters, light, ())
     environment = Environment(light, recipe.light_rates) if light else None
     gaussians = Gaussians({name: t.to(device) for name, t in tensors.items()}, recipe.learning_rates)
-    statistics = DensityStatistics(count, settings.views_per_step, gaussians["means"].device)
-    return TrainingState(0, gaussians, environment, statistics)
+    return TrainingState(0, gaussians, environment)

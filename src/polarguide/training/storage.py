@@ -1,8 +1,8 @@
-"""Cache of what is computed of the training views, in memory up to a limit and beyond it in a file.
+"""Cache of computed data of training views, in memory up to a limit and in a file beyond it.
 
-Targets are rounded to whole numbers of 1/32767 of the largest value of their picture, whatever the size of the scene,
-so that a result does not depend on where they were stored. That is a hundredth of a degree of a normal, and an eighth
-of a step of an 8-bit picture at full scale. Every entry can be computed again to the same bits.
+Targets are rounded to whole numbers of 1/32767 of the largest value of their picture, at any size of the scene, so that
+a result does not depend on their storage. That is a hundredth of a degree of a normal, and an eighth of a step of an
+8-bit picture at full scale. Every entry can be computed again to the same bits.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ import torch
 from torch import Tensor
 
 FULL = 32767
+"""Largest code of a packed tensor."""
 
 
 class Packed(NamedTuple):
-    """A tensor as it is kept.
+    """A cached tensor.
 
     Attributes:
-        codes: int16, or of the tensor's own type where that was not coded.
-        top: what the code 32767 stands for, a scalar; None: not coded.
+        codes: int16, or the tensor itself if it was not coded.
+        top: value of the code 32767, a scalar; None: not coded.
     """
 
     codes: Tensor
@@ -43,14 +44,17 @@ Entry = dict[str, Packed]
 
 
 def packed(values: Tensor) -> Packed:
-    """Finite float32 values as whole numbers of 1/32767 of the largest absolute one; 0 and the largest stay exact."""
+    """Pack finite float32 values as whole numbers of 1/32767 of the largest absolute value.
+
+    0 and the largest value stay exact.
+    """
     top = values.abs().amax()
     top = torch.where(top == 0, torch.ones_like(top), top)
     return Packed((values * (FULL / top)).round_().to(torch.int16), top)
 
 
 def stored_values(entry: Packed) -> Tensor:
-    """The values, float32 where they were coded."""
+    """Return the values of a packed tensor; coded ones as float32."""
     if entry.top is None:
         return entry.codes
     # A division by 32767 gives back a 1 exactly, a product with its inverse does not.
@@ -59,28 +63,29 @@ def stored_values(entry: Packed) -> Tensor:
 
 
 ALIGNED = 64
+"""Alignment of entries in the file, in bytes."""
 
 
 @dataclass
 class _FileSlot:
-    """Where in the file an entry is: its offset, the room there, and what to make of the bytes."""
+    """Slot of an entry in the file: offset, size in bytes, and the type, shape and scale of each tensor."""
 
     offset: int
-    room: int
+    size: int
     parts: dict[str, tuple[torch.dtype, tuple[int, ...], torch.Tensor | None]] | None = None
 
 
 class ViewStore:
-    """Keeps entries by kind and view.
+    """Cache of entries by kind and view.
 
-    Which of them lie in memory is decided as they come, and stays so: views are visited in changing order, in which
-    what was used last is not what is used next, so that exchanging them would only write more.
+    An entry stays in memory or in the file, whichever it came to first. Views are visited in changing order, so that
+    the least recently used entry is not the last to be used, and exchanging entries would only write more.
 
     Args:
-        limit: bytes of entries in memory; None: all.
-        folder: for the file of the others. It has no name there, and is gone with the process; None: entries over the
-            limit are not kept but made again.
-        warn: receives a message where the file cannot be written; entries over the limit are then computed again.
+        limit: bytes of entries in memory; None: no limit.
+        folder: folder of the file, which has no name and ends with the process; None: entries beyond the limit are
+            computed again.
+        warn: receives a message if the file cannot be written; entries beyond the limit are then computed again.
     """
 
     def __init__(
@@ -99,10 +104,12 @@ class ViewStore:
         self.in_file = 0
 
     def get(self, kind: str, view: str, make: Callable[[], Entry], *, disposable: bool = False) -> Entry:
-        """An entry; it is made where it is not kept.
+        """Return an entry; a missing one is computed.
 
         Args:
-            kind, view: its name. make: makes it. disposable: over the limit it is made again, not put into the file.
+            kind, view: key of the entry.
+            make: computes the entry.
+            disposable: beyond the limit, compute the entry again and do not write it to the file.
         """
         key = (kind, view)
         entry = self._entries.get(key) or self._read(key)
@@ -112,10 +119,10 @@ class ViewStore:
         return entry
 
     def drop(self, kind: str, view: str | None = None) -> None:
-        """Forget the entries of a kind, or one of them.
+        """Drop the entries of a kind, or one of them.
 
-        An entry that is made again takes its old place in the file if it still fits there. A larger one is put at the
-        end, and its old place stays empty: entries only grow when a stage reads more than the one before.
+        A new entry takes the slot of the dropped one in the file if it fits. A larger one is appended, and the slot
+        stays empty; entries grow only when a stage reads more than the previous one.
         """
         for key in [key for key in self._entries if key[0] == kind and view in (None, key[1])]:
             self.in_memory -= _size(self._entries.pop(key))
@@ -124,7 +131,7 @@ class ViewStore:
                 place.parts = None
 
     def close(self) -> None:
-        """Forget everything."""
+        """Drop all entries."""
         self._entries.clear()
         self._places.clear()
         self.in_memory = self.in_file = 0
@@ -144,8 +151,8 @@ class ViewStore:
                 self._places.pop(key, None)
                 self._folder = None
                 self._warn(
-                    f"what a training keeps of its views cannot be put into a file ({error.strerror or error}): it is "
-                    "computed again for every step, which is slow. Make room on the disk, or give more --memory."
+                    f"the cache of per-view data cannot be written to a file ({error.strerror or error}). The data are "
+                    "computed again in every step, which is slow. Free space on the disk, or increase --memory."
                 )
 
     def _write(self, key: tuple[str, str], entry: Entry, size: int) -> None:
@@ -153,7 +160,7 @@ class ViewStore:
             self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115, until close
             weakref.finalize(self, self._file.close)
         place = self._places.get(key)
-        if place is None or place.room < size:
+        if place is None or place.size < size:
             place = _FileSlot(self.in_file, size)
             self.in_file += -(-size // ALIGNED) * ALIGNED
             self._places[key] = place
@@ -166,7 +173,7 @@ class ViewStore:
         place.parts = {name: (p.codes.dtype, tuple(p.codes.shape), p.top) for name, p in entry.items()}
 
     def _read(self, key: tuple[str, str]) -> Entry | None:
-        """An entry from the file; None where it is not there, or cannot be read."""
+        """Return an entry from the file; None if it is missing or cannot be read."""
         place = self._places.get(key)
         if place is None or place.parts is None or self._file is None:
             return None

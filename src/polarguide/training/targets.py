@@ -1,4 +1,4 @@
-"""Targets of a step's rendering: the data of one view, as objects."""
+"""Targets of the rendering of a step: records of the data of one view."""
 
 from __future__ import annotations
 
@@ -13,30 +13,32 @@ from polarguide.capture import View
 from polarguide.capture.exposures import analyzers, radiance_places
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import srgb_encode
+from polarguide.raster import ScreenStatistic
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
 
 ABSENT = torch.tensor(torch.nan)
-"""Prior that was not computed: a loss that reads it is not finite, and is refused."""
+"""Placeholder of a prior that was not computed. A loss that reads it is not finite and is refused."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewPriors:
-    """Polarization targets of one view; those that no term reads are ``ABSENT``.
+    """Polarization targets of one view; fields that no term reads are ``ABSENT``.
 
     Attributes:
         camera: camera of the view.
         specular, diffuse: [H, W, 3] separated pictures as displayed (sRGB), on the scale of S0/2.
         separated: [H, W] weight of both: 1 where the separation is well conditioned.
         normal: [H, W, 3] disambiguated polarization normal, world axes.
-        plane: [H, W, 3] world normal of the plane of incidence that the AoLP gives.
+        plane: [H, W, 3] normal of the plane of incidence according to the AoLP, world axes.
         weight: [H, W] weight of ``normal`` and ``plane``, in [0, 1].
-        chromatic: [H, W, 3] normal from the polarization of color differences, world axes, or of a flat surface.
-        chromatic_weight: [H, W] its weight, in [0, 1]; 0 where the settings do not ask for it.
-        stokes: [3, H, W, 3] as measured.
+        chromatic: [H, W, 3] normal from the polarization of color differences or of a flat surface, world axes.
+        chromatic_weight: [H, W] its weight, in [0, 1]; 0 if the settings do not request it.
+        stokes: [3, H, W, 3] measured Stokes vectors.
         stokes_weight: [H, W] weight of S1 and S2, see ``stokes_weight``.
         surface: [H, W] weight of the agreement of normals and depth, see ``surface_weight``.
-        candidates: [H, W, K, 3] normals of which each step chooses one in place of ``normal``, world axes; None: none.
+        candidates: [H, W, K, 3] normals from which each step chooses in place of ``normal``, world axes; None: no
+            choice.
         azimuth_share, chromatic_share: least share of the pixels over which the terms on directions are averaged.
     """
 
@@ -72,21 +74,22 @@ def _total(weight: Tensor, share: float) -> Tensor:
 
 
 def stokes_weight(stokes: Tensor, reliable: Tensor) -> Tensor:
-    """Weight [H, W] of S1 and S2: one over the root of S0, since their variance grows with S0 where light itself is the
-    noise.
+    """Return the weight [H, W] of S1 and S2: one over the root of S0, since the variance of photon noise grows with S0.
 
     Args:
-        stokes: [3, H, W, 3] as measured. reliable: [H, W] 1 where the measurement counts, 0 where not.
+        stokes: [3, H, W, 3] measured Stokes vectors.
+        reliable: [H, W] 1 where the measurement counts, 0 elsewhere.
     """
     return reliable * (stokes[0].mean(dim=-1) + 0.01).rsqrt()
 
 
 def surface_weight(stokes: Tensor, weight: Tensor, bright: float) -> Tensor:
-    """Weight [H, W] of the agreement of normals and depth, in [0, 1].
+    """Return the weight [H, W] of the agreement of normals and depth, in [0, 1].
 
     Args:
-        stokes: [3, H, W, 3] as measured. weight: [H, W] of the polarization normal.
-        bright: S0/2 from which on the agreement counts fully; 0: it counts as much as the polarization normal.
+        stokes: [3, H, W, 3] measured Stokes vectors.
+        weight: [H, W] weight of the polarization normal.
+        bright: S0/2 above which the agreement counts fully; 0: it counts as much as the polarization normal.
     """
     if not bright:
         return weight
@@ -99,13 +102,12 @@ class PartialView:
     """Measurements of a view whose pictures do not determine the Stokes vector.
 
     Attributes:
-        picture: [H, W, 3] linear: the mean of some of its exposures.
+        picture: [H, W, 3] linear: mean of some of its exposures.
         shown: the same as displayed (sRGB), clipped.
-        mix: what ``picture`` measures beside S0/2, as an analyzer: [2], or [2, H, W] where it depends on the pixel;
-            None where it is S0/2.
+        mix: analyzer of ``picture``, [2], or [2, H, W] if it depends on the pixel; None: ``picture`` is S0/2.
         intensities: [K, H, W, 3] linear, of the exposures behind a polarizer at a known angle.
-        analyzers: of these, [K, 2] or [K, 2, H, W].
-        reliable: [H, W] 1 where the measurement counts, 0 where it is invalid or clips.
+        analyzers: their analyzers, [K, 2] or [K, 2, H, W].
+        reliable: [H, W] 1 where the measurement counts, 0 where it is invalid or saturated.
     """
 
     picture: Tensor
@@ -117,7 +119,7 @@ class PartialView:
 
     @classmethod
     def of(cls, view: View, device: torch.device) -> PartialView:
-        """Measurements of a view, on a device."""
+        """Return the measurements of a view, on a device."""
         view = view.to(device)
         values = view.intensities()
         exposures = view.exposures
@@ -148,8 +150,8 @@ class StepTargets:
         camera: camera of the view.
         picture: [H, W, 3] the photograph as displayed (sRGB).
         valid: [H, W] 1 where the photograph counts; None: everywhere.
-        empty: [H, W] 1 where the view shows nothing; None: not known.
-        partial: the measurements of a view that does not determine the Stokes vector; None: it does.
+        empty: [H, W] 1 where the view is empty; None: unknown.
+        partial: measurements of a view that does not determine the Stokes vector; None: it does.
         priors: polarization targets; None: no term of the stage reads them, or the view has none.
     """
 
@@ -163,13 +165,16 @@ class StepTargets:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """The data that the loss terms of one step read.
+    """Data that the loss terms of one step read.
 
     Attributes:
-        result: the rendered layers. targets: what they are compared with.
-        shading: shading of the stage, for the run's refractive index.
-        log_scales: [N, 3] of the Gaussians. extent: extent of the scene.
+        result: the rendered layers.
+        targets: their targets.
+        shading: shading of the stage, for the refractive index of the run.
+        log_scales: [N, 3] scales of the Gaussians.
+        extent: extent of the scene.
         ssim_weight: lambda of the image terms.
+        statistic: gradient of the projected means after the backward pass; None without density control.
     """
 
     result: RenderResult
@@ -178,3 +183,4 @@ class Step:
     log_scales: Tensor
     extent: float
     ssim_weight: float = 0.2
+    statistic: ScreenStatistic | None = None

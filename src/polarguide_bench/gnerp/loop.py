@@ -16,8 +16,8 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
 from polarguide.optics import aolp, dolp, lens_frame, luminance
 from polarguide.optics.color import srgb_encode
+from polarguide.training.callback import Loop
 from polarguide.training.distributed import ALONE
-from polarguide.training.loop import Loop
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import seeded
 from polarguide.training.storage import Entry, Packed, ViewStore, packed, stored_values

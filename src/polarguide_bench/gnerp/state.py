@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from polarguide.gaussians.adam import Adam
+from polarguide.gaussians.gaussians import Adam
 from polarguide.geometry.camera import Camera
 from polarguide.training.checked import MOST_STEPS, TensorRule, check_tensors, moment_rules
 from polarguide.training.state import seeded

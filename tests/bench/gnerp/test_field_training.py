@@ -26,10 +26,16 @@ from polarguide.training.settings import TrainSettings
 from polarguide_bench.gnerp.field import NetworkField
 from polarguide_bench.gnerp.loop import FieldLoop, aolp_loss, color_loss, eikonal_loss, guidance_loss
 from polarguide_bench.gnerp.march import _strata
-from polarguide_bench.gnerp.memory import plan_field_memory
 from polarguide_bench.gnerp.model import FieldModel
 from polarguide_bench.gnerp.recipe import FieldShape, NeuralRecipe, Sampling
-from polarguide_bench.gnerp.runs import FieldRun, load_field, open_field, resolve_field, train_field
+from polarguide_bench.gnerp.runs import (
+    FieldRun,
+    load_field,
+    open_field,
+    plan_field_memory,
+    resolve_field,
+    train_field,
+)
 from polarguide_bench.gnerp.state import FieldState
 from polarguide_bench.plan import trained_steps
 from polarguide_bench.recipes import ABLATIONS_GNERP, RECIPE_GNERP
@@ -212,7 +218,7 @@ def test_a_run_without_a_checkpoint_begins_anew_and_says_so(demo_scene: Path, tm
 
 def test_a_run_with_other_steps_is_not_resumed(demo_scene: Path, tmp_path: Path) -> None:
     field_trained(demo_scene, tmp_path / "run", 2)
-    Fault("steps", "2, as this training was begun", "3").raised_by(
+    Fault("steps", "2, the number", "3").raised_by(
         field_trained, demo_scene, tmp_path / "run", 3, resume=True
     )
 

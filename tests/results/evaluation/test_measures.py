@@ -99,11 +99,11 @@ def test_stokes_error_without_layers_or_polarization():
     depolarized = dataclasses.replace(VIEW, pictures=codes.round().to(torch.uint16))
     got = score(depolarized, FACTS)
     assert got["stokes_error"] is None
-    assert "hardly any polarization" in got["stokes_error_reason"]
+    assert "negligible" in got["stokes_error_reason"]
     pair = dataclasses.replace(VIEW, pictures=VIEW.codes[[0, 2]], exposures=(Exposure(0.0), Exposure(90.0)))
     got = score(pair, FACTS)
     assert got["stokes_error"] is None
-    assert "do not determine a Stokes vector" in got["stokes_error_reason"]
+    assert "do not determine" in got["stokes_error_reason"]
     # S1 of a thousandth of S0 is just enough to be compared with.
     for share, known in ((0.9e-3, False), (1.1e-3, True)):
         half = VIEW.intensities().mean(dim=0)

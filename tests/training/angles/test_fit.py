@@ -9,7 +9,7 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
-from polarguide.training.angles.fit import FLOOR, fit_angle
+from polarguide.training.angles.polarizers import FLOOR, fit_angle
 
 HEIGHT, WIDTH = 48, 64
 EYE = torch.eye(3, dtype=torch.float64)

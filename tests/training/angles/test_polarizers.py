@@ -23,8 +23,7 @@ from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.angles.polarizers import Polarizers
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.loop import TrainingLoop
-from polarguide.training.recipe import Recipe
-from polarguide.training.rules import AngleRules
+from polarguide.training.recipe import AngleRules, Recipe
 from polarguide.training.settings import TrainSettings
 from polarguide.training.state import TrainingState
 

@@ -1,4 +1,4 @@
-"""The cameras of a run as other programs read them, with the photographs that they belong to."""
+"""Export of a run's cameras, with the photographs of their views."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from polarguide.runs.opened import OpenedRun
 from polarguide.visualization import figures
 
 TRANSFORMS = "transforms.json"
+"""File of the cameras for nerfstudio."""
 
 
 def export_cameras(run: OpenedRun, presented: Presented, folder: Path, reporter: Reporter) -> list[Path]:
-    """Write ``sparse/0`` (COLMAP), ``transforms.json`` and ``images/``: the photographs as the run was trained on them.
+    """Write ``sparse/0`` (COLMAP), ``transforms.json`` and the photographs in ``images/``.
 
-    The cameras are pinholes, so that photographs as a lens took them do not belong to them: a picture in ``images/`` is
-    without distortion, of the cameras' size, in the color that is shown (8 bits, sRGB).
+    The cameras are pinholes. So the images are undistorted, have the cameras' size, and show the color of the
+    presentation (8 bits, sRGB).
 
     Raises:
-        PolarguideError: pictures or a model of somebody else lie there.
+        PolarguideError: the folder contains pictures or a model that no export wrote.
     """
     model = folder / "sparse" / "0"
     images = folder / IMAGES
@@ -32,15 +33,15 @@ def export_cameras(run: OpenedRun, presented: Presented, folder: Path, reporter:
         if place.is_dir() and holds_files(place) and not (folder / TRANSFORMS).exists():
             raise PolarguideError(
                 place,
-                expected="nothing, or what an earlier export wrote",
+                expected="an empty folder or an earlier export",
                 found="other files",
-                remedy="Give another --out.",
+                remedy="Choose another --out.",
             )
     scene = run.scene
     placement = presented.placement
     cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
     about = {**presented.origin.record(), **placement.record()}
-    # First, because it says to a repeated command that the rest is of an export that was stopped.
+    # This file comes first: a repeated command recognizes an interrupted export by it.
     write_transforms(folder / TRANSFORMS, cameras, about)
     make_folder(images)
     color = presented.presentation.color
@@ -49,6 +50,7 @@ def export_cameras(run: OpenedRun, presented: Presented, folder: Path, reporter:
             picture = figures.radiance_to_rgb(colored(view.photograph(), color))
             figures.write_png(images / f"{view.name}{SUFFIX}", picture)
             advance(number + 1)
-    points = placement.points(scene.points)
-    write_colmap(model, cameras, points, scene.point_colors, comments=presented.comments)
+    write_colmap(
+        model, cameras, placement.points(scene.points), scene.point_colors, comments=presented.comments
+    )
     return [model, folder / TRANSFORMS, images]

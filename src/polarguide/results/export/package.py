@@ -1,4 +1,4 @@
-"""What ``model.json`` of a package says: units, axes, origin, cameras, scores, and what is not known."""
+"""Content of ``model.json`` in an exported package: units, axes, origin, cameras, scores, and unknown quantities."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from polarguide.results.export.placement import GENERATOR, Origin, Placement, tr
 from polarguide.runs.opened import OpenedRun
 
 RECORD = "model.json"
+"""File name of the record."""
 FILES = {
     "model.glb": "textured mesh, lit by the viewer",
     "model-unlit.glb": "textured mesh with the picture's colors, for viewers without light",
@@ -20,30 +21,31 @@ FILES = {
     "splats-linear.glb": "splats for readers that blend linear colors (three.js)",
     "environment.exr": "the learned light as a panorama of linear radiance",
     "environment.hdr": "the same in the Radiance format",
-    "environment.png": "the same, to look at",
-    "preview.png": "a view of the run, to look at",
+    "environment.png": "the same as a picture",
+    "preview.png": "a view of the run as a picture",
 }
+"""Description of each file of a package."""
 
 
 def about_files(names: list[str]) -> dict[str, str]:
-    """The files of a package with a word on each."""
+    """Return the descriptions of files by name."""
     return {name: FILES[name] for name in names}
 
 
 def package_record(run: OpenedRun, placement: Placement, origin: Origin, base_color: str) -> dict[str, Any]:
-    """The record, without files.
+    """Return the record of a package without its files.
 
     Args:
-        run: the run; its scene is read. placement: placement of the files, upright (+y). origin: whom they are owed to.
-        base_color: what that of the model is.
+        run: the run; its scene is read. placement: placement of the files (+y up). origin: author and
+            provenance.
+        base_color: description of the base color.
     """
     unknown = [
         "the absolute brightness of base color and light: the learned light has no absolute scale",
         "surfaces that no camera saw: they are closed or continued from the nearest ones",
+        *([] if placement.metric else ["the length of a unit"]),
     ]
-    if not placement.metric:
-        unknown.append("how long a unit is")
-    color = origin.presentation.color  # on linear RGB, as photographed
+    color = origin.presentation.color  # applies to linear RGB of the photographs
     cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
     scored = (run.folder / METRICS_FILE).exists()
     return {

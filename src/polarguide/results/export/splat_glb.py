@@ -1,7 +1,8 @@
-"""Splats as glTF with ``KHR_gaussian_splatting`` (kernel ``ellipse``), from the PLY of a run.
+"""Export of splats as glTF with the extension ``KHR_gaussian_splatting`` (kernel ``ellipse``), from the PLY of a run.
 
-The extension has linear scales, opacities in [0, 1], quaternions (x, y, z, w) and harmonics as 3DGS has them. Its
-``colorSpace`` says whether colors are encoded, but no reader obeys it: hence a file for each kind of reader.
+The extension stores linear scales, opacities in [0, 1], quaternions (x, y, z, w) and the harmonics of 3DGS.
+Its ``colorSpace`` states the encoding of colors, but readers ignore it. So there is one file for each kind of
+reader.
 """
 
 from __future__ import annotations
@@ -15,16 +16,20 @@ from polarguide.gaussians.ply import read_ply
 from polarguide.results.export.glb import Binary
 
 EXTENSION = "KHR_gaussian_splatting"
+"""Name of the glTF extension."""
 Encoding = Literal["srgb", "linear"]
 COLOR_SPACES: dict[Encoding, str] = {"srgb": "srgb_rec709_display", "linear": "lin_rec709_display"}
-"""Babylon and PlayCanvas blend colors as they are, so want them encoded; three.js takes them for linear."""
+"""Value of ``colorSpace`` by encoding.
+
+Babylon and PlayCanvas blend encoded colors; three.js blends linear colors.
+"""
 
 
 def write_splat_glb(path: Path, ply: Path, asset: dict[str, Any], encoding: Encoding) -> None:
-    """Convert a PLY of Gaussians, upright (+y); our own fields in it are left out.
+    """Convert a PLY of Gaussians (+y up) without our own fields.
 
     Args:
-        path: the file to write. ply: as ``write_run_ply`` writes it. asset: glTF's record of whom and what made it.
+        path: the file to write. ply: file from ``write_run_ply``. asset: glTF asset record.
         encoding: encoding of the colors in the PLY.
 
     Raises:

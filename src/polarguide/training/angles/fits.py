@@ -23,7 +23,7 @@ from polarguide.training.storage import ViewStore
 
 
 class AngleFits(Callback[TrainingLoop]):
-    """Fits polarizer angles, and lets the loop begin again with those that a search has found.
+    """Fits of polarizer angles, after which the loop begins again with the angles that a search has found.
 
     Unknown angles are searched for in short trainings on small pictures. With ``TrainSettings.begin_again`` off there
     is no search, and they are fitted between steps of the training. Known angles are compared with the pictures there.
@@ -34,8 +34,8 @@ class AngleFits(Callback[TrainingLoop]):
 
     Attributes:
         polarizers: fitted angles.
-        begins_again: whether the training begins, or has begun, after a search.
-        current: context of the schedule that is next: a search, or the training.
+        begins_again: True if the training begins, or has begun, after a search.
+        current: context of the next schedule: a search, or the training.
     """
 
     def __init__(self, context: TrainingContext, table: Tensor | None) -> None:
@@ -69,7 +69,7 @@ class AngleFits(Callback[TrainingLoop]):
             loop.offset = self.polarizers.searched
             loop.total = self._context.settings.steps + self.polarizers.search
         if self._searches or not self.begins_again:
-            loop.set_exposures(self.polarizers.beliefs)
+            loop.feed.set_exposures(self.polarizers.beliefs)
 
     def before_step(self, loop: TrainingLoop, position: Position) -> None:
         """Fit angles if that is due."""
@@ -107,7 +107,7 @@ class AngleFits(Callback[TrainingLoop]):
         earlier = [] if state.angles is None else [*state.angles]
         state.angles = torch.stack([*earlier, table.cpu()])
         changed = self.polarizers.take(state.angles)
-        loop.set_exposures({name: self.polarizers.beliefs[name] for name in changed})
+        loop.feed.set_exposures({name: self.polarizers.beliefs[name] for name in changed})
 
 
 def gaussian_training(

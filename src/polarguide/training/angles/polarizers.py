@@ -1,4 +1,7 @@
-"""Polarizer angles as a training estimates them: unknown angles, and contradicted known ones."""
+"""Polarizer angles as a training estimates them: unknown angles, and contradicted known ones.
+
+The angle and the gain of a picture behind a polarizer, in closed form from predicted Stokes vectors.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +15,131 @@ from statistics import median
 import torch
 from torch import Tensor
 
+from polarguide import optics
 from polarguide.capture import Scene, View
 from polarguide.capture.angle_evidence import TO_DEVIATION, angle_difference, mean_angle, tolerance
 from polarguide.capture.exposures import Exposure, with_estimate
 from polarguide.capture.view import ANGLES
-from polarguide.training.angles.fit import FittedAngle, fit_angle
-from polarguide.training.recipe import Recipe
-from polarguide.training.rules import AngleRules
+from polarguide.optics import Mount
+from polarguide.training.recipe import AngleRules, Recipe
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import ANGLE_COLUMNS
+
+ROUNDS = 6
+"""Number of least-squares fits in the approximation of least absolute differences."""
+SOFT = 0.001
+"""Intensity difference below which the weight of a pixel stays constant."""
+FLOOR = 0.02
+"""S0 below which the weight of a pixel stays constant."""
+BLOCK = 16
+"""Side of the squares of pixels whose errors may be correlated."""
+
+
+@dataclass(frozen=True)
+class FittedAngle:
+    """Polarizer angle fitted to a picture.
+
+    Attributes:
+        angle: degrees in [0, 180), as ``Exposure.angle``.
+        gain: brightness over the predicted one.
+        modulation: polarization of the picture over the predicted one: 1 behind a polarizer, 0 without a polarizer,
+            above 1 if the prediction is too small.
+        spread: standard deviation of the angle, degrees; at most 90.
+        doubt: standard deviation of the modulation, at most 1.
+        misfit: mean residual over the mean light of the picture.
+        misfit_across: the same with the polarizer turned by 90 degrees.
+    """
+
+    angle: float
+    gain: float
+    modulation: float
+    spread: float
+    doubt: float
+    misfit: float
+    misfit_across: float
+
+
+def fit_angle(
+    intensity: Tensor, stokes: Tensor, weight: Tensor, rays: Tensor, mount: Mount
+) -> FittedAngle | None:
+    """Fit ``I = (g S0 + x S1 + y S2) / 2`` with g the gain and (x, y) = g (cos 2t, sin 2t) of the angle t.
+
+    Iteratively reweighted least squares minimize the absolute differences over the square of S0. Unexplained light thus
+    has little influence on the angle: errors of a prediction grow with the light, and dark surfaces are polarized most.
+    A filter in front of the lens has an analyzer that depends on the pixel; there, (x, y) rotates the analyzer of the
+    previous round.
+
+    Args:
+        intensity: [H, W, 3] linear.
+        stokes: [3, H, W, 3] predicted Stokes vectors.
+        weight: [H, W], 0 for pixels without a measurement.
+        rays: [H, W, 3] unit, camera axes.
+        mount: place of the polarizer.
+
+    Returns:
+        None without polarization that determines an angle.
+    """
+    flat = (weight / (stokes[0].mean(dim=-1).clamp(min=0) + FLOOR) ** 2)[..., None].expand_as(intensity)
+    plain = flat.reshape(-1).double()
+    y = intensity.reshape(-1).double()
+    s0, s1, s2 = (part.reshape(-1).double() / 2 for part in stokes)
+    angle = 0.0
+    weights = plain
+    solution = torch.zeros(3, dtype=torch.float64)
+    columns = torch.stack((s0, s1, s2))
+    for turn in range(ROUNDS):
+        if mount == "filter":
+            cosine, sine = (
+                part[..., None].expand_as(intensity).reshape(-1).double()
+                for part in optics.filter_analyzer(angle, rays).unbind(0)
+            )
+            columns = torch.stack((s0, s1 * cosine + s2 * sine, s2 * cosine - s1 * sine))
+        moments = (columns * weights) @ columns.T
+        spectrum = torch.linalg.eigvalsh(moments)
+        if not torch.isfinite(spectrum).all() or spectrum[0] <= 1e-9 * spectrum[-1].clamp(min=1e-30):
+            return None
+        solution = torch.linalg.solve(moments, (columns * weights) @ y)
+        if mount == "filter":
+            angle += math.atan2(float(solution[2]), float(solution[1])) / 2
+        if turn < ROUNDS - 1:
+            weights = plain / ((y - solution @ columns).abs() + SOFT)
+    gain, x, y2 = (float(value) for value in solution)
+    if mount == "sensor":
+        angle = math.atan2(y2, x) / 2
+    length = math.hypot(x, y2)
+    if gain <= 0 or length == 0:
+        return None
+    covariance = _covariance(columns, plain, y - solution @ columns, intensity.shape)
+    if mount == "filter":  # turned into the last round's analyzer, which is all but along the first axis
+        x = length
+        y2 = 0.0
+    across = torch.tensor([0.0, -y2, x], dtype=torch.float64) / length
+    spread = math.degrees(math.sqrt(max(0.0, float(across @ covariance @ across))) / length / 2)
+    doubt = math.sqrt(max(0.0, float(torch.linalg.eigvalsh(covariance[1:, 1:])[-1]))) / gain
+    modulation = length / gain
+    fair = plain.sqrt()
+    light = float((fair * y).sum())
+    turned = solution * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+    misfit, crossed = (float((fair * (y - of @ columns).abs()).sum()) / light for of in (solution, turned))
+    return FittedAngle(
+        math.degrees(angle) % 180.0, gain, modulation, min(spread, 90.0), min(doubt, 1.0), misfit, crossed
+    )
+
+
+def _covariance(columns: Tensor, weights: Tensor, residuals: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """Return the covariance [3, 3] of a solution by least absolute differences.
+
+    This is the sandwich estimator. The density of the residuals at zero follows from those below their median. Errors
+    may be correlated within blocks of side ``BLOCK``.
+    """
+    width = residuals[weights > 0].abs().median().clamp(min=1e-9)
+    slope = (columns * (weights * (residuals.abs() <= width) / width)) @ columns.T
+    scores = (columns * weights * residuals.sign()).reshape(3, *shape).sum(dim=-1)
+    blocks = torch.nn.functional.avg_pool2d(scores[None], BLOCK, ceil_mode=True, divisor_override=1)[0]
+    sums = blocks.reshape(3, -1)
+    inverse = torch.linalg.pinv(slope)
+    return inverse @ (sums @ sums.T) @ inverse
+
 
 REMEDY = (
     "Note the angle of each shot; or take three or four shots of each view at known angles, from a tripod; or treat "
@@ -30,25 +149,28 @@ REMEDY = (
 UNFITTED = (0.0, 1.0, 0.0, 90.0, 1.0, 0.0, 0.0)
 """Values of ``FittedAngle`` for a picture without polarization to fit an angle to."""
 Predict = Callable[[View], Tensor]
-"""Stokes vectors [3, H, W, 3] that the present state predicts for a view."""
+"""Function that predicts the Stokes vectors [3, H, W, 3] of a view from the current state."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Judgment(FittedAngle):
-    """The training's judgment of a picture's angle.
+    """Judgment of a training on the polarizer angle of a picture.
 
-    ``angle`` is the mean of the fits that tell one, or else of those that guess one. The other values of
+    ``angle`` is the mean of the fits that determine one, or else of those that are a best guess. The other values of
     ``FittedAngle`` are those of the last of these fits.
 
     Attributes:
-        view, number: the view, and the place of the picture among its exposures.
-        specified: what the capture says. believed: what the training goes by.
-        scatter: scatter of the angles about their mean, degrees; 90 where less than half of the fits have one.
-        usual: median of what the telling pictures of the same fit are ``off``: how well the model predicts any.
-        unexplained: misfit of the last of all fits over the median of all pictures, times that over the misfit across:
-            large where the picture is explained worse than others are, and hardly better than by a turned polarizer.
-        overruled: whether the other pictures of its view contradict a wrong angle; see ``Polarizers._overruled``.
-        rules: by which it is judged.
+        view: name of the view.
+        number: index of the picture among the exposures of the view.
+        specified: exposure of the capture.
+        believed: exposure that the training assumes.
+        scatter: scatter of the angles about their mean, degrees; 90 if less than half of the fits determine one.
+        usual: median deviation of the pictures with a determined angle in the same fit, which measures the prediction.
+        unexplained: misfit of the last fit over the median of all pictures, times the misfit over that across. It is
+            large for a picture with a worse explanation than others, and hardly a better one than by a turned
+            polarizer.
+        overruled: the other pictures of the view contradict a wrong angle; see ``Polarizers._overruled``.
+        rules: constants of the judgment.
     """
 
     view: str
@@ -98,8 +220,10 @@ class Judgment(FittedAngle):
 
     @property
     def limit(self) -> float:
-        """Degrees that a picture has to be ``off`` to contradict its specified angle: more than others are,
-        since where all are off, the model is wrong. From 90 on, nothing contradicts.
+        """Degrees of deviation beyond which a picture contradicts its specified angle.
+
+        It grows with the deviations of the other pictures, since large deviations of all pictures mean a wrong model.
+        From 90 on, no picture contradicts.
         """
         return tolerance(self.rules.contradicts, self.spread, self.usual)
 
@@ -109,7 +233,7 @@ class Judgment(FittedAngle):
         return not (self.unfiltered or self.overruled) and abs(self.off) > self.limit
 
     def resembles(self, other: Judgment) -> bool:
-        """Whether it looks as if taken at the specified angle of another picture, as well as it tells."""
+        """Return True if the fitted angle equals the specified angle of another picture, within its spread."""
         apart = angle_difference(self.angle, other.specified.angle or 0.0)
         return abs(apart) <= tolerance(self.rules.contradicts, self.spread)
 
@@ -121,19 +245,23 @@ class Judgment(FittedAngle):
 
 
 class Polarizers:
-    """The pictures behind polarizers that are to be fitted, and what has been found.
+    """Pictures behind polarizers to fit, and their fits.
 
-    Pictures of a polarization camera are not; nor is anything where the recipe has no use for it. Angles are sought in
-    the second half of a schedule. Where the training begins again with what was found, they are sought twice, the
-    second time by what the first has found.
+    Pictures of a polarization camera are left out, and all pictures if the recipe does not use them. Angles are fitted
+    in the second half of a schedule. If the training begins again with them, they are fitted in two searches; the
+    second begins with the angles of the first.
 
     Args:
-        scene: the capture. recipe: the method. steps: of the training. search: of the schedule by which unknown
-            angles are sought where the training begins again after it; 0: it does not.
-        table: what was found before, [F, P, 8] float64: what each ``fit`` gave; None: nothing.
+        scene: the capture.
+        recipe: the method.
+        steps: steps of the training.
+        table: earlier fits, [F, P, 8] float64, results of ``fit``; None: no fit.
+        search: steps of the schedule of a search for unknown angles; 0: the training does not begin again.
 
     Attributes:
-        beliefs: the exposures that a training goes by, by the name of the view; of views that were fitted.
+        table: all fits.
+        beliefs: assumed exposures of fitted views by the name of the view.
+        ignored: the recipe ignores the filters of some pictures.
 
     Raises:
         ValueError: the table has another number of rows.
@@ -167,7 +295,7 @@ class Polarizers:
         self.beliefs = self._beliefs()
 
     def due(self, step: int) -> bool:
-        """Return true if angles are fitted before a step."""
+        """Return True if angles are fitted before a step."""
         return not self.settled and step in self._rounds[self.ended]
 
     @property
@@ -183,7 +311,7 @@ class Polarizers:
 
     @property
     def search(self) -> int:
-        """Steps until unknown angles are found; 0 without unknown angles."""
+        """Number of steps until unknown angles are found; 0 without unknown angles."""
         return sum(times[-1] for times in self._rounds) if self._unknown else 0
 
     @property
@@ -192,19 +320,22 @@ class Polarizers:
         return sum(times[-1] for times in self._rounds[: self.ended]) if self._unknown else 0
 
     def believed(self, view: View) -> View:
-        """A view with what is believed of its exposures."""
+        """Return a view with its assumed exposures."""
         exposures = self.beliefs.get(view.name)
         return view if exposures is None or exposures == view.exposures else view.with_exposures(exposures)
 
     def resolved(self, scene: Scene) -> Scene:
-        """A scene with what is believed of its exposures."""
+        """Return a scene with its assumed exposures."""
         return replace(scene, views=tuple(self.believed(view) for view in scene.views))
 
     def fit(self, predict: Predict) -> Tensor:
         """Fit all angles.
 
+        Args:
+            predict: predicts the Stokes vectors of a view.
+
         Returns:
-            [P, 8] float64: of each picture the values of ``FittedAngle``, and 1 where there was anything to go by.
+            [P, 8] float64: the values of ``FittedAngle`` of each picture, and 1 for a successful fit.
         """
         rows = []
         for view in self._views:
@@ -220,14 +351,14 @@ class Polarizers:
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, ANGLE_COLUMNS)
 
     def take(self, table: Tensor) -> set[str]:
-        """Go by a table of all fits [F, P, 8] from now on; the names of the views of which it changes the beliefs."""
+        """Use a table of all fits [F, P, 8]; return the names of the views with changed exposures."""
         self.table = table
         before = self.beliefs
         self.beliefs = self._beliefs()
         return {name for name, exposures in self.beliefs.items() if before.get(name) != exposures}
 
     def judgments(self) -> list[Judgment]:
-        """Specified and assumed angles of each picture; empty before the first fit."""
+        """Return the judgment of each picture; empty before the first fit."""
         if self.table is None:
             return []
         common = self._common_gain(self.table[-1])
@@ -255,10 +386,10 @@ class Polarizers:
         return [replace(judgment, overruled=self._overruled(judgment, judgments)) for judgment in judgments]
 
     def _overruled(self, judgment: Judgment, judgments: Sequence[Judgment]) -> bool:
-        """Whether a picture contradicts its angle, and the three or more others of its view do not.
+        """Return True if a picture contradicts its angle, and the other pictures of its view, at least three, do not.
 
         Four pictures determine more than a Stokes vector: a single wrong angle breaks their pair sums, which
-        ``prepare`` and ``inspect`` check. Only two exchanged pictures keep the sums, and each looks like the other.
+        ``prepare`` and ``inspect`` check. Only two exchanged pictures keep the sums, and each resembles the other.
         """
         if not judgment.contradicts:
             return False
@@ -272,7 +403,7 @@ class Polarizers:
         )
 
     def _judged(self, fit: Tensor) -> list[Judgment]:
-        """The judgment of each picture by one fit [P, 8]."""
+        """Return the judgment of each picture by one fit [P, 8]."""
         rows = [
             Judgment(
                 *row[:-1],
@@ -289,7 +420,7 @@ class Polarizers:
         return [replace(row, usual=usual) for row in rows]
 
     def _common_gain(self, fit: Tensor) -> float | None:
-        """The gain that others are relative to; None where gains differ as little as those of locked exposures."""
+        """Return the median gain as a reference; None if gains differ as little as those of locked exposures."""
         rows = [row for (view, k), row in zip(self._places, fit, strict=True) if not view.exposures[k].known]
         gains = [float(row[1]) for row in rows if row[-1]]
         if len(gains) < self._rules.fewest:
@@ -307,12 +438,12 @@ class Polarizers:
 
 
 def predicts_filters(recipe: Recipe) -> bool:
-    """Whether a recipe learns from what is behind a filter: it renders S0, S1 and S2."""
+    """Return True if a recipe learns from pictures behind filters: it renders S0, S1 and S2."""
     return recipe.shading.reflects and any(stage.weights.stokes > 0 for stage in recipe.stages)
 
 
 def search_steps(recipe: Recipe, settings: ResolvedSettings) -> int:
-    """Steps of the schedule by which unknown angles are sought before a training begins; 0: it does not begin again."""
+    """Return the steps of the schedule of a search for unknown angles; 0: the training does not begin again."""
     return min(recipe.angle_rules.search_steps, settings.steps) if settings.begin_again else 0
 
 
@@ -325,7 +456,7 @@ def _unexplained(fit: Tensor) -> list[float]:
 
 
 def _belief(judgment: Judgment, common: float | None) -> Exposure:
-    """The exposure assumed for a picture without a specified angle: a photograph where no angle was fitted."""
+    """Return the exposure assumed for a picture without a specified angle: a photograph if no angle was fitted."""
     specified = judgment.specified
     if judgment.unfiltered:
         return replace(specified, filtered=False)

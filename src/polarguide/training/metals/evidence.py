@@ -41,7 +41,7 @@ from polarguide.training.metals.observations import (
     samples_of,
     view_sums,
 )
-from polarguide.training.rules import MetalRules, MetalViews
+from polarguide.training.recipe import MetalRules, MetalViews
 
 # Shares of its specular polarization that a dielectric's roughness may leave.
 ROUGH = (1.0, 0.85, 0.7, 0.55)

@@ -22,7 +22,7 @@ from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.model import Parameters
 from polarguide.training.priors import guide_normals
-from polarguide.training.rules import MetalViews
+from polarguide.training.recipe import MetalViews
 
 # Pixels in all views from which on a Gaussian is measured, or labeled.
 LEAST_PIXELS = 0.3

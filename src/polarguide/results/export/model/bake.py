@@ -19,15 +19,12 @@ from torch.nn.functional import grid_sample, max_pool2d
 
 from polarguide.capture import View
 from polarguide.core.progress import Reporter
-from polarguide.gaussians.gaussians import any_nonzero
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
 from polarguide.raster.surface import WIDTH
 from polarguide.results.rendering.mesh import OPAQUE
 from polarguide.runs.model import GaussianModel
 from polarguide.runs.opened import OpenedRun
-from polarguide.shading.gbuffer import splats
-from polarguide.shading.metal import metal_channels, reflectance
 from polarguide.shading.result import RenderResult
 from polarguide.shading.surface import GltfTexture
 
@@ -151,21 +148,11 @@ def _layers(model: GaussianModel, result: RenderResult, view: View, color: Color
         values = result.layers.get(name)
         layers[name] = torch.full((*size, 1), constant) if values is None else values[..., None]
     layers["strength"] = (layers["strength"] / alpha).clamp(max=1)
-    layers["reflectance"] = _reflectance(model, view.camera)
+    layers["reflectance"] = result.layers.get("reflectance", torch.zeros(*size, 3))
     index = result.layers.get("index", torch.full(size, model.shading.refractive_index))
     layers["index"] = index[..., None]
     layers["normal"] = result.normal
     return layers
-
-
-def _reflectance(model: GaussianModel, camera: Camera) -> Tensor:
-    """Reflectance [H, W, 3] of metals at normal incidence; 0 where there are none."""
-    gaussians = model.state.gaussians
-    if not any_nonzero(gaussians, "metalness"):
-        return torch.zeros(camera.height, camera.width, 3)
-    own = metal_channels(gaussians["metalness"], reflectance(gaussians["reflectance_logits"]))
-    picture = model.backend.rasterize(splats(gaussians, own), camera).features.cpu()
-    return picture[..., :3] / picture[..., 3:].clamp(min=1e-3)
 
 
 def _reliable_depth(result: RenderResult, view: View | None) -> Tensor:
