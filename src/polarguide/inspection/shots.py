@@ -372,7 +372,7 @@ def _each(findings: ShotFindings, rotation: CommonRotation) -> Check:
         )
         return Check("angles", *outcome, figures={"doubtful": doubtful, "unknown": unknown} if doubts else {})
     rows = [
-        (j, angle, AngleEstimate(j.angle, j.spread, sense * angle + offset))
+        (j, angle, AngleEstimate(j.angle, j.spread, sense * angle + offset, ShotLimits.contradicts))
         for j, angle in findings.determined
     ]
     typical = float(np.median([abs(estimate.off) for _, _, estimate in rows]))
@@ -380,7 +380,7 @@ def _each(findings: ShotFindings, rotation: CommonRotation) -> Check:
     off = [
         (j, angle)
         for j, angle, estimate in rows
-        if estimate.contradicts(ShotLimits.contradicts, typical, sigmas=ShotLimits.sigmas)
+        if replace(estimate, usual=typical, sigmas=ShotLimits.sigmas).contradicts
         and j.modulation > certain
         and not j.poorly_explained
     ]
