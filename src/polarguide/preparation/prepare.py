@@ -13,21 +13,19 @@ import re
 import shlex
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Geometry, Poses, Undistortion
 from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError, reconstruct, tone_mapped
 from polarguide.capture.colmap.triangulate import add_points
-from polarguide.capture.exposures import Angle
 from polarguide.capture.filter.camera_files import TURNS
 from polarguide.capture.filter.consecutive import chosen_matching
 from polarguide.capture.raw_options import SampledOptions, changed
@@ -242,27 +240,6 @@ class SceneFolder:
                 for name, size in record.files.items()
             )
         )
-
-    def write_view(
-        self,
-        view: str,
-        intensities: NDArray[np.float32],
-        invalid: NDArray[np.bool_],
-        record: ViewRecord,
-        mask: NDArray[np.bool_] | None = None,
-        angles: Sequence[Angle] = ANGLES,
-    ) -> None:
-        """Write the pictures of a view, then its record."""
-        record.files = write_view(
-            self.root,
-            view,
-            intensity_codes(intensities, invalid, getattr(self.measured, "rounding", EXACT)),
-            invalid,
-            mask,
-            angles,
-        )
-        self.views[view] = record
-        self.save()
 
     def drop(self, view: str) -> None:
         """Remove a view of an earlier call without poses."""
@@ -590,16 +567,17 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
                 faults += view_faults
                 notes += view_notes
             advance(count)
-    for text in faults[:_NOTES]:
+    for text in _shorten(faults, "views are black, saturated or masked"):
         reporter.warn(text)
-    if len(faults) > _NOTES:
-        reporter.warn(
-            f"{len(faults) - _NOTES} more views are black, saturated or masked. {SCENE} lists their figures."
-        )
-    for note in notes[:_NOTES]:
-        reporter.say(note)
-    if len(notes) > _NOTES:
-        reporter.say(f"... and {len(notes) - _NOTES} more notes on views. {SCENE} lists their figures.")
+    for text in _shorten(notes, "notes on views"):
+        reporter.say(text)
+
+
+def _shorten(texts: list[str], others: str) -> list[str]:
+    """Return the first texts, and a sentence on the number of others."""
+    rest = len(texts) - _NOTES
+    more = [f"{rest} more {others}. {SCENE} lists their figures."] if rest > 0 else []
+    return [*texts[:_NOTES], *more]
 
 
 def _write_view(
@@ -616,7 +594,10 @@ def _write_view(
         intensities, invalid = warp.apply(intensities, invalid)
         mask = None if mask is None else warp.apply_mask(mask)
         record.warp = _warp_record(warp)
-    folder.write_view(view, intensities, invalid, record, mask, done.angles)
+    codes = intensity_codes(intensities, invalid, getattr(folder.measured, "rounding", EXACT))
+    record.files = write_view(folder.root, view, codes, invalid, mask, done.angles)
+    folder.views[view] = record
+    folder.save()
     faults = [] if mask is None or mask.any() else [f"{view}: its mask shows no object."]
     if record.clipped_share > MOSTLY:
         faults.append(f"{view}: {record.clipped_share:.0%} of its pixels are saturated.")
