@@ -84,9 +84,10 @@ class CompareOptions(ClusterOptions, SceneOptions):
         device: Device of trainings and renderings.
         against: Reference recipe. Tables show the difference of every other recipe to it.
         exposures: Kinds of captures, a row of the tables each, simulated from a scene with four pictures of each view.
-            four: all four. three: 0, 60 and 120 degrees. two: two at right angles. one: one. unknown: one, at an
-            unknown angle. mixed: four of every fourth view, the others without a filter. sparse: every fourth view
-            alone. none: no filter, and no polarization in the recipe.
+            The values four, three (0, 60 and 120 degrees), two (at right angles), one and unknown (one at an unknown
+            angle) hold for each view. The value mixed has four pictures of every fourth view, and the others without a
+            filter. The value sparse has only every fourth view. The value none has no filter, and no polarization in
+            the recipe.
     """
 
     seeds: int = 1
