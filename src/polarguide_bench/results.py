@@ -317,8 +317,7 @@ def shared(values: Numbers) -> Numbers:
 
 def paired(of: Numbers, other: Numbers) -> Numbers:
     """Return the differences ``of - other`` [seeds, units] at the seeds and units that both have; see ``shared``."""
-    both = shared(np.stack([of, other]))
-    return np.asarray(both[0] - both[1])
+    return np.asarray(np.subtract(*shared(np.stack([of, other]))))
 
 
 def known(values: Numbers) -> list[float]:
