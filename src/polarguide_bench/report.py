@@ -29,7 +29,7 @@ from polarguide.runs.folder import RunLog
 from polarguide.runs.health import Health
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.visualization import figures
-from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture
+from polarguide.visualization.figures import Picture, ground_truth_pictures, layer_picture
 from polarguide.visualization.pages import BASE, LAYERS, data_uri, page, page_part, templates
 from polarguide_bench.gnerp.runs import FieldRun
 from polarguide_bench.plan import Comparison, PlannedRun, SceneEntry, open_compared

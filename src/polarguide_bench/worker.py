@@ -37,7 +37,7 @@ from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import train_gaussians
 from polarguide.training.recipe import Recipe
 from polarguide.visualization import figures
-from polarguide.visualization.layers import layer_picture
+from polarguide.visualization.figures import layer_picture
 from polarguide.visualization.pages import data_uri
 from polarguide_bench.children import (
     FORMAT,

@@ -186,10 +186,8 @@ def run(arguments: Sequence[str]) -> int:
     """Run a command line and return the exit status: 0 done, 1 stopped, 2 wrong input, or the status of the verb."""
     verb = arguments[0] if arguments and arguments[0] in VERBS else None
     before = interrupts()
-    for stream in (
-        sys.stdout,
-        sys.stderr,
-    ):  # names of files may have bytes that are not text, or that the encoding lacks
+    for stream in (sys.stdout, sys.stderr):
+        # File names may contain bytes that are not text or that the encoding lacks.
         if isinstance(stream, io.TextIOWrapper):
             # In the C locale Python decodes names of files as ASCII, although terminals show UTF-8.
             stream.reconfigure(

@@ -18,8 +18,7 @@ from polarguide.inspection.capture import InspectedView, ViewMeasurements, quant
 from polarguide.inspection.inspect import Inspection
 from polarguide.inspection.settings import json_value
 from polarguide.visualization import figures
-from polarguide.visualization.figures import Picture
-from polarguide.visualization.layers import AOLP_FULL_DOLP, DOLP_HIGH
+from polarguide.visualization.figures import AOLP_FULL_DOLP, DOLP_HIGH, Picture
 from polarguide.visualization.pages import data_uri, page
 
 SIDE = 240

@@ -276,7 +276,8 @@ def test_the_same_picture_from_the_same_place(presentation: Presentation, tmp_pa
     state, shading = random_state("polarguide-stokes")
     whole, moved, placement = tmp_path / "whole.ply", tmp_path / "moved.ply", placed(presentation)
     write_run_ply(whole, state, shading, own_fields=ply_fields(shading, state.gaussians))
-    rewrite_splats(moved, whole, placement, None, [])
+    everything = torch.ones(len(read_ply(whole)["means"]), dtype=torch.bool)
+    rewrite_splats(moved, whole, placement, everything, [])
     camera = CAMERAS["v2"]
     for field in ("", "linear"):
         before, after = picture(whole, camera, field), picture(moved, placement.camera(camera), field)

@@ -78,7 +78,6 @@ class Metric:
 
 
 GROUP = "polarguide.metrics"
-"""Group of the entry points."""
 _REMEDY = "Update or uninstall the package of the plug-in."
 _KINDS = get_type_hints(Metric) | {"digits": Annotated[int, msgspec.Meta(ge=0, le=10)]}
 

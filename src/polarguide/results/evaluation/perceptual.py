@@ -25,9 +25,7 @@ FOLDER = "POLARGUIDE_LPIPS"
 NETWORK = "vgg16-397923af.pth"
 """File of the network's convolutions in torch hub."""
 CHANNELS = "vgg.pth"
-"""File of the weights of the channels."""
 HELP = "see LPIPS in docs/reference/metrics.md for the commands that install them"
-"""End of the message about missing weights."""
 _STAGES = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
 """Indices of the convolutions between two poolings, in the numbering of the network's file."""
 _SHIFT = (-0.030, -0.088, -0.188)
@@ -161,7 +159,6 @@ def lpips(
 PIXELS_PER_DEGREE = 67.0206
 """Pixels per degree of visual angle: a display 0.7 m wide with 3840 pixels, at a distance of 0.7 m."""
 PACKAGE = "flip-evaluator"
-"""Package with FLIP."""
 
 
 def flip(

@@ -30,11 +30,9 @@ from polarguide.results.evaluation.table import (
 )
 
 PACKAGE = Path(__file__).parents[2]
-"""Folder of the package."""
 COMMIT = "_commit.txt"
 """File in an installed package with the commit of its build. It is empty if the commit is unknown."""
 DIGITS = 16
-"""Number of hexadecimal digits of a code digest."""
 NOT_TRAINING = ("results", "inspection", "viewer", "api", "cli", "__main__.py")
 """Parts of the package that training never imports."""
 BENCH = "polarguide_bench"
@@ -113,9 +111,7 @@ def commit(package: Path = PACKAGE) -> str | None:
 
 
 METRICS_FILE = "metrics.json"
-"""File name of the scores in a run folder."""
 _REMEDY = "Score the run again with this version: polarguide eval."
-"""Remedy for an invalid record."""
 
 
 class Provenance(TypedDict):
@@ -131,7 +127,6 @@ class Provenance(TypedDict):
 
 
 _Decibels = Annotated[float, msgspec.Meta(le=HIGHEST_PSNR)] | None
-"""Type of a metric in decibels."""
 
 
 def _fields(metrics: tuple[Metric, ...], *reasons: str) -> list[Any]:
@@ -146,9 +141,7 @@ def _fields(metrics: tuple[Metric, ...], *reasons: str) -> list[Any]:
 
 
 _VIEW_REASONS = ("lpips", "flip", "stokes_error")
-"""Metrics of a view with a recorded reason for null."""
 _RUN_REASONS = (*_VIEW_REASONS, "fps", "train_seconds", "peak_memory_mib", "mesh_fscore_1")
-"""Metrics of a run with a recorded reason for null."""
 
 
 _OBJECT = msgspec.defstruct(
@@ -164,9 +157,7 @@ _OBJECT = msgspec.defstruct(
 )
 """Errors over the pixels of an object or a class of material in all test views."""
 _PARTS = GenericAlias(dict, (str, _OBJECT))
-"""Errors by name of the object or class."""
 _VIEW = msgspec.defstruct("View", _fields(VIEW_METRICS, *_VIEW_REASONS))
-"""Scores of a view."""
 _RUN = msgspec.defstruct(
     "Run",
     [
@@ -259,7 +250,6 @@ def validate_metrics(record: Any, where: str | Path = METRICS_FILE) -> None:
 
 
 def _check_reason(scores: Mapping[str, Any], where: object) -> None:
-    """Refuse a missing LPIPS without a reason."""
     reason = scores.get("lpips_reason")
     if scores["lpips"] is None and not reason:
         raise PolarguideError(

@@ -134,11 +134,8 @@ def _record(sums: Sequence[float], *, metals: bool) -> dict[str, Any]:
 
 
 _NO_LAYERS = "the recipe has no specular and diffuse layers for a prediction"
-"""Reason for a missing Stokes error: no prediction."""
 _UNDETERMINED = "the pictures of the view do not determine the Stokes vectors"
-"""Reason for a missing Stokes error: no measurement."""
 _NO_POLARIZATION = "the measured polarization of the scored pixels is negligible"
-"""Reason for a missing Stokes error: no signal."""
 
 ViewScores = dict[str, float | str | None]
 """Scores of one view by key. None means undefined: no ground truth, no such layer, or no pixel to score.
@@ -146,8 +143,7 @@ ViewScores = dict[str, float | str | None]
 ``lpips_reason``, ``flip_reason`` and ``stokes_error_reason`` explain a missing ``lpips``, ``flip`` and
 ``stokes_error``.
 ``nonfinite_pixels`` counts pixels with NaN or infinity in a rendered layer, if any. They are scored as black,
-and their
-normals as 90 degrees off.
+and their normals as 90 degrees off.
 """
 
 

@@ -102,7 +102,6 @@ def _numbers(view: View) -> Tensor | None:
 
 
 def _on_black(views: Sequence[View], masks: dict[str, Tensor]) -> bool:
-    """Return True if the photographs are black outside the masks."""
     black = total = 0
     for view in views:
         beyond = outside(masks[view.name]) & ~view.invalid
@@ -112,7 +111,6 @@ def _on_black(views: Sequence[View], masks: dict[str, Tensor]) -> bool:
 
 
 def _partial_truth_warnings(views: Sequence[View]) -> list[str]:
-    """Return a warning if only some test views have a kind of ground truth."""
     counts = {key: sum(getattr(view.ground_truth, key, None) is not None for view in views) for key in KNOWN}
     partly = [f"{KNOWN[key]} of {count}" for key, count in counts.items() if 0 < count < len(views)]
     text = (
@@ -123,7 +121,7 @@ def _partial_truth_warnings(views: Sequence[View]) -> list[str]:
 
 
 def _object_warnings(scene: Scene, views: Sequence[View]) -> list[str]:
-    """Return warnings about object numbers without an entry in the table of objects, and about unspecified materials."""
+    """Return warnings about object numbers without a table entry, and about unspecified materials."""
     if not scene.objects:
         return [
             f"The ground truth has object numbers (objid), but {scene.root / 'scene.json'} has no table of objects "
@@ -141,7 +139,8 @@ def _object_warnings(scene: Scene, views: Sequence[View]) -> list[str]:
     if unlisted:
         sentences.append(
             f"{scene.root / 'scene.json'} (objects) does not list "
-            f"{listed([str(number) for number in sorted(unlisted)])}, although gt/{unlisted[min(unlisted)]}.npz contains it (objid): in no error by object or material."
+            f"{listed([str(number) for number in sorted(unlisted)])}, although gt/{unlisted[min(unlisted)]}.npz "
+            "contains it (objid): in no error by object or material."
         )
     unclear = [item.name for item in scene.objects if item.foreground and item.material.kind is None]
     if unclear:
@@ -182,6 +181,8 @@ class ViewTarget:
         smooth: valid pixels with a true depth, at least 2 pixels from any jump of it.
         mask: [H, W] float64, 1 in the foreground; only if the pictures show nothing else.
         beyond: valid pixels more than 3 pixels outside that mask.
+        seen: valid pixels whose content a training view shows; None if not determined.
+        seen_windows: those that are centers of SSIM windows. seen_polarized: those of ``polarized``.
         extent: extent of the scene in world units.
     """
 
@@ -203,6 +204,9 @@ class ViewTarget:
     smooth: Selection | None = None
     mask: Tensor | None = None
     beyond: Selection | None = None
+    seen: Selection | None = None
+    seen_windows: Selection | None = None
+    seen_polarized: Selection | None = None
     extent: float = 1.0
 
     @classmethod
@@ -281,6 +285,23 @@ class ViewTarget:
             mask=_on_device(mask, device),
             beyond=_selection(None if mask is None else outside(mask) & ~view.invalid, device),
             extent=facts.extent,
+        )
+
+    @property
+    def unseen(self) -> Tensor:
+        """Valid pixels [H, W] bool whose content no training view shows; none if not determined."""
+        return self.valid.mask & ~(self.valid if self.seen is None else self.seen).mask
+
+    def with_coverage(self, seen: Tensor) -> ViewTarget:
+        """Return the target with the pixels [H, W] bool (CPU) whose content a training view shows."""
+        device = self.photograph.device
+        counted = seen & self.valid.mask.cpu()
+        polarized = None if self.polarized is None else counted & self.polarized.mask.cpu()
+        return replace(
+            self,
+            seen=Selection.of(counted, device),
+            seen_windows=Selection.of(window_centers(counted), device),
+            seen_polarized=_selection(polarized, device),
         )
 
 

@@ -96,7 +96,6 @@ def page_shading(shading: ShadingModel, gaussians: Parameters, light: Light) -> 
 
 
 def _harmonics(gaussians: Parameters) -> dict[str, Tensor]:
-    """Return the harmonics of the base color as values of a page."""
     return {"color": gaussians["sh_dc"], "harmonics": gaussians["sh_rest"]}
 
 

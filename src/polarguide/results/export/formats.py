@@ -1,4 +1,7 @@
-"""Export of a run to the file formats of other programs."""
+"""Export of a run to the file formats of other programs.
+
+``model.json`` of a package states units, axes, origin, cameras, scores, and unknown quantities.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -17,6 +20,7 @@ from polarguide.capture.presentation import colored
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import (
     atomic_folder,
+    holds_files,
     make_folder,
     require_inside,
     temporary_folder,
@@ -33,23 +37,27 @@ from polarguide.core.options import (
 )
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.optics.color import srgb_encode
+from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
+from polarguide.results.evaluation.table import shown_metrics
 from polarguide.results.export.adapters import ply_fields
-from polarguide.results.export.cameras import export_cameras
 from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
 from polarguide.results.export.model.build import BASE_COLORS, Charted, charted_subject, textured_model
-from polarguide.results.export.model.gltf import write_glb
-from polarguide.results.export.model.obj import write_obj
-from polarguide.results.export.model.subject import subject_surface, write_stl
-from polarguide.results.export.package import RECORD, about_files, package_record
+from polarguide.results.export.model.gltf import write_glb, write_obj
+from polarguide.results.export.model.topology import subject_surface, write_stl
 from polarguide.results.export.placement import (
     GENERATOR,
+    IMAGES,
+    SUFFIX,
+    Origin,
     Placement,
     comments,
     rewrite_splats,
+    transforms,
+    write_colmap,
+    write_transforms,
 )
 from polarguide.results.export.presented import Presented
-from polarguide.results.export.splat_glb import COLOR_SPACES, Encoding, write_splat_glb
-from polarguide.results.export.splats import write_sog, write_spz
+from polarguide.results.export.splats import COLOR_SPACES, Encoding, write_sog, write_splat_glb, write_spz
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
 from polarguide.results.rendering.mesh import RESOLUTION, scene_mesh
 from polarguide.results.rendering.relight import (
@@ -62,6 +70,103 @@ from polarguide.results.rendering.relight import (
 from polarguide.runs.model import write_run_ply
 from polarguide.runs.opened import OpenedRun
 from polarguide.visualization import figures
+
+TRANSFORMS = "transforms.json"
+
+
+def export_cameras(run: OpenedRun, presented: Presented, folder: Path, reporter: Reporter) -> list[Path]:
+    """Write ``sparse/0`` (COLMAP), ``transforms.json`` and the photographs in ``images/``.
+
+    The cameras are pinholes. So the images are undistorted, have the cameras' size, and show the color of the
+    presentation (8 bits, sRGB).
+
+    Raises:
+        PolarguideError: the folder contains pictures or a model that no export wrote.
+    """
+    model = folder / "sparse" / "0"
+    images = folder / IMAGES
+    for place in (model, images):
+        require_inside(folder, place)
+        if place.is_dir() and holds_files(place) and not (folder / TRANSFORMS).exists():
+            raise PolarguideError(
+                place,
+                expected="an empty folder or an earlier export",
+                found="other files",
+                remedy="Choose another --out.",
+            )
+    scene = run.scene
+    placement = presented.placement
+    cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
+    about = {**presented.origin.record(), **placement.record()}
+    # This file comes first: a repeated command recognizes an interrupted export by it.
+    write_transforms(folder / TRANSFORMS, cameras, about)
+    make_folder(images)
+    color = presented.presentation.color
+    with reporter.track("photographs", len(scene.views)) as advance:
+        for number, view in enumerate(scene.views):
+            picture = figures.radiance_to_rgb(colored(view.photograph(), color))
+            figures.write_png(images / f"{view.name}{SUFFIX}", picture)
+            advance(number + 1)
+    write_colmap(
+        model, cameras, placement.points(scene.points), scene.point_colors, comments=presented.comments
+    )
+    return [model, folder / TRANSFORMS, images]
+
+
+RECORD = "model.json"
+FILES = {
+    "model.glb": "textured mesh, lit by the viewer",
+    "model-unlit.glb": "textured mesh with the picture's colors, for viewers without light",
+    "splats.ply": "splats, -y up (SuperSplat, Spark, Unity, Unreal)",
+    "splats.spz": "the same, compressed, +y up",
+    "splats.sog": "the same, compressed, -y up",
+    "splats-srgb.glb": "splats for readers that blend encoded colors (Babylon, PlayCanvas)",
+    "splats-linear.glb": "splats for readers that blend linear colors (three.js)",
+    "environment.exr": "the learned light as a panorama of linear radiance",
+    "environment.hdr": "the same in the Radiance format",
+    "environment.png": "the same as a picture",
+    "preview.png": "a view of the run as a picture",
+}
+
+
+def about_files(names: list[str]) -> dict[str, str]:
+    """Return the descriptions of files by name."""
+    return {name: FILES[name] for name in names}
+
+
+def package_record(run: OpenedRun, placement: Placement, origin: Origin, base_color: str) -> dict[str, Any]:
+    """Return the record of a package without its files.
+
+    Args:
+        run: the run; its scene is read. placement: placement of the files (+y up). origin: author and
+            provenance.
+        base_color: description of the base color.
+    """
+    unknown = [
+        "the absolute brightness of base color and light: the learned light has no absolute scale",
+        "surfaces that no camera saw: they are closed or continued from the nearest ones",
+        *([] if placement.metric else ["the length of a unit"]),
+    ]
+    color = origin.presentation.color  # applies to linear RGB of the photographs
+    cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
+    scored = (run.folder / METRICS_FILE).exists()
+    return {
+        "generator": GENERATOR,
+        **origin.record(),
+        "units": "meters" if placement.metric else "units of the scene",
+        "up_axis": "+y",
+        "rotation_of_scene": placement.rotation.flatten().tolist(),
+        "scale_of_scene": placement.scale,
+        "color": None if color is None else color.tolist(),
+        "base_color": base_color,
+        "not_known": unknown,
+        "scores": dict(shown_metrics(read_metrics(run.folder), scores_only=True)) if scored else {},
+        "cameras": [
+            {"view": name, **{key: value for key, value in frame.items() if key != "file_path"}}
+            for name, frame in zip(cameras, transforms(cameras)["frames"], strict=True)
+        ],
+    }
+
 
 PANORAMA_HEIGHT = 512
 """Rows of an exported environment map."""
@@ -85,11 +190,11 @@ def export(
 
     Args:
         run: the run. The formats ply, spz and sog read only poses and masks of its scene.
-        format: one of these formats. Splats (ply, spz, sog, splat-glb, splat-usdz) have reflections baked
-            into harmonics. The mesh (GLB and PLY) is fused from rendered depth and has diffuse colors and
-            learned normals. glb, obj and usdz are a textured model. stl is its closed surface. points are
-            opaque Gaussians with normals. environment is the learned light as a panorama (EXR, HDR and PNG).
-            cameras are a COLMAP model and transforms.json.
+        format: one of these formats. Splats (ply, spz, sog, splat-glb, splat-usdz) have reflections baked into
+            harmonics. The mesh (GLB and PLY) is fused from rendered depth and has diffuse colors and learned normals.
+            The textured model is glb, obj or usdz, and its closed surface stl. The points are opaque Gaussians with
+            normals. The environment is the learned light as a panorama (EXR, HDR and PNG). The cameras are a COLMAP
+            model and transforms.json.
         out: folder to write; default: ``export`` in the run's folder.
         resolution: number of voxels of the mesh along its longest side, 16 to 1024.
         spz_version: version of the SPZ file, 3 or 4. Readers support one of them.
@@ -143,7 +248,6 @@ class _Exporter:
     reporter: Reporter
 
     def plys(self) -> list[Path]:
-        """Write the PLY of the 3DGS release, and one with all fields if requested."""
         paths = [self._ply(self.folder / "splats.ply")]
         if self.fields == "all":
             paths.append(self._ply(self.folder / "polarguide.ply", own_fields=True))
@@ -189,7 +293,6 @@ class _Exporter:
         return self._from_ply("splats.spz", partial(write_spz, version=self.spz_version), placement)
 
     def sog(self) -> list[Path]:
-        """Write SOG."""
         credit = self.presented.presentation.credit
         asset = {
             **({"copyright": credit} if credit else {}),
@@ -214,7 +317,6 @@ class _Exporter:
         return self._from_ply("splats.usdz", partial(write_splat_usdz, about=about), placement)
 
     def mesh(self) -> list[Path]:
-        """Write the fused mesh as GLB and PLY."""
         presented = self.presented
         mesh = scene_mesh(self.run.cameras, presented.surface_view(self.run), resolution=self.resolution)
         mesh = mesh.within(presented.subject.holds(torch.from_numpy(mesh.surface.vertices)).numpy())
@@ -228,7 +330,6 @@ class _Exporter:
         return paths
 
     def model(self, kind: str) -> list[Path]:
-        """Write the textured model as ``glb``, ``obj`` or ``usdz``."""
         return self._textured(self._charted(kind), self.options, kind)
 
     def _charted(self, kind: str) -> Charted:
@@ -308,7 +409,6 @@ class _Exporter:
         return [self.folder / name for name in [RECORD, *names]]
 
     def points(self) -> list[Path]:
-        """Write opaque Gaussians as points with normals."""
         path = self.folder / "points.ply"
         model = self.run.model
         presented = self.presented
@@ -322,7 +422,6 @@ class _Exporter:
         return [path]
 
     def environment(self) -> list[Path]:
-        """Write the learned light as a panorama."""
         run = self.run
         presentation = self.presented.presentation
         cubemap = needs_radiance(run.model.shading, what="format")
@@ -336,7 +435,6 @@ class _Exporter:
         return paths
 
     def cameras(self) -> list[Path]:
-        """Write cameras and photographs."""
         return export_cameras(self.run, self.presented, self.folder, self.reporter)
 
 

@@ -106,7 +106,6 @@ OPAQUE = 0.5
 FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
     (name, "u1") for name in ("red", "green", "blue")
 ]
-"""Fields of the PLY of points."""
 
 
 @torch.no_grad()
