@@ -27,7 +27,7 @@ RENDER = BenchOptions(render_only=True, jobs=1)
 
 
 def scene_file(folder: Path, name: str, color: float = 0.2) -> str:
-    """A ball on a plane as a scene file."""
+    """Write a scene file with a ball on a plane."""
     things = [
         {"name": "ground", "foreground": False, "shape": {"type": "plane", "size": [6, 6]}},
         {
@@ -59,7 +59,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
 
 @pytest.fixture(scope="module")
 def rendered(bench: Bench, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the development half."""
+    """Render the development half."""
     pytest.importorskip("mitsuba", reason="no Mitsuba -> pip install '.[synth]'")
     out = tmp_path_factory.mktemp("bench")
     assert run_bench(out, RENDER, bench=bench) is None
@@ -68,7 +68,7 @@ def rendered(bench: Bench, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def compared(monkeypatch: pytest.MonkeyPatch) -> list[tuple[tuple[Any, ...], dict[str, Any]]]:
-    """What is asked of ``compare``, which does nothing."""
+    """Replace ``compare`` and record its arguments."""
     calls: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
 
     def compare(*arguments: Any, **more: Any) -> str:
