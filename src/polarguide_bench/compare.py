@@ -16,7 +16,7 @@ from msgspec import UNSET
 from polarguide import __version__
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.variants import EVERY
-from polarguide.core.errors import PolarguideError, require
+from polarguide.core.errors import require
 from polarguide.core.files import check_out, make_folder, require_inside, write_text
 from polarguide.core.options import (
     MOST,
@@ -175,15 +175,15 @@ def ablate(
     )
 
 
-def _folder(scene: object) -> Path:
-    if isinstance(scene, str | os.PathLike):
-        return Path(scene)
-    raise PolarguideError(
+def _folder(scene: PathLike) -> Path:
+    require(
+        isinstance(scene, str | os.PathLike),
         "scenes",
         expected="paths of scene folders",
         found=f"a {type(scene).__name__}",
         remedy="Pass scene.root: other processes read the scene from its folder.",
     )
+    return Path(scene)
 
 
 def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:

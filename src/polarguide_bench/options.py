@@ -22,7 +22,6 @@ from polarguide_synth.settings import SynthSettings
 
 MOST_SEEDS = 1000
 """Largest number of seeds. Each recipe and scene has a run for each seed."""
-Manager = Literal["slurm", "pbs"]
 LayoutName = Literal["publication-1", "publication-2"]
 """Tables of PolarGuide-GSDR: its comparison of methods, and its ablations."""
 
@@ -60,7 +59,7 @@ class ClusterOptions:
         )
 
     @property
-    def manager(self) -> Manager | None:
+    def manager(self) -> Literal["slurm", "pbs"] | None:
         """Manager of the cluster, if any."""
         if self.slurm:
             return "slurm"
@@ -133,9 +132,6 @@ class BatchOptions(ClusterOptions):
     device: DeviceName = "auto"
 
 
-Half = Literal["development", "held-back"]
-
-
 @dataclass(frozen=True)
 class Bench:
     """A fixed set of rendered scenes, and of rows to compare on them.
@@ -199,7 +195,7 @@ class BenchOptions(ClusterOptions):
     device: DeviceName = "auto"
 
     @property
-    def half(self) -> Half:
+    def half(self) -> Literal["development", "held-back"]:
         """Requested half."""
         return "held-back" if self.held_back else "development"
 

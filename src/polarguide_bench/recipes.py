@@ -46,11 +46,6 @@ def shading(**values: Any) -> Change:
     return lambda recipe: replace(recipe, shading=replace(recipe.shading, **values))
 
 
-def without_propagation(base: Recipe) -> Recipe:
-    """Remove propagations and resets of the opacities."""
-    return both(staged(lambda stage: replace(stage, rounds=None)), without("reset_opacity"))(base)
-
-
 def firm_to_the_end(base: Recipe) -> Recipe:
     """Use rates and weights of the guided stage in the final stage, except the weights of the layers."""
     *before, final = base.stages
@@ -149,7 +144,7 @@ ABLATIONS_3DGS_DR = varied(
     (
         "without-propagation",
         "Without propagations and resets of the opacities: the reference on real captures.",
-        without_propagation,
+        both(staged(lambda stage: replace(stage, rounds=None)), without("reset_opacity")),
     ),
 )
 

@@ -617,11 +617,6 @@ class Results:
                 rows.append(ScoreRow(scene, recipe, finished, cells))
         return rows
 
-    def content(self) -> dict[str, Any]:
-        """Return the content of ``results.json``."""
-        tables = {"table": [row._asdict() for row in self.table], "differences": self.compared}
-        return {**msgspec.to_builtins(self.record), **msgspec.to_builtins(tables)}
-
 
 def _over_scenes(numbers: Sequence[Any]) -> Cell:
     """Return the mean over scenes of a recipe's values by seed; an empty cell if a scene has no value."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import pandas as pd
 from msgspec import UNSET
@@ -434,7 +435,12 @@ _TEXTS.filters.update(md=markdown_text, tex=latex_text, printable=printable)
 
 def write_tables(out: Path, results: Results) -> None:
     """Write ``results.json``, ``.md``, ``.csv`` and ``.tex``, and differences and parts as CSV, each atomically."""
-    write_text(out / "results.json", json.dumps(results.content(), indent=1, allow_nan=False) + "\n")
+    content = {
+        **msgspec.to_builtins(results.record),
+        "table": [msgspec.to_builtins(row._asdict()) for row in results.table],
+        "differences": msgspec.to_builtins(results.compared),
+    }
+    write_text(out / "results.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
     tables = sections(results)
     for name in ("results.md", "results.tex"):
         write_text(out / name, readable(tables, name))

@@ -218,8 +218,11 @@ class FieldLoop(Loop):
         field.direction_share.fill_(min(1.0, max(0.0, (share - begin) / (end - begin))))
         drawn = torch.randint(len(target.valid), (sampling.rays,), generator=generator)
         pixels = target.valid[drawn.to(self._device)]
-        origin, rays = self._rays(view.camera, pixels)
-        marched = march(field, origin, view.camera.to_world(rays), sampling, generator=generator)
+        rays = view.camera.rays(device=self._device).view(-1, 3)[pixels]
+        center = field.region.inner(view.camera.pose(rays.dtype, self._device).center)
+        marched = march(
+            field, center.expand(len(rays), 3), view.camera.to_world(rays), sampling, generator=generator
+        )
         picture = target.picture[pixels]
         color = color_loss(marched.color, picture, target.dolp[pixels])
         loss = self._loss(color, marched, view.camera, rays, pixels, target, share)
@@ -291,14 +294,6 @@ class FieldLoop(Loop):
         ahead = camera.to_world(rays)[:, None] * width
         steps = [dy * down + dx * right for dy, dx in DIAGONAL]
         return torch.stack([places + step for step in (*steps, ahead, -ahead)], dim=2)
-
-    def _rays(self, camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Return origins [N, 3] in coordinates of the field, and directions [N, 3] in camera axes."""
-        region = self.state.field.region
-        device = self._device
-        rays = camera.rays(device=device).view(-1, 3)[pixels]
-        center = region.inner(camera.pose(rays.dtype, device).center)
-        return center.expand(len(rays), 3), rays
 
     def _view_of(self, place: int) -> View:
         """Return the view at a place in the sequence of all views. Each epoch visits each view once, in a new order."""
