@@ -39,6 +39,7 @@ if verb == "fail":
     sys.exit(2)
 if verb == "quiet":
     sys.exit(3)
+
 if verb == "always killed" or verb == "killed" and begun <= 4:
     os.kill(os.getpid(), signal.SIGKILL)
 if verb == "preempted" and begun == 1:
