@@ -21,7 +21,7 @@ from polarguide_bench.join import join_tables
 from polarguide_bench.options import BENCH, Bench, BenchOptions
 from polarguide_synth import render as renderer
 from polarguide_synth.folder import scene_digest
-from polarguide_synth.settings import PRESETS, SynthSettings, find_scene
+from polarguide_synth.settings import PRESETS, Overrides, SynthSettings, find_scene
 
 RENDER = BenchOptions(render_only=True, jobs=1)
 
@@ -83,7 +83,8 @@ def test_the_halves_share_nothing_and_have_all_presets() -> None:
     every = (*BENCH.development, *BENCH.held_back)
     assert len(set(every)) == len(every) == 11
     assert set(every) == set(PRESETS) - {"glossy", "proof"}
-    assert (BENCH.views, BENCH.synth.test_every) == (56, 7)
+    plan = renderer.Plan(Overrides(views=BENCH.views).apply(find_scene("kit")), BENCH.synth, Path("kit"))
+    assert (len(plan.names), len(plan.tests)) == (56, 8)
     # ``polarguide synth NAME --size 192x144 --views 56 --test-every 7`` renders the same.
     assert BENCH.synth == SynthSettings(size="192x144", test_every=7)
     assert all(find_scene(name).name == name for name in every)
