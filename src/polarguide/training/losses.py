@@ -1,11 +1,8 @@
 """Loss of one step: its terms, their inputs, and their weighted sum.
 
 A new term is a field of ``Weights``, with the rendered layers and the targets that it reads, and a function in
-``TERMS``.
-
-Native pass over the terms that compare normals, layers and depth per pixel, with its gradient.
-
-It takes float32 on the CPU. The functions in ``polarguide.training.losses`` are the reference implementation.
+``TERMS``. A native pass computes the terms on normals, layers and depth in float32 on the CPU; functions in plain torch
+are its reference implementation.
 """
 
 from __future__ import annotations

@@ -3,11 +3,10 @@
 This is the coupling of PolarGuide-GSDR (Shan et al. 2026). The normals of the Gaussians resolve the ambiguity of the
 polarization normals and of the separation. The resulting priors supervise the Gaussians until the next refresh.
 
-Flat mirroring surfaces: large parts of a view whose polarization one normal explains.
-
-Light that a dielectric or a metal mirrors is polarized across the plane of incidence. The AoLP of a pixel therefore
-gives a direction perpendicular to its normal, for any mirrored light at any apparent depth. All pixels of a plane have
-one normal, and the directions of many pixels determine it up to its sign, which follows from the camera. Neither the
+Flat mirroring surfaces have one normal that explains the polarization of a large part of a view. Light that a
+dielectric or a metal mirrors is polarized across the plane of incidence. The AoLP of a pixel therefore gives a
+direction perpendicular to its normal, for any mirrored light at any apparent depth. All pixels of a plane have one
+normal, and the directions of many pixels determine it up to its sign, which follows from the camera. Neither the
 ambiguity of pi nor that of pi/2 remains. Still water, which shows the depth of the mirrored scene, has no other cue.
 
 The planes of incidence of a sphere also meet in one line, the ray through its center. There Fresnel's equations allow
@@ -120,7 +119,7 @@ def flat_surfaces(views: Iterable[View], refractive_index: float, rules: FlatRul
     """
     surfaces = dict[str, Flat]()
     determined = 0
-    for view in views:  # one by one, as they come
+    for view in views:
         if view.is_determined:
             determined += 1
             if (flat := flat_surface(view, refractive_index, rules)) is not None:

@@ -1,9 +1,7 @@
-"""Recipes as data: stages with their rendering, losses and actions.
+"""Recipes as data: stages with their rendering, losses and actions, and the constants of a method.
 
 Stage boundaries are fractions of the number of steps, so that the loop compares no step with a constant. ``Schedule``
 maps the stages of a recipe to the steps of a training.
-
-Constants of the detection of metals and flat surfaces, and of the fit of polarizer angles, as data of a recipe.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ from polarguide.training.losses import Weights as Weights
 
 @dataclass(frozen=True)
 class MetalRules:
-    """Constants of the energy whose minimum decides on metals (``training.metals.cut``).
+    """Constants of the energy whose minimum decides on metals (``training.metals.search``).
 
     Attributes:
         prior: log likelihood ratio per view, in nats, by which a metal must be likelier than a dielectric.

@@ -1,6 +1,6 @@
 """Polarizer angles as a training estimates them: unknown angles, and contradicted known ones.
 
-The angle and the gain of a picture behind a polarizer, in closed form from predicted Stokes vectors.
+The angle and the gain of a picture behind a polarizer follow in closed form from predicted Stokes vectors.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def fit_angle(
     if gain <= 0 or length == 0:
         return None
     covariance = _covariance(columns, plain, y - solution @ columns, intensity.shape)
-    if mount == "filter":  # turned into the last round's analyzer, which is all but along the first axis
+    if mount == "filter":  # in the analyzer of the last round, the second component is almost 0
         x = length
         y2 = 0.0
     across = torch.tensor([0.0, -y2, x], dtype=torch.float64) / length
@@ -363,7 +363,7 @@ class Polarizers:
         if self.table is None:
             return []
         common = self._common_gain(self.table[-1])
-        # The fits of the latest search that has any; those of earlier ones are worse.
+        # Fits of the latest search only, because earlier ones are worse.
         ends = itertools.accumulate(map(len, self._rounds), initial=0)
         latest = self.table[max(end for end in ends if end < len(self.table)) :]
         fits = zip(*map(self._judged, latest), strict=True)

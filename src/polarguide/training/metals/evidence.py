@@ -1,20 +1,21 @@
-"""Evidence for each Gaussian: how much likelier what the views measured of it is of a metal than of a dielectric.
+"""Evidence of metals: log likelihood ratio of metal and dielectric for each Gaussian.
 
 At a Gaussian, a view measures S0 and, per color, the polarization P across the rendered normal's plane of incidence and
 U at 45 degrees to it. ``rho`` are Fresnel's degrees of polarization.
 
-- A dielectric's body light d is the same from everywhere, and its specular light s is free: ``S0 = d + s``,
-  ``P = k rho_s s - rho_d d``; k, from ``ROUGH`` to 1, is what roughness leaves of the polarization.
-- A metal mirrors light that is free, but polarizes it as its reflectance r says: ``P = rho(r) S0``. Its color is that
-  of the light that it mirrors times r, so that r follows the color that is seen.
+- The body light d of a dielectric is the same from everywhere, and its specular light s is free: ``S0 = d + s``, ``P =
+  k rho_s s - rho_d d``. Roughness leaves the share k of the polarization, from ``ROUGH`` to 1.
+- A metal mirrors free light and polarizes it according to its reflectance r: ``P = rho(r) S0``. Its color is that of
+  the mirrored light times r, so that r follows the observed color.
 
-Unpolarized light leaves no U. Light that is polarized changes P about as much as U. A metal keeps at most the share
+Unpolarized light has no U. Polarized light changes P about as much as U. A metal preserves at most the share
 ``conductor_oblique_share`` of U (aluminum 0.98 at 45 degrees and 0.91 at 60; copper and gold 0.57 at 60 and 0.1 at 70).
-A dielectric makes ``sqrt(Rs Rp)`` times the scene's light at most. Either explanation is therefore excused in P for as
-much U as it explains, and has the rest of U as an error.
+A dielectric preserves at most ``sqrt(Rs Rp)`` times the light of the scene. Each hypothesis may therefore explain as
+much of its error in P as of U, and the rest of U counts as an error.
 
-The errors E, mean squares relative to the light, of n views of unknown variance, at least that of the scene's typical
-error e, give the log likelihood ratio ``n log((e^2 + E_dielectric) / (e^2 + E_metal))``: n/2 for each of P and U.
+The errors E are mean squares relative to the light, in n views of unknown variance. With e the typical error of the
+scene, a lower bound of all errors, they give the log likelihood ratio ``n log((e^2 + E_dielectric) / (e^2 +
+E_metal))``: n/2 for each of P and U.
 """
 
 from __future__ import annotations
@@ -43,23 +44,29 @@ from polarguide.training.metals.observations import (
 )
 from polarguide.training.recipe import MetalRules, MetalViews
 
-# Shares of its specular polarization that a dielectric's roughness may leave.
 ROUGH = (1.0, 0.85, 0.7, 0.55)
-# Reflectances that are tried: a level times a power of the observed color.
+"""Shares of the specular polarization that roughness of a dielectric may leave."""
 LEVELS = (0.5, 0.6, 0.7, 0.8, 0.88, 0.95)
+"""Levels of the tested reflectances, which are a level times a power of the observed color."""
 POWERS = (0.5, 0.75, 1.0)
-# Weakest over strongest reflectance of the most deeply colored metal, gold.
+"""Powers of the observed color in the tested reflectances."""
 GOLD = 0.38
-# Unknowns of either explanation, for which as many views tell nothing.
+"""Smallest over largest reflectance of the most deeply colored metal, gold."""
 UNKNOWNS = 2
-# Mean square of the noise of the views, relative to the light: the scene's typical error is no less.
+"""Number of unknowns of either hypothesis, which determine the same number of views."""
 NOISE = 1e-4
-# Gaussians at a time, so that intermediate tensors take little memory.
+"""Lower bound of the typical error of a scene: mean square of the noise of the views, relative to the light."""
 CHUNK = 1 << 14
+"""Batch size in Gaussians, which bounds the memory of intermediate tensors."""
 
 
 class Errors(NamedTuple):
-    """Errors [N] of both explanations, mean squares relative to the light, and the metal's reflectance [N, 3]."""
+    """Errors of both hypotheses.
+
+    Attributes:
+        dielectric, metal: [N] mean squares relative to the light.
+        reflectance: [N, 3] reflectance of the metal.
+    """
 
     dielectric: Tensor
     metal: Tensor
@@ -70,10 +77,11 @@ class MetalEvidence(NamedTuple):
     """Evidence of the views for N Gaussians.
 
     Attributes:
-        ratio: [N] log likelihood ratio of metal and dielectric, per view. views: [N] how many independent views it has.
-        reflectance: [N, 3] of the metal that fits best.
+        ratio: [N] log likelihood ratio of metal and dielectric, per view.
+        views: [N] number of independent views.
+        reflectance: [N, 3] reflectance of the best metal.
         color: [N, 3] mean S0.
-        labels: [N, 2] weight of pixels that the user calls dielectric and metal.
+        labels: [N, 2] weight of pixels that the user labels as dielectric and as metal.
     """
 
     ratio: Tensor
@@ -84,16 +92,19 @@ class MetalEvidence(NamedTuple):
 
 
 def errors(samples: ViewSamples, refractive_index: float, light: float, dark: float) -> Errors:
-    """Errors of both explanations of N Gaussians.
+    """Return the errors of both hypotheses for N Gaussians.
 
     Args:
-        light: mean radiance of the scene, S0. dark: radiance added to the one that errors are relative to.
+        samples: means over the views.
+        refractive_index: refractive index of dielectrics.
+        light: mean radiance of the scene, S0.
+        dark: radiance added to the reference of relative errors.
     """
     s0 = samples.s0
     across = samples.across
     cosine = samples.cosine[..., None]
     sine2 = 1 - cosine * cosine
-    above = s0.clamp(min=0) + dark  # the variance of light that is counted grows with the light
+    above = s0.clamp(min=0) + dark  # the variance of photon counts grows with the light
     weight = samples.weight[..., None] / above
     scale = (weight * above * above).sum(dim=0).clamp(min=1e-9)
 
@@ -106,15 +117,15 @@ def errors(samples: ViewSamples, refractive_index: float, light: float, dark: fl
         over = left * specular
         by_line = weight / (1 + over * over)
         of_body = over + diffuse
-        seen = over * s0 - across
-        body = (by_line * of_body * seen).sum(dim=0) / (by_line * of_body**2).sum(dim=0).clamp(min=1e-9)
-        bodies.append(mean((seen - of_body * body.clamp(min=0)) ** 2 / (1 + over * over)))
+        excess = over * s0 - across
+        body = (by_line * of_body * excess).sum(dim=0) / (by_line * of_body**2).sum(dim=0).clamp(min=1e-9)
+        bodies.append(mean((excess - of_body * body.clamp(min=0)) ** 2 / (1 + over * over)))
     color = (samples.weight[..., None] * s0).sum(dim=0)
     color = (color / color.amax(dim=1, keepdim=True).clamp(min=1e-6)).clamp(min=0.05)
     oblique = mean(samples.oblique**2)
 
     def excused(error: Tensor, largest: Tensor) -> Tensor:
-        """The error without what an oblique polarization up to ``largest`` explains, plus what is beyond it."""
+        """Subtract the part of an error that an oblique polarization up to ``largest`` explains, and add the excess."""
         beyond = mean((samples.oblique.abs() - largest).clamp(min=0) ** 2)
         return (error - (oblique - beyond).clamp(min=0)).clamp(min=0) + beyond
 
@@ -142,9 +153,9 @@ def evidence(
     limits: MetalViews,
     memory: MemoryBound = UNBOUNDED,
 ) -> MetalEvidence:
-    """Evidence of the views for each Gaussian; see ``training.metals.evidence``.
+    """Return the evidence of the views for each Gaussian; see ``training.metals.evidence``.
 
-    Views whose pictures do not determine the Stokes vector say what the user says of materials in them, no more.
+    Views whose pictures do not determine the Stokes vector only contribute the labels of the user.
     """
     labels = label_weights(gaussians, views, rasterize, memory)
     measured = evenly([view for view in views if view.is_determined], limits.most_views)
@@ -162,7 +173,7 @@ def evidence(
 def of_views(
     looks: Sequence[Tensor], labels: Tensor, refractive_index: float, rules: MetalRules, limits: MetalViews
 ) -> MetalEvidence:
-    """Evidence of what views measured, as of ``view_sums``, and of the user's labels."""
+    """Return the evidence of the sums of ``view_sums`` and of the labels of the user."""
     sums = torch.stack([look.sum(dim=0) for look in looks]).sum(dim=0)
     light = float(sums[1:4].mean() / sums[0].clamp(min=1e-6))
     parts = []
@@ -182,7 +193,9 @@ def of_views(
 
 
 def _tint_cost(color: Tensor, weight: Tensor, rules: MetalRules) -> Tensor:
-    """What it costs a metal [N] to be more deeply colored than gold in the mean light of the scene, in nats a view."""
+    """Return the cost [N] of a metal that is more deeply colored than gold in the mean light of the scene, in nats per
+    view.
+    """
     mean = (color * weight[:, None]).sum(dim=0) / weight.sum().clamp(min=1e-6)
     tints = (color / mean.clamp(min=1e-6)).clamp(min=1e-3)
     tint = (tints.amin(dim=1) / tints.amax(dim=1)).log()

@@ -1,10 +1,9 @@
-"""The search for metals in a training: when it looks, what it changes, and what it tells the user.
+"""Search for metals in a training: its steps, its decision, and its messages.
 
-Which Gaussians are metals: the minimum of one energy over the whole scene, by a minimum cut.
-
-With x = 1 for a metal, E(x) is the sum over all Gaussians of ``-u x`` and over all pairs of neighbors of
-``likeness w |x_i - x_j|``. The evidence u is that of the views (``training.metals.evidence``) less the prior, in nats,
-and infinite where the user says what a Gaussian is. Each piece of metal that hangs together costs a fixed amount more.
+The decision is the minimum of one energy over the whole scene, found by a minimum cut. With x = 1 for a metal, E(x) is
+the sum over all Gaussians of ``-u x`` and over all pairs of neighbors of ``likeness w |x_i - x_j|``. The evidence u is
+that of the views (``training.metals.evidence``) minus the prior, in nats, and infinite for Gaussians that the user
+labels. Each connected piece of metal has an additional fixed cost.
 """
 
 from __future__ import annotations
@@ -40,17 +39,23 @@ from polarguide.training.recipe import MetalRules, MetalViews, Recipe, Schedule
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import TrainingState
 
-# Neighbors of a Gaussian.
 NEIGHBORS = 16
-# Capacities of the flow are integers: so many to a nat. INFINITE, in nats, is more than all that others can weigh.
+"""Number of neighbors of a Gaussian."""
 PER_NAT = 100
+"""Capacity of one nat in the flow, whose capacities are integers."""
 INFINITE = 1e5
-# Radiance (full scale is 1) that is added to colors before they are compared.
+"""Evidence of a label, in nats, which exceeds all other evidence."""
 DARK = 0.02
+"""Radiance (full scale is 1) that is added to colors before their comparison."""
 
 
 class Graph(NamedTuple):
-    """Pairs of neighbors: both [M], and what it costs, in nats, to be of different kinds [M]."""
+    """Pairs of neighbors.
+
+    Attributes:
+        first, second: [M] indices of both Gaussians.
+        cost: [M] cost of different materials, in nats.
+    """
 
     first: NDArray[np.int64]
     second: NDArray[np.int64]
@@ -58,9 +63,9 @@ class Graph(NamedTuple):
 
 
 def neighbor_graph(gaussians: Parameters, measured: MetalEvidence, rules: MetalRules) -> Graph:
-    """The nearest neighbors of each Gaussian, tied by how alike they are turned and how alike their color is.
+    """Return the nearest neighbors of each Gaussian, connected by the similarity of their normals and colors.
 
-    The scene tells which colors are alike: the mean square of what neighbors differ by is 1.
+    Color differences are relative to the root mean square difference of neighbors in the scene.
     """
     means = gaussians["means"].detach()
     axes = shortest_axis_normals(
@@ -72,30 +77,32 @@ def neighbor_graph(gaussians: Parameters, measured: MetalEvidence, rules: MetalR
     near = near.to(means.device)
     logarithms = (measured.color + DARK).log()
     apart = (logarithms[near] - logarithms[:, None]).square().mean(dim=-1)
-    seen = measured.views > 0
-    typical = (apart.mean(dim=1) * seen).sum() / seen.sum().clamp(min=1)
+    visible = measured.views > 0
+    typical = (apart.mean(dim=1) * visible).sum() / visible.sum().clamp(min=1)
     alike = dot(axes[:, None], axes[near]) ** 4 * torch.exp(-0.5 * apart / typical.clamp(min=1e-6))
     first = np.repeat(np.arange(len(places)), count - 1)
-    # A pair that is near from both sides is there twice.
+    # A pair of mutual neighbors appears twice.
     return Graph(
         first, near.cpu().numpy().ravel(), (0.5 * rules.likeness * alike).cpu().double().numpy().ravel()
     )
 
 
 def unary(measured: MetalEvidence, allowed: Tensor, rules: MetalRules) -> Tensor:
-    """What metal is better than dielectric for each Gaussian by itself, in nats [N].
+    """Return the evidence [N] for metal of each Gaussian alone, in nats.
 
     Args:
-        allowed: [N] bool, those that may be metals unless the user says so.
+        measured: evidence of the views.
+        allowed: [N] bool, Gaussians that may be metals without a label.
+        rules: constants of the energy.
     """
     nats = measured.views * measured.ratio - (measured.views + 1) * rules.prior
     nats = torch.where(allowed, nats.clamp(-rules.trust, rules.trust), torch.full_like(nats, -INFINITE))
-    words = (measured.labels[:, 1] > measured.labels[:, 0]).to(nats) * 2 - 1
-    return torch.where(measured.labels.sum(dim=1) > LEAST_PIXELS, words * INFINITE, nats)
+    signs = (measured.labels[:, 1] > measured.labels[:, 0]).to(nats) * 2 - 1
+    return torch.where(measured.labels.sum(dim=1) > LEAST_PIXELS, signs * INFINITE, nats)
 
 
 def minimum_cut(nats: NDArray[np.float64], graph: Graph) -> NDArray[np.bool_]:
-    """The x [N] of least energy; of several the one with the fewest metals."""
+    """Return the x [N] of least energy; in a tie, the one with the fewest metals."""
     count = len(nats)
     every = np.arange(count)
     source = np.full(count, count)
@@ -116,7 +123,7 @@ def minimum_cut(nats: NDArray[np.float64], graph: Graph) -> NDArray[np.bool_]:
 def surfaces(
     metal: NDArray[np.bool_], nats: NDArray[np.float64], graph: Graph, least: float
 ) -> NDArray[np.bool_]:
-    """Those of the metals whose pieces lower the energy by more than a piece costs."""
+    """Return the metals in pieces that lower the energy by more than the cost of a piece."""
     count = len(metal)
     first, second, cost = graph
     inside = metal[first] & metal[second] & (cost > 0.5 / PER_NAT)
@@ -136,12 +143,15 @@ def decide(
     rules: MetalRules,
     priors: Sequence[float] = (1.0,),
 ) -> Tensor:
-    """Metalness [N] of the Gaussians, the mean over several priors of the minimum of the energy; see the module's text.
+    """Return the metalness [N]: the mean of the minimum of the energy over several priors.
 
     Args:
-        allowed: [N] bool, those that may be metals unless the user says so.
-        priors: shares of the prior. With one, a Gaussian is a metal (1) or a dielectric (0); with more it is between
-            them where the priors decide differently.
+        measured: evidence of the views.
+        gaussians: the Gaussians.
+        allowed: [N] bool, Gaussians that may be metals without a label.
+        rules: constants of the energy.
+        priors: shares of the prior. With one share, a Gaussian is a metal (1) or a dielectric (0). With more, metalness
+            is between them where the priors lead to different decisions.
     """
     graph = neighbor_graph(gaussians, measured, rules)
     metalness = np.zeros(len(allowed), dtype=np.float32)
@@ -151,8 +161,8 @@ def decide(
     return torch.from_numpy(metalness / len(priors)).to(allowed.device)
 
 
-# Shares of the prior that decide before the last look; metalness is the share of these decisions that say metal.
 SOFT_PRIORS = (1 / 3, 2 / 3, 1.0)
+"""Shares of the prior before the last search; metalness is the share of these decisions for metal."""
 
 
 @torch.no_grad()
@@ -165,13 +175,14 @@ def light_gain(
     limits: MetalViews,
     memory: MemoryBound = UNBOUNDED,
 ) -> float:
-    """By how much the light should be brighter, as the first metals show it.
+    """Return the factor by which the light should be brighter, according to the first metals.
 
-    Dielectrics fix the product of strength and light alone. Metals, whose reflectance is known, fix the light.
+    Dielectrics determine only the product of strength and light. Metals, whose reflectance is known, determine the
+    light.
 
     Returns:
-        The median of what they show over what is rendered of them; 1 without views and where they are hardly seen. Not
-        so little that strengths would have to exceed 1.
+        The median of measured over rendered light of metals, at most ``most_gain`` and at least a value that keeps
+        strengths below 1. 1 without views, and for too few metal pixels.
     """
     ratios = []
     pixels = 0
@@ -197,7 +208,7 @@ def light_gain(
 
 
 class MetalSearch:
-    """Finds metals at the refreshes of the priors, within the share of the steps that the recipe specifies.
+    """Search for metals at the refreshes of the priors, within the share of the steps that the recipe specifies.
 
     Args:
         context: context of the training.
@@ -209,14 +220,14 @@ class MetalSearch:
         self._looks = looks(context.recipe, context.settings)
 
     def is_due(self, step: int) -> bool:
-        """Whether a refresh at this step looks for metals."""
+        """Return True if a refresh at this step searches for metals."""
         context = self._context
         steps = context.settings.steps
         return _searches(context.recipe, context.settings) and _within(context.recipe.metals, step, steps)
 
     @torch.no_grad()
     def look(self, state: TrainingState) -> None:
-        """Decide which Gaussians are metals, and begin with what was measured of those that are new."""
+        """Decide which Gaussians are metals, and initialize new metals with the measurement."""
         context = self._context
         views = context.views
         if not any(view.is_determined or view.materials is not None for view in views):
@@ -253,15 +264,15 @@ class MetalSearch:
         self._warned = True
         names = listed([f"materials/{name}.png" for name in wrong])
         context.reporter.warn(
-            f"other views contradict {names} on {100 * max(wrong.values()):.0f} % of what is said there, at most: "
-            "dielectric in one view, metal in another. The larger part counts; look at these files."
+            f"other views contradict {names} on up to {100 * max(wrong.values()):.0f} % of their labels: dielectric "
+            "in one view, metal in another. The majority counts; check these files."
         )
 
     @torch.no_grad()
     def undecided(self, state: TrainingState) -> Tensor | None:
-        """Gaussians [N] bool that are dielectrics by the prior alone: what was measured of them would make them metals.
+        """Return a mask [N] of Gaussians that are dielectrics by the prior alone, and metals by their measurement.
 
-        None where a training does not look for metals, or no view determines the Stokes vector.
+        None if the training does not search for metals, or if no view determines the Stokes vector.
         """
         if not self._looks or not any(view.is_determined for view in self._context.views):
             return None
@@ -283,8 +294,9 @@ class MetalSearch:
         )
 
     def _allowed(self, state: TrainingState) -> Tensor:
-        """Gaussians [N] bool that may be metals unless the user says so: none where nothing tells how far a label
-        reaches.
+        """Return a mask [N] of Gaussians that may be metals without a label.
+
+        It is empty without polarization, because the range of a label is then unknown.
         """
         context = self._context
         means = state.gaussians["means"].detach()
@@ -293,22 +305,22 @@ class MetalSearch:
         return ~far & any(view.is_determined for view in context.views)
 
     def _priors(self, step: int) -> tuple[float, ...]:
-        """Shares of the prior that decide at a step: several before the last look, so that metalness is soft first.
+        """Return the shares of the prior at a step: several before the last search, for soft metalness.
 
-        Normals of a metal that is shaded as a dielectric are wrong, and its evidence with them. What is likely is
-        therefore shaded as a mixture first, and is a dielectric again where its own normals do not confirm it.
+        A metal that is shaded as a dielectric has wrong normals and wrong evidence. A likely metal is therefore shaded
+        as a mixture first, and becomes a dielectric again if its new normals do not confirm the metal.
         """
         return SOFT_PRIORS if step < max(self._looks, default=step) else (1.0,)
 
 
 def refreshes(recipe: Recipe, steps: int) -> list[int]:
-    """The steps of a training that refresh its priors."""
+    """Return the steps of a training that refresh its priors."""
     schedule = Schedule(recipe, steps)
     return [step for step in range(steps) if "refresh_priors" in schedule.at(step).actions]
 
 
 def looks(recipe: Recipe, settings: ResolvedSettings) -> list[int]:
-    """The steps at which a training decides what is metal; none: it takes everything for dielectric."""
+    """Return the steps at which a training decides on metals; empty if all surfaces are dielectrics."""
     if not _searches(recipe, settings):
         return []
     steps = settings.steps
@@ -318,7 +330,7 @@ def looks(recipe: Recipe, settings: ResolvedSettings) -> list[int]:
 def warn_of_unused_materials(context: TrainingContext) -> None:
     """Warn if ``materials/``, or refractive indices of single materials, have no effect on a training.
 
-    Recipes that never refresh their priors, such as controls, do not look for metals and get no warning of these.
+    Recipes that never refresh their priors, such as controls, do not search for metals and get no warning of these.
     """
     recipe = context.recipe
     settings = context.settings
@@ -329,15 +341,15 @@ def warn_of_unused_materials(context: TrainingContext) -> None:
         first, last = (100 * share for share in recipe.metals)
         context.reporter.warn(
             f"materials/ is read at refreshes of the priors between {first:.0f} and {last:.0f} % of the steps. "
-            "A training this short has none there, and takes everything for dielectric. Take more steps."
+            "This training is too short for such a refresh and treats all surfaces as dielectrics. Use more steps."
         )
     indices = context.scene.indices
     if not indices:
         return
     if not ("index_offset" in recipe.shading.parameters and refreshed):
-        why = f"the recipe {recipe.name} takes the run's for everything"
+        why = f"the recipe {recipe.name} uses that of the run for all surfaces"
     elif not any(numbers_in(view) & indices.keys() for view in views):
-        why = "no picture in materials/ of a training view has one of their numbers"
+        why = "no picture in materials/ of a training view contains their numbers"
     else:
         return
     context.reporter.warn(
@@ -354,5 +366,5 @@ def _within(shares: tuple[float, float], step: int, steps: int) -> bool:
 
 
 def _names_metals(view: View) -> bool:
-    """Whether the user says of a view which of what it shows is a metal, or none."""
+    """Return True if the user labels metals or dielectrics in a view."""
     return view.materials is not None and bool(((view.materials == 1) | (view.materials == 2)).any())
