@@ -1,7 +1,4 @@
-"""Callbacks of a run for any method: progress with a log, checkpoints, viewer, memory and stop.
-
-Time that a piece of work takes, and whether other work ran beside it.
-"""
+"""Callbacks of a run for any method: progress with a log, checkpoints, viewer, memory and stop."""
 
 from __future__ import annotations
 
@@ -23,15 +20,16 @@ from polarguide.training.callback import Callback, Loop
 from polarguide.training.losses import refuse_diverged
 from polarguide.training.settings import StepReport
 
-# Share of one core that others may use before a time is no longer worth quoting.
 FOREIGN_SHARE = 0.10
+"""Share of one core above which other processes invalidate a measured time."""
 
 
 class Stopwatch:
-    """Adds up wall time, and compares the machine's busy time with this process's own.
+    """Wall time of an operation, with a check for other busy processes.
 
     Args:
-        seconds: time already spent (before a resume). alone: whether that was spent alone.
+        seconds: earlier time, before a resume.
+        alone: no other process was busy then.
     """
 
     def __init__(self, seconds: float = 0.0, alone: bool = True) -> None:
@@ -44,13 +42,13 @@ class Stopwatch:
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
-        """Time inside does not count."""
+        """Exclude the time inside the context."""
         begin = time.perf_counter()
         yield
         self._pause += time.perf_counter() - begin
 
     def read(self) -> tuple[float, bool]:
-        """Seconds so far, and whether nothing else of weight ran beside."""
+        """Return the seconds so far, and True if no other process was busy."""
         wall = time.perf_counter() - self._start
         foreign = (machine_busy_seconds() - self._machine) - (time.process_time() - self._own)
         alone = self._alone and foreign <= FOREIGN_SHARE * wall + 0.5
@@ -58,7 +56,7 @@ class Stopwatch:
 
 
 def in_words(seconds: float) -> str:
-    """A time as 40 s, 12 min or 1 h 05 min."""
+    """Format a time as 40 s, 12 min or 1 h 05 min."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

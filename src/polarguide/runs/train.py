@@ -112,7 +112,7 @@ def train_gaussians(
             if leads:
                 stack.enter_context(writing_to(out))
             state = _resumed_state(out, method, configuration, reporter, leads=leads)
-        return_freed_memory()  # of decoded files
+        return_freed_memory()  # of decoding
         store = stack.enter_context(closing(view_store(plan, backend, out, reporter)))
         bound = MemoryBound(plan.peak)
         context = TrainingContext(loaded, method, resolved, backend, ranks, store, bound, reporter)

@@ -1,5 +1,4 @@
-"""Processes that torchrun started for one training: their shares of views, sums of their results, and loss of a
-process.
+"""Processes of one training, started by torchrun: shares of views, sums of results, and loss of a process.
 
 A step renders B views in its slots 0 to B - 1. Each rank takes a range of them. Sums over slots are computed in the
 order of the ranks, for every communication backend, so that two processes of one view each give the bits of one process

@@ -178,9 +178,7 @@ def pixel_terms(result: RenderResult, camera: Camera, terms: Terms) -> Tensor:
 
 
 def _field(result: RenderResult) -> Tensor | None:
-    """Return the metals' part of the specular layer and of its polarization over ``sin^2(zenith)``, [P, 6]; None: no
-    metal.
-    """
+    """Return the part [P, 6] of metals in the specular layer and in its polarization over ``sin^2(zenith)``."""
     if (metal := result.metal) is None:
         return None
     both = torch.cat((metal.specular, metal.slope * metal.specular), dim=1)
@@ -460,7 +458,7 @@ def refuse_diverged(total: Tensor) -> None:
             "training",
             expected="a finite loss",
             found=str(float(total.sum())),
-            remedy="Check the pictures and poses (polarguide inspect). For your own recipe, lower its rates.",
+            remedy="Check the pictures and poses (polarguide inspect). In your own recipe, lower the rates.",
         )
 
 

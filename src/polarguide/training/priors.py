@@ -6,8 +6,8 @@ polarization normals and of the separation. The resulting priors supervise the G
 Flat mirroring surfaces have one normal that explains the polarization of a large part of a view. Light that a
 dielectric or a metal mirrors is polarized across the plane of incidence. The AoLP of a pixel therefore gives a
 direction perpendicular to its normal, for any mirrored light at any apparent depth. All pixels of a plane have one
-normal, and the directions of many pixels determine it up to its sign, which follows from the camera. Neither the
-ambiguity of pi nor that of pi/2 remains. Still water, which shows the depth of the mirrored scene, has no other cue.
+normal, and the directions of many pixels determine it up to its sign, which follows from the camera. Both
+ambiguities, of pi and of pi/2, vanish. Still water, which shows the depth of the mirrored scene, has no other cue.
 
 The planes of incidence of a sphere also meet in one line, the ray through its center. There Fresnel's equations allow
 almost no polarization, so that the measurement contradicts this normal.
@@ -339,7 +339,7 @@ def _guide(view: View, normal: Tensor, flat: Flat | None, rays: Tensor, settings
 def _by_color(
     precomputed: Unguided, guide: _Guide, settings: Priors, rays: Tensor
 ) -> tuple[Tensor, Tensor] | None:
-    """Return the normals [H, W, 3] of color differences or of a flat surface, and their weight; None: not requested."""
+    """Return the normals [H, W, 3] of color differences or of a flat surface, and their weight; None without them."""
     _, _, zenith, azimuth, certainty, colorful = precomputed
     if zenith is None or azimuth is None or certainty is None or colorful is None:
         return None
@@ -377,9 +377,7 @@ def _across(luminance: Tensor, normal: Tensor, rays: Tensor) -> Tensor:
 
 
 def _within(normal: Tensor, guide: Tensor, full: float, none: float) -> Tensor:
-    """Return a weight [H, W] that falls from 1 at ``full`` degrees between unit normals [H, W, 3] to 0 at ``none``
-    degrees.
-    """
+    """Return a weight [H, W] that falls with the angle of unit normals, from 1 at ``full`` to 0 at ``none`` degrees."""
     off = torch.linalg.cross(normal, guide).norm(dim=-1).atan2(dot(normal, guide)).rad2deg()
     return ((none - off) / (none - full)).clamp(0, 1)
 

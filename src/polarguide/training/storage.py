@@ -57,7 +57,7 @@ def stored_values(entry: Packed) -> Tensor:
     """Return the values of a packed tensor; coded ones as float32."""
     if entry.top is None:
         return entry.codes
-    # A division by 32767 gives back a 1 exactly, a product with its inverse does not.
+    # Division by 32767 restores a 1 exactly; a product with its inverse does not.
     values = entry.codes.to(torch.float32).div_(FULL)
     return values if entry.top.device.type == "cpu" and float(entry.top) == 1 else values.mul_(entry.top)
 

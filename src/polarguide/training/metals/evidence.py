@@ -3,19 +3,19 @@
 At a Gaussian, a view measures S0 and, per color, the polarization P across the rendered normal's plane of incidence and
 U at 45 degrees to it. ``rho`` are Fresnel's degrees of polarization.
 
-- The body light d of a dielectric is the same from everywhere, and its specular light s is free: ``S0 = d + s``, ``P =
-  k rho_s s - rho_d d``. Roughness leaves the share k of the polarization, from ``ROUGH`` to 1.
+- The body light d of a dielectric is the same from everywhere, and its specular light s is free: ``S0 = d + s``,
+  ``P = k rho_s s - rho_d d``. Roughness leaves the share k of the polarization, from ``ROUGH`` to 1.
 - A metal mirrors free light and polarizes it according to its reflectance r: ``P = rho(r) S0``. Its color is that of
   the mirrored light times r, so that r follows the observed color.
 
 Unpolarized light has no U. Polarized light changes P about as much as U. A metal preserves at most the share
 ``conductor_oblique_share`` of U (aluminum 0.98 at 45 degrees and 0.91 at 60; copper and gold 0.57 at 60 and 0.1 at 70).
-A dielectric preserves at most ``sqrt(Rs Rp)`` times the light of the scene. Each hypothesis may therefore explain as
-much of its error in P as of U, and the rest of U counts as an error.
+A dielectric preserves at most ``sqrt(Rs Rp)`` times the light of the scene. Each hypothesis reduces its error
+in P by the part of U that it explains, and the rest of U is an error.
 
 The errors E are mean squares relative to the light, in n views of unknown variance. With e the typical error of the
-scene, a lower bound of all errors, they give the log likelihood ratio ``n log((e^2 + E_dielectric) / (e^2 +
-E_metal))``: n/2 for each of P and U.
+scene, a lower bound of all errors, they give the log likelihood ratio
+``n log((e^2 + E_dielectric) / (e^2 + E_metal))``: n/2 for each of P and U.
 """
 
 from __future__ import annotations
@@ -193,8 +193,9 @@ def of_views(
 
 
 def _tint_cost(color: Tensor, weight: Tensor, rules: MetalRules) -> Tensor:
-    """Return the cost [N] of a metal that is more deeply colored than gold in the mean light of the scene, in nats per
-    view.
+    """Return the cost [N] of a metal that is more deeply colored than gold in the mean light of the scene.
+
+    The unit is nats per view.
     """
     mean = (color * weight[:, None]).sum(dim=0) / weight.sum().clamp(min=1e-6)
     tints = (color / mean.clamp(min=1e-6)).clamp(min=1e-3)
